@@ -23,7 +23,7 @@ from projections import relocalize
 from projections.exact import quantise, to_float32
 from projections.model.log_commands import read_corrections
 from projections.model.space_vectors import vectors_of
-from projections.reducers.reembedded import Reembedded
+from projections.reducers.embedding_space import Reembedded
 from projections.relocalize import Crop, View
 from projections.settings import Settings
 

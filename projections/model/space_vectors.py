@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from eventsrc.system_events import EMBEDDINGS_KEY
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import FoldError
-from projections.reducers.reembedded import Reembedded
+from projections.reducers.embedding_space import Reembedded
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 

@@ -54,7 +54,7 @@ from .constrained_objects import ConstrainedObjects
 from .constrained_places import ConstrainedPlaces
 from .current_map import CurrentMap
 from .edited_events import edit_event, edits_events
-from .embedding_space import Space
+from .embedding_space import Reembedded, Space
 from .envelope_evidence import (
     camera_of,
     pose_error_of,
@@ -70,7 +70,6 @@ from .objects import FusibleObservation, Objects
 from .place_members import PosedKeyframe
 from .place_names import PlaceNames
 from .places import Places
-from .reembedded import Reembedded
 from .rooms import Rooms
 from .rules import objects_by, places_by
 
