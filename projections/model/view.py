@@ -39,8 +39,8 @@ from projections.deltas import (
     RunSeen,
     SkipKind,
 )
-from projections.floor_maps import map_in_force
 from projections.place_types import PlaceType, place_type
+from projections.reducers.current_map import map_in_force
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
 from projections.settings import Settings
 

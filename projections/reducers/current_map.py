@@ -7,6 +7,7 @@ the later of them is folded.
 A map that names no floor is of the floor that the log is of first, unless another names that one.
 """
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -14,13 +15,21 @@ import numpy as np
 from eventsrc.envelope import Offset
 from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import MapGiven
-from projections.floor_maps import map_in_force
 from projections.occupancy import OccupancyGrid, Point
 from projections.reducers import State, part, prefixed
 from projections.settings import Settings
 
 from .driven_cells import StraightWay
 from .floors import Floors, shift_um
+
+
+def map_in_force(
+    given: Mapping[str | None, MapGiven], floor: str | None, *, is_first: bool
+) -> MapGiven | None:
+    """The map on ``floor``, of those ``given`` by the floor that they name. One that names none is
+    of the floor that the log is of first, unless another names that one."""
+    named = None if floor is None else given.get(floor)
+    return given.get(None) if named is None and is_first else named
 
 
 class CurrentMap:
