@@ -1,4 +1,5 @@
-"""The map's embedding space: which vectors are compared with each other."""
+"""The map's embedding space: which vectors are compared with each other, and vectors of that space
+that detections were given later."""
 
 from collections.abc import Sequence
 

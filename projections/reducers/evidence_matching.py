@@ -1,4 +1,11 @@
-"""Which Object each observation of a picture is of: rules 1 to 3 of `evidence_objects`."""
+"""Which Object each observation of a picture is of: rules 1 to 3 of `evidence_objects`.
+
+Where several observations want the same Object, `assign` makes the choice with the largest sum of
+evidence. Observations that want no Object in common do not depend on each other. Of those that do,
+up to `_MOST` are assigned by the Hungarian method, each considered for as many Objects as there are
+observations, its best. More than that, which no camera sees, are assigned greedily, the largest
+evidence first, so that a picture's cost is bounded.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias

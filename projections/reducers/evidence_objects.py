@@ -10,7 +10,7 @@ The rules, for the observations of one picture:
     (`label_counts`). Below −5 the sight alone rules a candidate out.
 3.  Each observation goes to one Object, and each Object gets one observation of a picture: two
     things in one picture are not one. Of all such choices that with the largest sum of evidence is
-    taken, a pair's being above 0 (`assignment`). What is left founds Objects. Where other Objects,
+    taken, a pair's being above 0 (`assign`). What is left founds Objects. Where other Objects,
     or a new one, or two observations exchanged were nearly as probable, the sight weighs only its
     probability in the estimate, and below 0.85 the look is no exemplar.
 4.  The Object's estimate is solved again from its spots (`spots`), its class is that of most of its

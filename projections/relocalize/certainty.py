@@ -1,8 +1,8 @@
-"""How sure an answer is: `known`, whether the map has the things shown, and `confidence`, whether
-the pose is within 1.5 m.
+"""How sure an answer is: `known`, whether the map has the things shown, `confidence`, whether the
+pose is within 1.5 m, and `thinness`, whether the map has too few observations to trust either.
 
-Both are logistic models. What they are computed from depends neither on the embedding model nor on
-the size of the map: likenesses are relative, (cosine - different) / (1 - different), 0 for what
+`known` and `confidence` are logistic models. Their inputs depend neither on the embedding model nor
+on the size of the map: likenesses are relative, (cosine - different) / (1 - different), 0 for what
 different things of this map look like to each other and 1 for the same picture. A thing seen again
 on another day has some 0.75, the most similar of a building that was never mapped 0.2 to 0.4, or
 0.7 where it has furniture of the same model.
@@ -10,6 +10,10 @@ on another day has some 0.75, the most similar of a building that was never mapp
 The weights are for all maps; `scripts/fit_confidence` fits them. How far a map is off is in its
 `LocalizerConstants`: a shift and a scale of the logit, which `mapfold calibrate` reads off the
 map's own questions.
+
+Nothing measured on other maps holds for one that a robot has just begun: the few things it has seen
+are the most similar to any crop, and every pose is near the few spots they were seen from. The
+candidates show that, so `thinness` costs a question nothing.
 """
 
 import math

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.deltas import ObjectOrdinal
+from projections.reducers import evidence_matching
 from projections.reducers.evidence_matching import Match, assign
 
 _VALUES = st.one_of(st.sampled_from([1.0, 2.0, 3.0]), st.floats(1e-6, 30.0))
@@ -63,7 +64,7 @@ def test_an_observation_leaves_its_best_object_to_one_that_has_no_other() -> Non
 @pytest.mark.parametrize("objects", [5, 60])
 def test_more_observations_than_a_camera_sees_take_the_best_first(objects: int) -> None:
     chance = random.Random(objects)
-    many = 2 * assignment._MOST
+    many = 2 * evidence_matching._MOST
     wanted = [{o: 0.1 + chance.random() for o in range(objects)} for _ in range(many)]
     matches = _matches(wanted)
     taken = assign(matches)
@@ -75,7 +76,7 @@ def test_more_observations_than_a_camera_sees_take_the_best_first(objects: int) 
 
 def test_the_largest_picture_is_assigned_with_the_largest_sum() -> None:
     """All want the same Objects, in the same order, one more than the other."""
-    size = assignment._MOST
+    size = evidence_matching._MOST
     matches = _matches([{o: (row + 1.0) * (size - o) for o in range(size)} for row in range(size)])
     taken = assign(matches)
     _check_valid(matches, taken)
