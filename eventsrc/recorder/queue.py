@@ -15,6 +15,7 @@ it is no such gap.
 import threading
 import time
 from collections import deque
+from collections.abc import Iterable
 from typing import Final
 
 from eventsrc.gaps import DEFAULT_SETTLE_NS, Gap, GapLedger
@@ -154,15 +155,20 @@ class MessageQueue:
 
     def put(self, message: Received) -> None:
         """Add a message, or count it as lost if there is no room in time."""
+        self.put_all((message,))
+
+    def put_all(self, messages: Iterable[Received]) -> None:
+        """Add messages in order, and count those as lost that find no room in time."""
         with self._lock:
-            if message.number is not None:
-                self._sequence_gaps.record(message.number, time.monotonic_ns())
-            if self._fits(message) or self._wait_for_room(message):
-                self._messages.append(message)
-                self._bytes += len(message.payload)
-            elif not message.key.endswith(SENT_SUFFIX):  # an announcement is no event
-                self.overflowed += 1
-                _count(self._overflow, message.key)
+            for message in messages:
+                if message.number is not None:
+                    self._sequence_gaps.record(message.number, time.monotonic_ns())
+                if self._fits(message) or self._wait_for_room(message):
+                    self._messages.append(message)
+                    self._bytes += len(message.payload)
+                elif not message.key.endswith(SENT_SUFFIX):  # an announcement is no event
+                    self.overflowed += 1
+                    _count(self._overflow, message.key)
             if self._getting:
                 self._filled.notify()
 
@@ -259,6 +265,7 @@ class MessageQueue:
         if not self._may_wait:
             return False
         self._putting += 1
+        self._filled.notify()  # of messages put before this one
         self._emptied.wait_for(lambda: self._fits(message) or not self._may_wait, self._max_wait_s)
         self._putting -= 1
         fits = self._fits(message)

@@ -91,7 +91,7 @@ class Recorder:
             subscription
             for key in keys
             for subscription in (
-                session.subscribe(key, self._receive, limit=limit),
+                session.subscribe_batches(key, self._receive, limit),
                 session.subscribe(sent_key(key), self._queue.put, limit=sent_limit),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
@@ -168,11 +168,11 @@ class Recorder:
         self._queue.close()
         writing.result()
 
-    def _receive(self, message: Received) -> None:
+    def _receive(self, messages: Sequence[Received]) -> None:
         # A recorder of `**` receives acks and refusals too, also its own. They are not data. Crops
         # it receives twice.
-        if not message.key.startswith((ACK_PREFIX, *self._crop_prefixes)):
-            self._queue.put(message)
+        ignored = (ACK_PREFIX, *self._crop_prefixes)
+        self._queue.put_all([m for m in messages if not m.key.startswith(ignored)])
 
     def _receive_bridged(self, message: Received) -> None:
         self._queue.put(BridgedMessage(*message))

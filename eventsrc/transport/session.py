@@ -26,6 +26,8 @@ from eventsrc.errors import MisuseError
 
 from .config import Mode, ZenohOptions, check_endpoints, configure
 from .declarations import (
+    CHANNEL_SIZE,
+    BatchSubscription,
     Publisher,
     Query,
     Received,
@@ -95,6 +97,18 @@ class Session:
         with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
             called = zenoh.handlers.Callback(receive, indirect=not in_order)
             return Subscription(self.raw.declare_subscriber(key_expr, called))
+
+    def subscribe_batches(
+        self, key_expr: str, handler: Callable[[list[Received]], None], limit: SizeLimit
+    ) -> Subscription:
+        """Like `subscribe`, with all messages that have come since the call before, in order. For
+        many messages a second, of which each would else interrupt the program's other threads."""
+        check_key_length(key_expr)
+        with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
+            channel: zenoh.handlers.FifoChannel[zenoh.Sample]
+            channel = zenoh.handlers.FifoChannel(CHANNEL_SIZE)
+            subscriber = self.raw.declare_subscriber(key_expr, channel)
+        return BatchSubscription(subscriber, handler, limit)
 
     def subscribe_heartbeats(
         self, key_expr: str, handler: Callable[[SequenceNumber], None]

@@ -9,12 +9,14 @@ import pytest
 import zenoh
 
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
+from eventsrc.transport.declarations import CHANNEL_SIZE
 from eventsrc.transport.session import (
     Query,
     Received,
     Router,
     SequenceNumber,
     Session,
+    SizeLimit,
     ZenohOptions,
     open_session,
 )
@@ -43,6 +45,32 @@ def test_bytes_arrive_as_sent_and_in_order(connected: Sessions) -> None:
     assert [m.payload for m in got] == sent
     assert {m.key for m in got} == {"tb/detections"}
     assert {m.number for m in got} == {None}
+
+
+def test_batches_hold_all_messages_in_order_but_those_over_the_limit(connected: Sessions) -> None:
+    """While the first batch is handled, more messages come than Zenoh's channel holds."""
+    batches: list[list[Received]] = []
+    refused: queue.SimpleQueue[str] = queue.SimpleQueue()
+    sent_some = threading.Event()
+
+    def handle(batch: list[Received]) -> None:
+        batches.append(batch)
+        sent_some.wait(DEADLINE_S)
+
+    limit = SizeLimit(1_000, lambda key, _number: refused.put(key))
+    subscription = connected().subscribe_batches("tb/*", handle, limit)
+    publisher = connected().publisher("tb/detections")
+    assert publisher.wait_for_subscriber(DEADLINE_S)
+    payloads = [b"%d" % number for number in range(3 * CHANNEL_SIZE)]
+    for payload in payloads:
+        publisher.put(payload)
+    sent_some.set()
+    publisher.put(bytes(1_001))
+    assert refused.get(timeout=DEADLINE_S) == "tb/detections"
+    subscription.close()
+    assert [message.payload for batch in batches for message in batch] == payloads
+    assert {message.key for batch in batches for message in batch} == {"tb/detections"}
+    assert max(map(len, batches)) > 1
 
 
 def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected: Sessions) -> None:

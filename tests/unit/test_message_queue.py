@@ -117,6 +117,23 @@ def test_a_full_queue_slows_the_sender_down_and_loses_nothing() -> None:
     assert queue.overflowed == 0
 
 
+def test_messages_put_together_wake_who_waits_before_they_wait_for_room() -> None:
+    queue = MessageQueue(2, max_wait_s=DEADLINE_S)
+    texts = [str(n) for n in range(100)]
+    taken: list[str] = []
+
+    def take() -> None:
+        while len(taken) < len(texts):
+            taken.extend(_texts(queue.get(3, 100 * DEADLINE_S)))
+
+    taker = threading.Thread(target=take)
+    taker.start()
+    queue.put_all(map(_message, texts))
+    taker.join(DEADLINE_S)
+    assert taken == texts
+    assert queue.overflowed == 0
+
+
 def test_after_one_timeout_messages_are_lost_at_once_until_half_is_free() -> None:
     """A sender that waits for ever would hang this test: only the first loss may take time."""
     queue = MessageQueue(4, max_wait_s=0.01)
