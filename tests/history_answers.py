@@ -78,6 +78,7 @@ def stories(known: KnownHistory) -> dict[str, Any]:
         "object merges": [object_merge_document(history, each) for each in known.object_merges()],
         "places": [known.why(each).document() for each in history.place_ordinals],
         "objects": [known.why(each).document() for each in history.object_ordinals],
+        "searches": searches(known, names),
         "pairs": [known.why_same(*pair).document() for pair in pairs],
         "diff": difference_of(first, last, {}, ()).document(),
         "skipped": list(history.skipped),
@@ -86,6 +87,22 @@ def stories(known: KnownHistory) -> dict[str, Any]:
         "placed": [list(history.placed_offsets), list(history.placed_in)],
         "ordinals": dict(history.keyframe_ordinals),
     }
+
+
+def searches(known: KnownHistory, names: list[str]) -> list[dict[str, Any]]:
+    """When conditions turned true, each asked by a scan and, where that can do, by bisection."""
+    history = known.history
+    conditions = ["noise_count > 2", "place_count == 2", "keyframe_count > 5"]
+    conditions += [f"place_of({name!r}) != none" for name in names[:1]]
+    conditions += [f"same_place({a!r}, {b!r})" for a, b in zip(names, names[4:5], strict=False)]
+    conditions += [f"keyframe_count({runs[0].run_id!r}) > 3" for runs in history.runs]
+    conditions += [f"size({name!r}) > 4" for name in list(history.place_ordinals)[:2]]
+    conditions += [f"sightings({name!r}) > 2" for name in list(history.object_ordinals)[:2]]
+    return [
+        known.bisect(condition, scan=scan).document()
+        for condition in conditions
+        for scan in (False, True)
+    ]
 
 
 def told(timeline: Timeline, ends: Iterable[int]) -> dict[str, Any]:

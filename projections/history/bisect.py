@@ -9,16 +9,18 @@ answer is always the first offset at which the condition *became* true.
 from array import array
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from eventsrc.envelope import Offset
 
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression
 from .history import NEVER, History
-from .names import id_of_place, keyframe_ordinal
+from .names import id_of_place, keyframe_name, keyframe_ordinal
 from .records import Cause, ObjectHistory, PlaceHistory
 
 
@@ -26,14 +28,12 @@ class CountIndex:
     """Sorted offsets at which counts rise or fall, made once from a history."""
 
     def __init__(self, history: History) -> None:
-        self.posed = array("q", (k.offset for k in history.keyframes if k.pose is not None))
-        self.placed = _sorted(offset for offset in history.placed_offsets if offset != NEVER)
+        self.posed = history.posed_offsets()
+        self.placed = _placed_offsets(history)
         self.formed = _sorted(place.formed.offset for place in history.places)
         self.absorbed = _sorted(m.cause.offset for m in history.merges for _ in m.absorbed)
-        self.keyframes_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
+        self.keyframes_of = history.offsets_by_run()
         self.objects_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-        for keyframe in history.keyframes:
-            self.keyframes_of[keyframe.run_id].append(keyframe.offset)
         self.fused_of: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         for each in history.objects:
             self._add_classes(each)
@@ -63,6 +63,13 @@ class CountIndex:
             self.objects_of[name].append(classified.offset)
         if until is not None:
             self.fused_of[name].append(until.offset)
+
+
+def _placed_offsets(history: History) -> Sequence[int]:
+    """The events that placed keyframes, in order."""
+    placed = np.asarray(history.placed_offsets)
+    found: Any = np.sort(placed[placed != NEVER])
+    return memoryview(found)
 
 
 def _sorted(offsets: Iterable[int]) -> "array[int]":
@@ -154,11 +161,18 @@ class HistoryFacts:
     def refused_count(self) -> int:
         return self._count(self._index.refused)
 
+    def has(self, kind: Names, text: str) -> bool:
+        """Whether a thing of a kind has this name in the whole history."""
+        if kind is Names.KEYFRAME:
+            ordinal = keyframe_ordinal(self._history, text)
+            return ordinal is not None and keyframe_name(self._history, ordinal) == text
+        return text in self.names(kind)
+
     def names(self, kind: Names) -> Iterable[str]:
         """The names of all things of a kind in the whole history."""
         match kind:
             case Names.KEYFRAME:
-                return [f"{k.run_id}:{k.keyframe_id}" for k in self._history.keyframes]
+                return (f"{k.run_id}:{k.keyframe_id}" for k in self._history.keyframes)
             case Names.PLACE:
                 return self._history.place_ordinals.keys()
             case Names.OBJECT:
@@ -170,7 +184,7 @@ class HistoryFacts:
             case Names.NAME:
                 return self._index.places_called.keys()
 
-    def _count(self, offsets: "array[int] | tuple[()]") -> int:
+    def _count(self, offsets: Sequence[int]) -> int:
         return bisect_left(offsets, self.end)
 
 

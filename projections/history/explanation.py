@@ -1,5 +1,6 @@
 """Why a place or an object is what it is: what happened to it, event by event."""
 
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -103,7 +104,8 @@ def _place_entries(history: History, record: PlaceHistory) -> Iterator[Entry]:
 
 def _founding(history: History, record: PlaceHistory) -> Entry:
     founder = record.formed.founder
-    first = [d.keyframe for d in record.joined if d.offset == record.formed.offset]
+    founding = count_before(record.joined, Offset(record.formed.offset + 1))
+    first = [d.keyframe for d in record.joined[:founding]]
     named = ", ".join(keyframe_name(history, k) for k in first[:MOST_FOUNDERS])
     more = f" and {len(first) - MOST_FOUNDERS} more" if len(first) > MOST_FOUNDERS else ""
     where = position_text(history.keyframes[founder].pose)
@@ -360,4 +362,4 @@ def _milestones_up_to(count: int) -> int:
     if count < 10:
         return 0
     digits = str(count)
-    return 3 * (len(digits) - 2) + sum(digits[0] >= lead for lead in "125")
+    return 3 * (len(digits) - 2) + bisect_right("125", digits[0])

@@ -10,7 +10,7 @@ An ``end`` is a number of events: the answer is about the map after the events 0
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, MutableSequence, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -194,6 +194,17 @@ class History:
     def keyframe_count(self, end: Offset) -> int:
         """Keyframes added by the events below ``end``."""
         return bisect_left(self.keyframe_offsets, end)
+
+    def posed_offsets(self) -> Sequence[int]:
+        """The events that added keyframes with a pose, in order."""
+        return array("q", (k.offset for k in self.keyframes if k.pose is not None))
+
+    def offsets_by_run(self) -> Mapping[str, Sequence[int]]:
+        """By run the events that added its keyframes, in order."""
+        found: dict[str, array[int]] = {}
+        for keyframe in self.keyframes:
+            found.setdefault(keyframe.run_id, array("q")).append(keyframe.offset)
+        return found
 
     def cause_at(self, offset: Offset) -> Cause:
         """The cause of what the event at ``offset`` did."""

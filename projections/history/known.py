@@ -259,7 +259,6 @@ def _check_names(expression: Expression, facts: HistoryFacts) -> None:
     """Raises ExpressionError for a name that is not in the log: a condition on it would never
     hold."""
     for mention in expression.mentions():
-        names = facts.names(mention.kind)
-        if mention.text not in names:
-            error = NoSuchThing(mention.kind.value, mention.text, names)
+        if not facts.has(mention.kind, mention.text):
+            error = NoSuchThing(mention.kind.value, mention.text, facts.names(mention.kind))
             raise expression.error_at(mention.column, str(error))

@@ -1,6 +1,8 @@
 """Sequences whose items are made from rows of tables when they are asked for."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Final, TypeVar, overload
 
 from numpy.typing import NDArray
@@ -8,13 +10,17 @@ from numpy.typing import NDArray
 _T = TypeVar("_T")
 _KEPT: Final = 64
 _AT_ONCE: Final = 4_096
+_MOST_CHUNKS: Final = 256
 
 
 class Chunks(Sequence[_T]):
     """``count`` items; ``make`` makes those from an index to before another.
 
-    Items that are asked for one by one are kept with their neighbours; a walk over all keeps none.
+    Items that are asked for one by one are kept with their neighbours, those made last; a walk over
+    all keeps none.
     """
+
+    __slots__ = ("_count", "_kept", "_make")
 
     def __init__(self, count: int, make: Callable[[int, int], list[_T]]) -> None:
         self._count, self._make = count, make
@@ -39,6 +45,8 @@ class Chunks(Sequence[_T]):
         chunk, within = divmod(at, _KEPT)
         if chunk not in self._kept:
             first = chunk * _KEPT
+            if len(self._kept) == _MOST_CHUNKS:
+                del self._kept[next(iter(self._kept))]
             self._kept[chunk] = self._make(first, min(first + _KEPT, self._count))
         return self._kept[chunk][within]
 
@@ -47,32 +55,28 @@ class Chunks(Sequence[_T]):
             yield from self._make(first, min(first + _AT_ONCE, self._count))
 
 
-class Items(Sequence[_T]):
-    """The items of ``rows``, all made by ``make`` when the first is asked for."""
+class Items(Chunks[_T]):
+    """The items of some rows, in order of offset. ``make`` makes those of given rows, ``offsets``
+    says of which events they are."""
 
-    __slots__ = ("_items", "_make", "_rows")
+    __slots__ = ("_made_offsets", "_offsets", "_rows")
 
-    def __init__(self, rows: NDArray[Any], make: Callable[[NDArray[Any]], list[_T]]) -> None:
-        self._rows, self._make = rows, make
-        self._items: list[_T] | None = None
+    def __init__(
+        self,
+        rows: NDArray[Any],
+        make: Callable[[NDArray[Any]], list[_T]],
+        offsets: Callable[[NDArray[Any]], NDArray[Any]],
+    ) -> None:
+        super().__init__(len(rows), lambda first, last: make(rows[first:last]))
+        self._rows, self._offsets = rows, offsets
+        self._made_offsets: memoryview | None = None
 
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @overload
-    def __getitem__(self, index: int) -> _T: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[_T]: ...
-    def __getitem__(self, index: int | slice) -> _T | list[_T]:
-        return self._all()[index]
-
-    def __iter__(self) -> Iterator[_T]:
-        return iter(self._all())
-
-    def _all(self) -> list[_T]:
-        if self._items is None:
-            self._items = self._make(self._rows) if len(self._rows) else []
-        return self._items
+    def before(self, end: int) -> int:
+        """How many items are of events below ``end``."""
+        if self._made_offsets is None:
+            found: Any = self._offsets(self._rows)
+            self._made_offsets = memoryview(found)
+        return bisect_left(self._made_offsets, end)
 
 
 class Found(Mapping[Any, Any]):
@@ -81,7 +85,7 @@ class Found(Mapping[Any, Any]):
     def __init__(
         self, count: int, find: Callable[[Any], int | None], names: Callable[[], Iterator[Any]]
     ) -> None:
-        self._count, self._find, self._names = count, find, names
+        self._count, self._find, self._names = count, lru_cache(_KEPT)(find), names
 
     def __len__(self) -> int:
         return self._count

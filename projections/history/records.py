@@ -38,6 +38,8 @@ from projections.deltas import (
     PlaceOrdinal,
 )
 
+from .lazy_rows import Items
+
 CauseKind = Literal["keyframe", "command"]
 
 
@@ -278,10 +280,12 @@ _offset = attrgetter("offset")
 
 def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
     """How many of the items, sorted by offset, are of events below ``end``."""
+    if isinstance(items, Items):
+        return items.before(end)
     return bisect_left(items, end, key=_offset)
 
 
 def last_before(items: Sequence[_T], end: Offset) -> _T | None:
     """The last item, sorted by offset, of the events below ``end``."""
-    count = bisect_left(items, end, key=_offset)
+    count = count_before(items, end)
     return items[count - 1] if count else None

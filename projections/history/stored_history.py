@@ -1,6 +1,6 @@
 """A history read from tables: what `History` keeps as records in memory, made when asked for."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import starmap
 from typing import Any, Final, TypeVar, cast
@@ -41,7 +41,7 @@ from .history import NEVER, NO_PLACE, History
 from .lazy_rows import Chunks, Found, Items
 from .neighbours import Neighbours, Posed
 from .records import Cause, Merge, ObjectHistory, ObjectMerge, PlaceHistory, Refusal
-from .tables import Tables
+from .tables import Groups, Tables
 
 _T = TypeVar("_T")
 MapAt = Callable[[Offset], OccupancyMap]
@@ -89,6 +89,18 @@ class StoredHistory(History):
         """Keyframes added by the events below ``end``."""
         return self.tables.before("keyframe", end)
 
+    def posed_offsets(self) -> Sequence[int]:
+        """The events that added keyframes with a pose, in order."""
+        posed = self.tables.column("keyframe", "posed").astype(np.bool_)
+        return _as_ints(self.tables.integers("keyframe", "offset")[posed])
+
+    def offsets_by_run(self) -> Mapping[str, Sequence[int]]:
+        """By run the events that added its keyframes, in order."""
+        offsets = self.tables.integers("keyframe", "offset")
+        by_run = Groups(self.tables.column("keyframe", "run"), offsets)
+        found = {seen[0].run_id: by_run[number] for number, seen in enumerate(self.runs)}
+        return {run_id: _as_ints(of) for run_id, of in found.items() if len(of)}
+
     def cause_at(self, offset: Offset) -> Cause:
         """The cause of what the event at ``offset`` did."""
         (cause,) = self.causes_at([offset])
@@ -97,8 +109,9 @@ class StoredHistory(History):
     def causes_at(self, offsets: Sequence[Offset]) -> list[Cause]:
         """`cause_at` of many."""
         tables, keyframes = self.tables, np.asarray(self.keyframe_offsets)
-        rows = np.searchsorted(keyframes, np.array(offsets, np.int64))
-        found = np.append(keyframes, NEVER)[rows] == offsets
+        asked = np.array(offsets, np.int64)
+        rows = np.searchsorted(keyframes, asked)
+        found = np.searchsorted(keyframes, asked, "right") > rows
         numbers = rows[found]
         values = zip(
             tables.column("keyframe", "timestamp")[numbers].tolist(),
@@ -241,7 +254,12 @@ def _items(
     if not len(rows):
         return []
     # A sequence; the records say list because a fold appends to theirs.
-    return cast("list[_T]", Items(rows, lambda of: list(starmap(delta, tables.rows_at(table, of)))))
+    found = Items(
+        rows,
+        lambda of: list(starmap(delta, tables.rows_at(table, of))),
+        lambda of: tables.integers(table, "offset")[of],
+    )
+    return cast("list[_T]", found)
 
 
 def documents(tables: Tables, table: str, type_: type[_T], count: int | None = None) -> list[_T]:

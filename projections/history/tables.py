@@ -21,6 +21,7 @@ from .columns import NONE, STRIPE_EVENTS, TABLES, Array, Stripe, joined
 Rows = NDArray[np.int64]
 _T = TypeVar("_T")
 _MANY: Final = 4_000
+_AT_ONCE: Final = 65_536
 
 
 class DamagedPart(Exception):
@@ -42,6 +43,7 @@ class Tables:
         self._again = again
         self._columns: dict[str, Array] = {}
         self._groups: dict[str, Groups] = {}
+        self._unreleased = 0  # rows that were read
 
     @property
     def end(self) -> Offset:
@@ -115,19 +117,14 @@ class Tables:
                 for row in _stripe_rows(stripe, table, a, b)
             ]
         )
-        if len(found) >= _MANY:  # on the way through all, which then must not fill the memory
+        self._unreleased += len(found)
+        if self._unreleased >= _MANY:  # perhaps on the way through all, which must not fill memory
             self._release()
         return found
 
     def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
         """These rows, each with all its columns in order."""
-        found = self._safely(
-            lambda: list(
-                zip(*(self._picked(table, each, numbers) for each in TABLES[table]), strict=True)
-            )
-        )
-        self._release()
-        return found
+        return self._safely(lambda: self._rows_at(table, numbers))
 
     def _before(self, table: str, end: Offset) -> int:
         count = 0
@@ -155,28 +152,25 @@ class Tables:
         return found[:wanted]
 
     def _release(self) -> None:
-        for stripe in self.stripes:
-            stripe.release()
+        self._unreleased = 0
+        for release in {stripe.release for stripe in self.stripes}:
+            release()
 
-    def _picked(self, table: str, column: str, numbers: Array) -> list[Any]:
-        """The values of a column in these rows; of each stripe only the rows asked for."""
-        kind, name = TABLES[table][column], f"{table}.{column}"
+    def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
+        """These rows; of each stripe only the rows asked for are read."""
         bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in self.stripes)])
         within = np.searchsorted(bounds, numbers, "right") - 1
-        found = np.empty(len(numbers), object)
+        found: list[tuple[Any, ...]] = []
+        places: list[Array] = []
         for index in np.unique(within).tolist():
-            stripe, here = self.stripes[index], within == index
-            rows = numbers[here] - bounds[index]
-            if kind == "text":
-                values: list[Any] = [stripe.text(table, column, row) for row in rows.tolist()]
-            elif kind == "code":
-                strings = [*stripe.strings, None]
-                values = [strings[code] for code in stripe.arrays[name][rows].tolist()]
-            else:
-                values = _values(stripe.arrays[name][rows], kind)
-            found[here] = values
-        picked: list[Any] = found.tolist()
-        return picked
+            here = np.flatnonzero(within == index)
+            found += _picked(self.stripes[index], table, numbers[here] - bounds[index])
+            places.append(here)
+            self._release()
+        if len(places) < 2:
+            return found
+        order = np.argsort(np.concatenate(places)).tolist()
+        return [found[place] for place in order]
 
     def _codes(self, table: str, column: str, count: int | None) -> tuple[Array, list[str]]:
         strings: list[str] = []
@@ -245,6 +239,21 @@ def _stripe_rows(stripe: Stripe, table: str, first: int, last: int) -> list[tupl
     return list(zip(*columns, strict=True))
 
 
+def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
+    """These rows of a stripe."""
+    columns: list[Any] = []
+    for column, kind in TABLES[table].items():
+        if kind == "text":
+            columns.append([stripe.text(table, column, row) for row in rows.tolist()])
+        elif kind == "code":
+            strings = [*stripe.strings, None]
+            codes = stripe.arrays[f"{table}.{column}"][rows].tolist()
+            columns.append([strings[code] for code in codes])
+        else:
+            columns.append(_values(stripe.arrays[f"{table}.{column}"][rows], kind))
+    return list(zip(*columns, strict=True))
+
+
 def _values(array: Array, kind: str) -> list[Any]:
     values: list[Any] = array.tolist()
     if kind == "flag":
@@ -257,5 +266,7 @@ def _values(array: Array, kind: str) -> list[Any]:
 def last_rows(values: Array, size: int) -> Rows:
     """For each of 0 … ``size`` - 1 the last index at which ``values`` has it, -1 for none."""
     found = np.full(size, NONE, np.int64)
-    found[values] = np.arange(len(values))  # of equal indices the last one is kept
+    for first in range(0, len(values), _AT_ONCE):  # in spans: numpy makes 64-bit copies of both
+        some = values[first : first + _AT_ONCE]
+        found[some] = np.arange(first, first + len(some))  # of equal indices the last one is kept
     return found
