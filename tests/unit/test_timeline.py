@@ -167,6 +167,8 @@ def test_an_absent_keyframe_lists_the_near_ones(corridor: Timeline) -> None:
 def test_a_condition_on_an_unknown_name_is_an_error_at_its_column(corridor: Timeline) -> None:
     with pytest.raises(ExpressionError, match="no place 'run-a_p9'") as caught:
         corridor.bisect("place_count < 3 and merged('run-a_p9')")
+    with pytest.raises(ExpressionError, match="no keyframe 'run-a:02' in this log; near it: run-a"):
+        corridor.bisect("place_of('run-a:02') != none")
     assert caught.value.column == 28
 
 
