@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from eventsrc.advised import advised
 from eventsrc.errors import MapfoldError
+from eventsrc.log.reader import segments_of
 from projections.queries.relocalize import CandidateReader
 from projections.relocalize import Answer, Camera, Question, rank
 
@@ -32,12 +33,11 @@ def ask_sites(
     jobs: int,
 ) -> FleetAnswer:
     """Ask each site; one that cannot be asked counts neither for nor against the others."""
-    names = [site.name for site in sites]
     with ThreadPoolExecutor(jobs, "ask") as threads:  # it mostly waits for the databases
         answers = threads.map(
-            lambda name: _ask(databases[name], question, top=top, camera=camera), names
+            lambda site: _ask(site, databases[site.name], question, top=top, camera=camera), sites
         )
-        found = dict(zip(names, answers, strict=True))
+        found = {site.name: answer for site, answer in zip(sites, answers, strict=True)}
     return FleetAnswer(
         which_site({name: a for name, a in found.items() if isinstance(a, Answer)}),
         {name: a for name, a in found.items() if isinstance(a, str)},
@@ -45,12 +45,13 @@ def ask_sites(
 
 
 def _ask(
-    databases: SiteDatabases, question: Question, *, top: int, camera: Camera | None
+    site: Site, databases: SiteDatabases, question: Question, *, top: int, camera: Camera | None
 ) -> Answer | str:
     """The answer of one site's map, or why there is none."""
     try:
         for url in databases.urls:
             if exists(url) is False:
+                segments_of(site.log)  # raises where there is no log to replay
                 return f"there is no such database yet; `{advised('fleet', 'replay')}` makes it"
         with CandidateReader(databases.targets) as reader:
             candidates = reader.candidates(question.crops)

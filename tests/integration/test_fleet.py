@@ -207,6 +207,11 @@ def test_relocalize_ranks_the_sites(fleet: Fleet, tmp_path: Path) -> None:
     text = fleet.run("fleet", "relocalize", listed, query, code=3)
     assert text.out == "no site could be asked\n"
 
+    absent = tmp_path / "absent"
+    listed.write_text(f"new {absent}")
+    text = fleet.run("fleet", "relocalize", listed, query, code=3)
+    assert f"not asked: new: no log at {absent}; " in text.err
+
     text = fleet.run("fleet", "relocalize", fleet.sites / "..", query, code=None)
     assert text.code == 2  # the folder above the sites has no log in its subfolders
     text = fleet.run("fleet", "relocalize", fleet.sites, query)
