@@ -4,7 +4,8 @@
   web page could point its own name at this address and read the answers (DNS rebinding).
 * ``Origin``, which browsers send with requests of other sites, must equal ``Host`` or be one of
   ``--cors``. Pages of those may read the answers: they get the headers of CORS, and their preflight
-  requests, which browsers send without a token, are answered.
+  requests, which browsers send without a token, are answered. With ``--cors`` every response has
+  ``Vary: Origin``, so that a cache does not give a page a response without those headers.
 * With a token, every path requires it: ``Authorization: Bearer TOKEN``.
 """
 
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -119,7 +120,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or refuse it."""
-        await self._chosen(scope)(scope, receive, send)
+        await self._chosen(scope)(scope, receive, _varied(send) if self._origins else send)
 
     def _chosen(self, scope: Scope) -> ASGIApp:
         headers = Headers(scope=scope)
@@ -154,6 +155,19 @@ class Guard:
         scheme, _, given = authorization.partition(" ")
         ours = self._token or b""
         return hmac.compare_digest(given.strip().encode(), ours) and scheme.lower() == "bearer"
+
+
+def _varied(send: Send) -> Send:
+    """``send``, with ``Vary: Origin`` in a response that does not have it."""
+
+    async def send_varied(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            if "origin" not in headers.get("vary", "").lower():
+                headers.add_vary_header("Origin")
+        await send(message)
+
+    return send_varied
 
 
 class _Cors(CORSMiddleware):

@@ -323,6 +323,12 @@ class TestOtherSites:
             assert "Origin" in fields["vary"]
             assert "access-control-allow-credentials" not in fields
 
+    def test_caches_keep_answers_with_and_without_an_origin_apart(self, service: Service) -> None:
+        for headers in ({}, {"Origin": FRIEND}, {"Origin": "https://evil.example"}):
+            for path in ("/health", "/nothing"):
+                _, fields, _ = service.get(path, **headers)
+                assert fields["vary"] == "Origin", (path, headers)
+
     def test_its_preflight_needs_no_token(self, service: Service) -> None:
         asked = {**PREFLIGHT, "Access-Control-Request-Headers": "authorization,content-type"}
         code, fields, _ = service.get("/relocalize", secured=True, Origin=FRIEND, **asked)
