@@ -36,7 +36,7 @@ from projections.relocalize.question import Movement
 
 from .pools import Pools
 from .sessions import Sessions, session_name
-from .states import state_read
+from .states import refuse_unknown, state_read
 
 
 class TooMuchError(MapfoldError):
@@ -99,6 +99,7 @@ class RepeatFilter:
 
 
 MAX_TOP: Final = 100
+_OPTIONS: Final = ("top", "method", "session")
 _DIGITS: Final = re.compile(r"[0-9]{1,9}", re.ASCII)
 DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
@@ -146,6 +147,7 @@ class Answerer:
             raise QuestionError(
                 f"the question has {len(payload)} bytes, more than {self.max_bytes}"
             )
+        refuse_unknown(options, _OPTIONS)
         with self._parsing:
             asked = _read(payload, options)
         question = asked.question

@@ -98,6 +98,8 @@ def create_app(
         payload = await read_body(request, answerer.max_bytes)
         given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
+        unknown = {n: value for n, value in request.query_params.items() if n not in given}
+        options |= unknown  # refused by name
         return await answered(request, "relocalize", lambda: answerer.relocalize(payload, options))
 
     @app.get(

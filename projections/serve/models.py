@@ -181,7 +181,7 @@ class Refusal(TypedDict):
 
 
 class StateQuery(BaseModel):
-    """What is asked of a state; other parameters are kept, to be refused where they mislead."""
+    """What is asked of a state; other parameters are kept, so that `states` refuses them."""
 
     model_config = ConfigDict(extra="allow")
 

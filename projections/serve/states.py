@@ -8,7 +8,7 @@ exactly once; what is founded meanwhile comes last.
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 from projections.database.connection import Connection
@@ -45,26 +45,28 @@ _STATES: Final = {
 }
 
 
-def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], dict[str, Any]]:
-    """The read that answers a question. Raises QuestionError for what is none.
+def refuse_unknown(options: Iterable[str], names: Sequence[str]) -> None:
+    """Raise QuestionError for an option that is none of ``names``, a misspelt one for example.
+    Names with an underscore in front are Zenoh's own."""
+    for name in options:
+        if name not in names and not name.startswith("_"):
+            raise QuestionError(
+                f"no parameter called {describe_value(name)}; there are {', '.join(names)}"
+            )
 
-    Names other than those of `_NAMES` are left alone beside a position. Without one they are
-    refused: a misspelt ``x`` must not list everything.
-    """
+
+def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], dict[str, Any]]:
+    """The read that answers a question. Raises QuestionError for what is none."""
     reads = _STATES.get(what)
     if reads is None:
         raise QuestionError(
             f"no state called {describe_value(what)}; there are {' and '.join(_STATES)}"
         )
+    refuse_unknown(options, _NAMES)
     if "x" in options or "y" in options:
         return _near(what, reads, options)
-    for name in options:
-        if name == "radius":
-            raise QuestionError("radius is given without x and y; give all three, or none for all")
-        if name not in _NAMES:
-            raise QuestionError(
-                f"no parameter called {describe_value(name)}; there are {', '.join(_NAMES)}"
-            )
+    if "radius" in options:
+        raise QuestionError("radius is given without x and y; give all three, or none for all")
     most, after = _limit(options) or DEFAULT_PAGE, _cursor(options)
 
     def read(connection: Connection) -> dict[str, Any]:

@@ -344,6 +344,7 @@ class TestHttp:
             ("/state/places?x=nan&y=0", None),
             ("/relocalize?top=abc", question()),
             ("/relocalize?top=0", question()),
+            ("/state/places?x=0&y=0&raduis=5", None),
             ("/state/places?x=0", None),
             ("/state/places?y=0", None),
             ("/state/places?X=0&Y=0", None),
@@ -364,6 +365,10 @@ class TestHttp:
         status, document = fetch(f"{http}{path}", data)
         assert status == 400
         assert document["error"]["kind"] == "bad_question"
+
+    def test_a_misspelt_parameter_is_named_with_those_there_are(self, http: str) -> None:
+        said = fetch(f"{http}/relocalize?tpo=3", question())[1]["error"]["message"]
+        assert said == "no parameter called 'tpo'; there are top, method, session"
 
     def test_an_unknown_path_is_refused_in_the_same_form(self, http: str) -> None:
         status, document = fetch(f"{http}/nothing")
