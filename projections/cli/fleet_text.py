@@ -58,7 +58,7 @@ def _sink_cell(sink: SinkStatus) -> str:
     """Condition, and how many events behind; parked events, which were left out."""
     cell: str = sink.condition
     if sink.lag:
-        cell += f" ({sink.lag:,} behind)"
+        cell = f"behind by {sink.lag:,}" if cell == "behind" else f"{cell}, behind by {sink.lag:,}"
     if sink.dead_letters:
         cell += f", {len(sink.dead_letters):,} parked"
     return cell
