@@ -1,7 +1,7 @@
-"""``mapfold fleet``: replay, state, verification and questions over many sites at once.
+"""``mapfold fleet``: replay, status, verification and questions over many sites at once.
 
-Each command ends with exit 3 when something was found at a site, or one failed; the others are done
-all the same.
+A site that fails does not stop the others. A command ends with exit 3 when a site failed or
+something was found at one.
 """
 
 from dataclasses import asdict
@@ -49,10 +49,10 @@ _NAMED: Final = 10
 
 
 def _chosen(file: Any, assignments: list[str] | None) -> Any:
-    """What ``--settings`` and ``--set`` say, read here: workers may be on other machines."""
+    """The values of ``--settings`` and ``--set``, read here: workers may be on other machines."""
     from projections.fleet.replaying import ChosenSettings
 
-    settings_from(file, assignments)  # raises for what cannot be
+    settings_from(file, assignments)  # raises for invalid ones
     base: Settings | None = None if file is None else settings_from(file, None)
     return ChosenSettings(base, tuple(assignments or ()))
 
@@ -89,8 +89,8 @@ def replay(
 ) -> None:
     """Rebuild the databases of all sites that are not up to date.
 
-    It can be interrupted and run again: what is done is skipped. Databases that do not exist are
-    created. A map made from another log is replaced only with --replace.
+    It can be interrupted and run again: sites that are up to date are skipped. Databases that do
+    not exist are created. A map made from another log is replaced only with --replace.
     """
     from projections.fleet.replaying import ReplayRequest, SiteReplay, replay_site
 
@@ -120,7 +120,7 @@ def replay(
                 done = ended.result or SiteReplay("failed", error=ended.error)
                 entries[ended.index] = _replay_entry(site, ended, done)
                 if not as_json and done.report is not None:
-                    again_text = f", begun {ended.attempts} times" if ended.attempts > 1 else ""
+                    again_text = f", started {ended.attempts} times" if ended.attempts > 1 else ""
                     say(
                         f"{visible(site.name)}: {counted(done.report.events, 'event')} in"
                         f" {done.report.total_s:.2f} s; digest {done.report.digest[:16]}"
@@ -297,7 +297,7 @@ def url(
 ) -> None:
     """Print the URL of one site's database, for --db of the commands of one map.
 
-    Of the embedded server it answers while the server runs: see `db start`.
+    A URL of the embedded server works while that server runs: see `db start`.
     """
     sites = sites_of(place)
     if site not in {each.name for each in sites}:

@@ -1,4 +1,4 @@
-"""What ``mapfold fleet`` prints for people: the table of sites, and which site a robot is at."""
+"""Text output of ``mapfold fleet``: the table of sites, and the ranking of sites for a question."""
 
 from collections.abc import Sequence
 from typing import Final

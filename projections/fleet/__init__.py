@@ -1,8 +1,8 @@
-"""Many logs, one a site: replay, state, verification and questions over all of them at once.
+"""Replay, status, verification and questions over many sites.
 
-A *site* has a name, a log and a database of its own (`sites`, `site_databases`). What is done for
-each is a *task*: a function of a request, run by an *engine*, which is a pool of processes on this
-machine (`local_pool`) or a Dask cluster (`cluster`).
+A *site* is a log with a name and a database of its own (`sites`, `site_databases`). A *task* is a
+function of one site's request; an *engine* runs tasks, in a pool of processes on this machine
+(`local_pool`) or on a Dask cluster (`cluster`).
 
-Nothing is imported here: each worker process would wait for it.
+Nothing is imported here, because every worker process would import it too.
 """

@@ -1,4 +1,4 @@
-"""Ask the databases of several sites one question, several at once."""
+"""Ask the databases of several sites the same question, several at once."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +17,7 @@ from .which_site import WhichSite, which_site
 
 @dataclass(frozen=True, slots=True)
 class FleetAnswer:
-    """What the sites that could be asked say together; the others with the reason."""
+    """The ranking of the sites that could be asked, and why the others could not."""
 
     which: WhichSite
     not_asked: Mapping[str, str]

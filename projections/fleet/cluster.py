@@ -1,7 +1,7 @@
-"""Tasks on a Dask cluster: scheduler and workers that are there already (``--engine dask://…``).
+"""Run tasks on an existing Dask cluster (``--engine dask://HOST:PORT``).
 
-The only importer of ``distributed``. One task a site. When a worker is killed the scheduler gives
-its tasks to others; a task that fails for a reason of the machine's is begun again `RETRIES` times.
+The only importer of ``distributed``. Each site is one task. When a worker is killed the scheduler
+gives its tasks to others; a task whose workers were killed is submitted again `RETRIES` times.
 """
 
 import logging
@@ -19,11 +19,11 @@ from .engine import RETRIES, Ended, Progress, Task
 _CONNECT_S: Final = 10.0
 _POLL_S: Final = 0.25
 _GONE_S: Final = 20.0
-"""So long the scheduler may be away: it is not told what is done meanwhile."""
+"""Longest time without a connection to the scheduler; it has no results meanwhile."""
 
 
 class ClusterError(MapfoldError):
-    """The cluster cannot be used, or has gone."""
+    """The cluster cannot be used, or its scheduler has ended."""
 
 
 class DaskCluster:
@@ -37,7 +37,7 @@ class DaskCluster:
             raise MisuseError(
                 "--engine dask:// needs the package distributed: pip install 'mapfold[cluster]'"
             ) from None
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we say it ourselves
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported here
         self.address = address
         client: Any = distributed.Client
         try:
@@ -63,7 +63,7 @@ class DaskCluster:
     def run(
         self, task: Task, requests: Sequence[Any], progress: Progress | None = None
     ) -> Iterator[Ended]:
-        """See `projections.fleet.engine.Engine`; ``progress`` is not told of events."""
+        """See `projections.fleet.engine.Engine`; ``progress`` always receives 0."""
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         name = f"mapfold-{uuid4().hex[:8]}"
         futures: dict[str, tuple[int, Any]] = {}
@@ -94,7 +94,7 @@ class DaskCluster:
                 self._raise_gone(len(futures) + 1, len(requests))
             error = future.exception() if future.status == "error" else None
             if _was_killed(error) and attempts[index] <= RETRIES:
-                submit(index)  # Dask also blames tasks that a killed worker had not begun
+                submit(index)  # Dask also blames tasks that a killed worker had not started
                 continue
             result = None if error is not None else future.result()
             yield Ended(
@@ -112,7 +112,7 @@ class DaskCluster:
 
     def _raise_gone(self, left: int, total: int) -> None:
         raise ClusterError(
-            f"--engine dask://{self.address}: the scheduler has gone; of {left:,} of"
+            f"--engine dask://{self.address}: the scheduler has ended; of {left:,} of"
             f" {counted(total, 'site')} it is not known whether they are done. Run the command"
             " again: it skips those that are"
         )
@@ -121,7 +121,7 @@ class DaskCluster:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Let the scheduler forget tasks that have not begun; those at work end by themselves."""
+        """Cancel tasks that have not started; running ones finish on their workers."""
         self._client.close(timeout=2.0 if kind is None else 0.5)
 
 
@@ -130,7 +130,7 @@ def _call(task: Task, request: Any) -> Any:
 
 
 def _unreported(_events: int) -> None:
-    """A cluster's tasks report at their end."""
+    """Drop the progress of a task: a cluster's tasks report at their end only."""
 
 
 def _was_killed(error: BaseException | None) -> bool:
@@ -140,7 +140,7 @@ def _was_killed(error: BaseException | None) -> bool:
 def _error_text(error: BaseException) -> str:
     if _was_killed(error):
         return (
-            "the workers that had it were killed, one after the other; for want of memory? Look in"
+            "the workers that had it were killed, one after the other; out of memory? Look in"
             " their logs"
         )
     return f"{type(error).__name__}: {str(error)[:400]}"

@@ -1,4 +1,4 @@
-"""What runs a task for each site, and what comes back."""
+"""The interface of engines, which run a task for each site, and their results."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, TypeAlias
 
 RETRIES: Final = 2
-"""So often a site is begun again whose worker process was killed."""
+"""How often the task of a killed worker is started again."""
 
 Progress: TypeAlias = Callable[[int], None]
 """Receives how many events of its site a task has done."""
 Task: TypeAlias = Callable[[Any, Progress], Any]
-"""A function of a module, which a worker imports; the request and the result are pickled. It raises
-nothing that the site's log or database can cause: such errors are in its result."""
+"""A module-level function, which workers import; request and result are pickled. Errors of the
+site's log or database are in its result and not raised."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """What came of the request with this index: a result, or ``error`` when its worker was killed
-    again and again, or met a fault in mapfold. ``attempts`` counts how often it was begun, as far
-    as the engine knows."""
+    """The outcome of the request with this index: a result, or ``error`` when its workers were
+    killed `RETRIES` + 1 times or the task raised. ``attempts`` counts its starts, as far as the
+    engine knows them."""
 
     index: int
     result: Any

@@ -1,11 +1,11 @@
-"""Tasks in worker processes on this machine.
+"""Run tasks in worker processes on this machine.
 
-Each worker is a pool of one process (`concurrent.futures`): when one is killed, its pool breaks and
-no other, so it is known which site was lost, and the others go on. The site is begun again in a new
-process, at most `RETRIES` times.
+Each worker is a pool of one process (`concurrent.futures`). When one is killed only its own pool
+breaks, which identifies the interrupted site; the site is started again in a new process, at most
+`RETRIES` times, and the others go on.
 
-The workers end with the process that started them, however that ends: they hold the reading end of
-a pipe whose only writing end is here. They get no Ctrl-C of the terminal; this process ends them.
+Workers end with the process that started them, even if that is killed: they wait on a pipe whose
+only writing end is here. They ignore Ctrl-C of the terminal; this process ends them.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from .engine import RETRIES, Ended, Progress, Task
 
 _POLL_S: Final = 0.25
 _ERROR_CHARS: Final = 400
-"""Of an unexpected error's text so much is kept."""
+"""Longest text kept of an unexpected error."""
 
 
 class WorkersError(MapfoldError):
@@ -51,7 +51,7 @@ class LocalPool:
     ) -> Iterator[Ended]:
         """See `projections.fleet.engine.Engine`."""
         for slot in range(self._jobs):
-            self._discard(slot)  # of an earlier run, whose counts it has
+            self._discard(slot)  # it has the counters of an earlier run
         self._done = self._context.RawArray("q", max(1, len(requests)))
         waiting = deque(range(len(requests)))
         attempts = [0] * len(requests)
@@ -113,7 +113,7 @@ class LocalPool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the workers at once, also those at work."""
+        """End the workers at once, also running ones."""
         self._alive_writer.close()
         for slot in range(self._jobs):
             self._discard(slot)
@@ -121,7 +121,7 @@ class LocalPool:
 
 
 _done: Any = None
-"""In a worker: the events of each request that are done."""
+"""In a worker: how many events of each request are done."""
 
 
 def _prepare(alive: Connection, done: Any) -> None:
@@ -147,7 +147,7 @@ def _call(task: Task, request: Any, index: int) -> Any:
 def _error_text(error: BaseException, attempts: int) -> str:
     if isinstance(error, BrokenProcessPool):
         return (
-            f"its worker process was killed {counted(attempts, 'time')}; for want of memory? Look"
+            f"its worker process was killed {counted(attempts, 'time')}; out of memory? Look"
             " in the kernel's log, or run with fewer --jobs"
         )
     return f"a fault in mapfold: {type(error).__name__}: {str(error)[:_ERROR_CHARS]}"

@@ -1,5 +1,5 @@
-"""The tasks of ``fleet status`` and ``fleet verify``: a site's log and databases at a glance, and
-its log read whole."""
+"""The tasks of ``fleet status``, the state of a site's log and databases, and of ``fleet verify``,
+which reads every byte of its log."""
 
 from dataclasses import dataclass, field
 
@@ -20,7 +20,7 @@ from .task_errors import advice_for, os_error_text
 
 @dataclass(frozen=True, slots=True)
 class StatusRequest:
-    """A site to look at."""
+    """A site whose status is wanted."""
 
     site: Site
     databases: SiteDatabases
@@ -45,7 +45,7 @@ class SiteStatus:
 
 
 def look_at_site(request: StatusRequest, _: Progress) -> SiteStatus:
-    """The state of one site. Raises nothing that its log or its databases cause."""
+    """The status of one site. Errors of its log and databases are in the result, not raised."""
     with advice_for(request.databases):
         try:
             info = log_info(request.site.log)
@@ -63,7 +63,7 @@ def _databases(request: StatusRequest, info: LogInfo) -> Status:
         return projection_status(request.site.log, urls.targets, request.settings.of)
     others = [url for url in urls.urls if url not in missing]
     found = {}
-    if others:  # the graph's or the vectors' alone
+    if others:  # one of the two exists
         status = projection_status(
             request.site.log, Targets(others[0], others[0]), request.settings.of
         )
@@ -95,7 +95,7 @@ class SiteVerification:
 
 
 def verify_site(site: Site, progress: Progress) -> SiteVerification:
-    """Verify one site's log. Raises nothing that it causes."""
+    """Verify one site's log. Errors of the log are in the result, not raised."""
     try:
         found = verify_log(site.log)
     except MapfoldError as error:

@@ -1,7 +1,7 @@
 """The task of ``fleet replay``: rebuild the databases of one site, unless they are up to date.
 
-A rebuild is swapped in at its end. So a site whose worker was killed has its old map, or the new
-one if that was swapped in just before; then its checkpoint says so and it is not rebuilt twice.
+A rebuild is swapped in by its last transaction. So a site whose worker was killed has either its
+old map, or the new one, in which case its checkpoint is up to date and it is not rebuilt again.
 """
 
 import time
@@ -27,8 +27,8 @@ from .sites import Site
 from .task_errors import advice_for, os_error_text
 
 BUSY_S: Final = 20.0
-"""So long a site is waited for that another process writes: the server may not have noticed yet
-that a worker was killed."""
+"""Longest wait for a site that another process writes: the server may not have noticed yet that a
+worker was killed."""
 _POLL_S: Final = 0.2
 
 Outcome: TypeAlias = Literal["rebuilt", "up_to_date", "followed", "failed"]
@@ -36,7 +36,7 @@ Outcome: TypeAlias = Literal["rebuilt", "up_to_date", "followed", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class ChosenSettings:
-    """What ``--settings`` and ``--set`` say, for logs that may name settings of their own."""
+    """The values of ``--settings`` and ``--set``; logs may name settings of their own."""
 
     base: Settings | None = None
     assignments: tuple[str, ...] = ()
@@ -63,8 +63,8 @@ class ReplayRequest:
 
 @dataclass(frozen=True, slots=True)
 class SiteReplay:
-    """What came of it: ``rebuilt`` with its report, ``up_to_date``, ``followed`` by a live tail,
-    which writes it by itself, or ``failed`` with the reason. ``events`` are those of the log."""
+    """The outcome: ``rebuilt`` with its report, ``up_to_date``, ``followed`` by a live tail, which
+    writes it, or ``failed`` with the reason. ``events`` is the length of the log."""
 
     outcome: Outcome
     events: int = 0
@@ -73,7 +73,7 @@ class SiteReplay:
 
 
 def replay_site(request: ReplayRequest, progress: Progress) -> SiteReplay:
-    """Rebuild one site. Raises nothing that its log or its databases cause."""
+    """Rebuild one site. Errors of its log and databases are in the result, not raised."""
     with advice_for(request.databases):
         try:
             return _replay(request, progress)
@@ -84,7 +84,7 @@ def replay_site(request: ReplayRequest, progress: Progress) -> SiteReplay:
 
 
 def _replay(request: ReplayRequest, progress: Progress) -> SiteReplay:
-    with LogReader(request.site.log) as reader:  # before a database is made
+    with LogReader(request.site.log) as reader:  # fails before a database is created
         events = int(reader.next_offset)
     for url in request.databases.urls:
         create_if_missing(url)
@@ -124,7 +124,7 @@ def _outcome_before(request: ReplayRequest) -> Outcome | None:
     if request.replace and "other" in conditions:
         return None
     for sink in found.sinks:
-        # With other settings it is replaced: that is what a replay is for.
+        # A map of the same log with other settings is replaced without --replace.
         if sink.condition == "other" and sink.lag is None:
             raise ProjectionMismatch(
                 f"{sink.place}: the {sink.sink} there: made from another log, or from more events"
@@ -145,7 +145,7 @@ _REPLACE: Final = "is this the right database for the site? --replace rebuilds i
 
 
 def _refuse_other_events(request: ReplayRequest, found: Status) -> None:
-    """Raise ProjectionMismatch where the last event of a checkpoint is another in the log."""
+    """Raise ProjectionMismatch where the last event of a checkpoint differs from the log's."""
     urls: dict[SinkName, str] = {
         "graph": request.databases.graph_url,
         "vectors": request.databases.vector_url,

@@ -1,8 +1,8 @@
-"""Which database a site has: a template's, or one of the embedded server's, named as the site.
+"""The database of each site: from a URL template, or of the embedded server, named as the site.
 
 A map has fixed names in its database: the graph ``semantic_map``, which Apache AGE keeps as a
 schema, the schema ``mapfold`` with the checkpoints, and tables in ``public``. So two sites cannot
-share a database, not in two schemas either; ``{site}`` stands in the database's name.
+share a database, not even in two schemas, and ``{site}`` must be in the database's name.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ class SiteDatabases:
 
     @property
     def targets(self) -> Targets:
-        """As the functions of one map take them."""
+        """The same URLs as `Targets`, which functions for one map take."""
         return Targets(self.graph_url, self.vector_url)
 
     @property
@@ -207,8 +207,8 @@ def _maintenance(url: str) -> Iterator[Connection | None]:
             server, autocommit=True, application_name="mapfold fleet", connect_timeout=10
         )
     except psycopg.OperationalError:
-        # No server answers, or that database is closed to us. Who connects to the site's own
-        # database next is told which.
+        # No server answers, or this user may not use that database. Connecting to the site's own
+        # database next raises the error that says which.
         yield None
         return
     with connection, database_errors(url):

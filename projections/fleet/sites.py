@@ -1,4 +1,4 @@
-"""Which sites there are: the subfolders of a folder that are logs, or the lines of a list."""
+"""Find sites: the subfolders of a folder that hold a log, or the lines of a list."""
 
 import os
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Messages of the errors that a task meets at its site."""
+"""Error messages of tasks: advised command lines with the site's databases, and file errors."""
 
 import contextlib
 from collections.abc import Collection, Iterator, Sequence
@@ -12,7 +12,7 @@ from .sites import Site
 
 @contextlib.contextmanager
 def advice_for(databases: SiteDatabases) -> Iterator[None]:
-    """Command lines that are advised meanwhile are for one site: they name its databases, without
+    """Add one site's databases to the command lines that messages advise in this context, without
     passwords, which libpq reads from ~/.pgpass or PGPASSWORD."""
 
     def complete(words: Sequence[str], without: Collection[str]) -> list[str]:
@@ -37,5 +37,5 @@ def advice_for(databases: SiteDatabases) -> Iterator[None]:
 
 
 def os_error_text(error: OSError, site: Site) -> str:
-    """An error of the disk, with the file it is about."""
+    """The text of a file error, with its path."""
     return f"{error.filename or site.log}: {error.strerror or error}"

@@ -1,10 +1,10 @@
 """Which of several maps a question is from: the probability of each, and of none. Pure.
 
-Scores of places cannot be compared across maps: they are shares of one map's poses. What can be are
-the two probabilities of an answer, which each map calibrates: `known`, that it has the things
-shown, and `confidence`, that the pose found in it is right. Their logits are evidence for a map
-against none of them. Prior: the robot is in one of the sites or in none as it was where the weights
-were fitted, and each site is as likely.
+Scores of places cannot be compared across maps: they are shares of one map's poses. The two
+probabilities of an answer can, as each map calibrates them: `known`, that it has the things shown,
+and `confidence`, that the pose found is right. Their logits are the evidence for a map against
+"none of them" (docs/decisions/which-building.md). All sites are equally likely before; the prior of
+"none" is that of the questions the weights were fitted on.
 """
 
 import math
@@ -22,7 +22,7 @@ INTERCEPT: Final = -0.568
 sites each, one of them the right one for about half of the questions."""
 FITTED_SITES: Final = 6
 _LEAST: Final = 1e-6
-"""A probability that is nearer to 0 or 1 counts as this near: no one map decides with certainty."""
+"""Probabilities are clipped to this distance from 0 and 1, so that no map decides alone."""
 
 
 @dataclass(frozen=True, slots=True)

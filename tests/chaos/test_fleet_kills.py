@@ -50,7 +50,7 @@ def test_a_scheduler_that_goes_is_an_error_after_a_while(tmp_path: Path) -> None
                 cluster.kill_scheduler()
                 gone.append("scheduler")
 
-        with pytest.raises(ClusterError, match="the scheduler has gone; of 2 of 2 sites"):
+        with pytest.raises(ClusterError, match="the scheduler has ended; of 2 of 2 sites"):
             list(engine.run(wait, requests, kill_scheduler))
 
 
