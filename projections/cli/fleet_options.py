@@ -7,15 +7,31 @@ from typing import Annotated, Any
 
 import typer
 
-from eventsrc.errors import LogError
+from eventsrc.errors import LogError, MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
-from projections.fleet.engine import Ended, Task
-from projections.fleet.engines import open_engine
+from projections.fleet.engine import Ended, Engine, Task, usable_cores
+from projections.fleet.local_pool import LocalPool
 from projections.fleet.sites import Site, find_sites
 
 from .signals import sigterm_unwinds
 from .terminal import Bar, people, say
+
+
+def open_engine(engine: str, jobs: int | None, tasks: int) -> Engine:
+    """``local``, with ``jobs`` processes, or ``dask://HOST:PORT``. Raises MisuseError for anything
+    else."""
+    if engine == "local":
+        return LocalPool(min(jobs or usable_cores(), max(1, tasks)))
+    scheme, _, address = engine.partition("://")
+    if scheme != "dask" or not address:
+        raise MisuseError(f"--engine {engine}: there are local and dask://HOST:PORT")
+    if jobs is not None:
+        raise MisuseError("--jobs is of --engine local; a cluster runs as many as it has workers")
+    from projections.fleet.cluster import DaskCluster  # its package is an extra
+
+    return DaskCluster(address)
+
 
 SitesArgument = Annotated[
     Path,
@@ -64,8 +80,8 @@ def sites_of(place: Path) -> list[Site]:
 def ended_sites(
     task: Task, requests: Sequence[Any], sites: Sequence[Site], engine: str, jobs: int | None
 ) -> Iterator[Iterator[Ended]]:
-    """The results of a task for each site as they come, under a bar; SIGTERM ends the workers as
-    Ctrl-C does."""
+    """The results of a task for each site as they come, with a progress bar. SIGTERM ends the
+    workers, as Ctrl-C does."""
     with sigterm_unwinds(), open_engine(engine, jobs, len(requests)) as running, Bar() as bar:
         yield _shown(running.run, task, requests, sites, bar)
 

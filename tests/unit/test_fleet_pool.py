@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from eventsrc.errors import MisuseError
+from projections.cli.fleet_options import open_engine
 from projections.fleet.engine import RETRIES, Ended
-from projections.fleet.engines import open_engine
 from projections.fleet.local_pool import LocalPool
 from tests.fleet_tasks import double, fails, killed
 
@@ -33,7 +33,7 @@ def test_each_request_has_one_result_whichever_worker_is_killed(tmp_path: Path) 
     assert ended[3].result is None
     assert ended[3].attempts == RETRIES + 1
     assert ended[3].error is not None
-    assert ended[3].error.startswith("its worker process was killed 3 times; for want of memory?")
+    assert ended[3].error.startswith("its worker process was killed 3 times; out of memory?")
     # Beside a worker that was killed no other site was begun again.
     begun = [(tmp_path / str(number)).stat().st_size for number in range(4)]
     assert begun == [1, 2, 1, RETRIES + 1]
