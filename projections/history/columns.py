@@ -168,8 +168,11 @@ def texts_in(arrays: Mapping[str, Array], name: str, first: int, last: int | Non
     start = int(ends[first - 1]) if first else 0
     stops = (ends[first:last].astype(np.int64) - start).tolist()
     raw = arrays[name][start : start + stops[-1] if stops else start].tobytes()
-    starts = [0, *stops[:-1]]
-    return [raw[a:b].decode("utf-8", "surrogatepass") for a, b in zip(starts, stops, strict=False)]
+    spans = zip([0, *stops[:-1]], stops, strict=False)
+    if raw.isascii():  # then bytes are characters
+        text = raw.decode("ascii")
+        return [text[a:b] for a, b in spans]
+    return [raw[a:b].decode("utf-8", "surrogatepass") for a, b in spans]
 
 
 def stripe_of(start: Offset, end: Offset, rows: Mapping[str, Sequence[Sequence[Any]]]) -> Stripe:

@@ -1,9 +1,8 @@
 """The map at any offset, made from a history without folding again."""
 
 from bisect import bisect_left
-from dataclasses import replace
 
-from msgspec.structs import astuple
+from msgspec.structs import astuple, replace
 
 from eventsrc.envelope import Offset
 from projections.deltas import PlaceOrdinal

@@ -6,6 +6,7 @@ by one when somebody asks for them, and all of them before the view is changed.
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import pairwise, repeat
 from typing import Any, Final, cast
 
 import numpy as np
@@ -13,8 +14,8 @@ import numpy as np
 from eventsrc.envelope import Offset
 from projections.deltas import (
     Delta,
-    ObservationOrdinal,
     PlaceOrdinal,
+    Pose,
     SkipKind,
 )
 from projections.model.records import (
@@ -27,7 +28,7 @@ from projections.reducers.survivors import PlaceSurvivors
 from .columns import NONE
 from .lazy_rows import Chunks
 from .moment import Moment
-from .stored_history import StoredHistory, keyframes_of
+from .stored_history import StoredHistory
 from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
 
 _LAZY: Final = ("keyframes", "observations")
@@ -115,50 +116,52 @@ class StoredView(MapView):
 def _keyframes(
     moment: Moment, survivors: PlaceSurvivors, first: int, last: int
 ) -> list[KeyframeRecord]:
+    offsets, runs, run_ids, ids, timestamps, posed, x_um, y_um, yaws, floors = moment.tables.lists(
+        "keyframe", first, last
+    )
     _, joined = moment.placed
-    added = keyframes_of(moment.tables, first, last)
+    poses = map(Pose, x_um, y_um, yaws)
     starts = moment.observation_starts[first : last + 1].tolist()
-    return [
-        KeyframeRecord(
-            k.keyframe,
-            k.offset,
-            k.run,
-            k.run_id,
-            k.keyframe_id,
-            k.timestamp,
-            k.pose,
-            survivors,
-            [ObservationOrdinal(number) for number in range(start, end)] or (),
-            None if place == NONE else place,
-            k.floor,
+    return list(
+        map(
+            KeyframeRecord,
+            range(first, last),
+            offsets,
+            runs,
+            run_ids,
+            ids,
+            timestamps,
+            [pose if has_pose else None for pose, has_pose in zip(poses, posed, strict=True)],
+            repeat(survivors),
+            [list(range(*span)) or () for span in pairwise(starts)],
+            [None if place == NONE else place for place in joined[first:last].tolist()],
+            floors,
         )
-        for k, place, start, end in zip(
-            added, joined[first:last].tolist(), starts[:-1], starts[1:], strict=True
-        )
-    ]
+    )
 
 
 def _observations(moment: Moment, first: int, last: int) -> list[ObservationRecord]:
-    objects, similarities = moment.fused
-    rows = moment.tables.rows("observation", first, last)
-    return [
-        ObservationRecord(
-            ObservationOrdinal(number),
-            keyframe,
-            det_id,
-            name,
-            confidence,
-            (x0, y0, x1, y1),
-            model,
-            None,
-            crc,
+    _, keyframes, det_ids, names, confidences, x0, y0, x1, y1, models, crcs, foreign = (
+        moment.tables.lists("observation", first, last)
+    )
+    objects, similarities = (column[first:last].tolist() for column in moment.fused)
+    return list(
+        map(
+            ObservationRecord,
+            range(first, last),
+            keyframes,
+            det_ids,
+            names,
+            confidences,
+            zip(x0, y0, x1, y1, strict=True),
+            models,
+            repeat(None),
+            crcs,
             foreign,
-            None if found == NONE else found,
-            None if found == NONE else q40,
+            [None if found == NONE else found for found in objects],
+            [
+                None if found == NONE else q40
+                for found, q40 in zip(objects, similarities, strict=True)
+            ],
         )
-        for number, (_, keyframe, det_id, name, confidence, x0, y0, x1, y1, model, crc, foreign),
-        found, q40 in zip(
-            range(first, last), rows, objects[first:last].tolist(),
-            similarities[first:last].tolist(), strict=True,
-        )
-    ]  # fmt: skip
+    )

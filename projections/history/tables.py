@@ -110,14 +110,12 @@ class Tables:
 
     def rows(self, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
         """The rows from ``first`` to before ``last``, each with all its columns in order."""
-        found = self._safely(
-            lambda: [
-                row
-                for stripe, a, b in self._spans(table, first, last)
-                for row in _stripe_rows(stripe, table, a, b)
-            ]
-        )
-        self._unreleased += len(found)
+        return list(zip(*self.lists(table, first, last), strict=True))
+
+    def lists(self, table: str, first: int, last: int) -> list[list[Any]]:
+        """The same rows as a list for each column."""
+        found = self._safely(lambda: self._lists(table, first, last))
+        self._unreleased += last - first
         if self._unreleased >= _MANY:  # perhaps on the way through all, which must not fill memory
             self._release()
         return found
@@ -155,6 +153,13 @@ class Tables:
         self._unreleased = 0
         for release in {stripe.release for stripe in self.stripes}:
             release()
+
+    def _lists(self, table: str, first: int, last: int) -> list[list[Any]]:
+        found: list[list[Any]] = [[] for _ in TABLES[table]]
+        for stripe, a, b in self._spans(table, first, last):
+            for column, values in zip(found, _stripe_lists(stripe, table, a, b), strict=True):
+                column += values
+        return found
 
     def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
         """These rows; of each stripe only the rows asked for are read."""
@@ -229,14 +234,12 @@ class Groups:
         return self._order[self._ends[value] : self._ends[value + 1]]
 
 
-def _stripe_rows(stripe: Stripe, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
-    columns: list[Any] = []
+def _stripe_lists(stripe: Stripe, table: str, first: int, last: int) -> Iterator[list[Any]]:
     for column, kind in TABLES[table].items():
         if kind in ("text", "code"):
-            columns.append(stripe.texts(table, column, first, last))
+            yield stripe.texts(table, column, first, last)
         else:
-            columns.append(_values(stripe.arrays[f"{table}.{column}"][first:last], kind))
-    return list(zip(*columns, strict=True))
+            yield _values(stripe.arrays[f"{table}.{column}"][first:last], kind)
 
 
 def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
@@ -255,9 +258,9 @@ def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
 
 
 def _values(array: Array, kind: str) -> list[Any]:
-    values: list[Any] = array.tolist()
     if kind == "flag":
-        return [bool(value) for value in values]
+        array = array.astype(np.bool_)
+    values: list[Any] = array.tolist()
     if kind == "number?":
         return [None if value == NONE else value for value in values]
     return values

@@ -13,6 +13,7 @@ makes the answer slower, never wrong.
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -54,6 +55,8 @@ MOST_BYTES: Final = 1024 * 1024 * 1024
 _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
 _LEFT_OVER_S: Final = 3_600.0
+_NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
+"""Errors of opening what is no regular file."""
 _TRIES: Final = 3
 """Readings of a folder in which other processes replace files."""
 
@@ -139,13 +142,16 @@ class TimelineCache:
             self._keep_part(stripes, end)
             self._tidy(end)
         except OSError as error:
-            self._say(f"{self.folder}: no history was kept: {error.strerror}")
+            self._not_kept(error.strerror)
         except (Unwritable, LogError) as error:
-            self._say(f"{self.folder}: no history was kept: {error}")
+            self._not_kept(error)
         except DamagedPart as damage:
             self.forget(damage)
             return
         self._kept_at = end
+
+    def _not_kept(self, why: object) -> None:
+        self._say(f"{self.folder}: no history was kept: {why}; --no-cache goes without one")
 
     def forget(self, damage: DamagedPart) -> None:
         """Delete the parts, of which one is damaged."""
@@ -211,7 +217,11 @@ class TimelineCache:
         except LogError as error:  # the events asked for may be before the damage
             self._say(f"{file.path} is not used: {error}")
             return None
-        except (OSError, DamagedPart) as error:
+        except OSError as error:
+            self._say(f"{file.path} is not used: {error.strerror}")
+            if error.errno not in _NO_FILE:  # too many open files, or not ours to read: no damage
+                return None
+        except DamagedPart as error:
             self._say(f"{file.path} is not used: {error}")
         except (LookupError, TypeError, AttributeError, ValueError) as error:
             self._say(f"{file.path} is not used: its content does not fit together: {error!r}")

@@ -8,6 +8,8 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 import math
 from dataclasses import dataclass, field
 
+import msgspec
+
 from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
 from projections.deltas import (
     KeyframeOrdinal,
@@ -69,8 +71,7 @@ class PlaceRecord:
         return mean_m(self.sum_y_um, self.keyframe_count)
 
 
-@dataclass(slots=True, eq=False)
-class KeyframeRecord:
+class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
     ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
@@ -95,8 +96,7 @@ class KeyframeRecord:
         return None if self.joined is None else self.survivors.find(self.joined)
 
 
-@dataclass(slots=True, eq=False)
-class ObservationRecord:
+class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     """One detection. ``object`` and ``similarity_q40`` are None when it was not fused.
 
     ``embedding`` is None when there is none, when it is of a foreign space, or when the view was

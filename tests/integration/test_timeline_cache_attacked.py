@@ -1,12 +1,14 @@
 """The kept history under attack: a full disk, a kill in the middle of writing, many processes at
 once, garbage in its folder, and a log that grows while it is read."""
 
+import errno
 import os
 import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -15,6 +17,7 @@ from eventsrc.log import LogReader
 from projections.corrections import NO_CORRECTIONS
 from projections.history import Timeline
 from projections.history.known import map_after
+from projections.history.timeline_cache import TimelineCache
 from projections.model.fold import fold_log
 from tests import prefork
 from tests.envelopes import detection, envelope
@@ -133,7 +136,24 @@ def test_a_folder_that_cannot_be_made(log: Path, right: str) -> None:
     log.with_name("log.history").write_text("a file")
     notes: list[str] = []
     assert answers(log, notes) == right
-    assert notes == [f"{log}.history: no history was kept: File exists"]
+    why = "no history was kept: File exists; --no-cache goes without one"
+    assert notes == [f"{log}.history: {why}"]
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EACCES, errno.EIO, errno.ENOMEM])
+def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: int) -> None:
+    assert answers(log, []) == right
+    before = [(path, path.stat().st_ino) for path in kept(log)]
+    why = os.strerror(number)
+    notes: list[str] = []
+    with kept_early(), Timeline(log, RULES, note=notes.append) as timeline:
+        cache = TimelineCache(timeline.reader, RULES, NO_CORRECTIONS, notes.append)
+        with patch("projections.history.timeline_cache.Part", side_effect=OSError(number, why)):
+            assert not cache.stripes(timeline.end)
+        assert [(path, path.stat().st_ino) for path in kept(log)] == before
+        assert notes
+        assert all(note.endswith(f"is not used: {why}") for note in notes)
+        assert cache.stripes(timeline.end)[-1].end == timeline.end
 
 
 def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
