@@ -3,7 +3,7 @@
 Images come from outside, so their size is checked before any pixel is decoded, and only these two
 formats are read. docs/decisions/map-images.md says why Pillow.
 
-Pillow is imported when an image is at hand: every command imports this module, few need it.
+Pillow is imported when an image is read: every command imports this module, few need it.
 """
 
 import io

@@ -1,8 +1,8 @@
 """Read envelopes of known fields in half of pydantic's time, for callers that keep only the bytes.
 
 `read_plain` accepts a part of what `eventsrc.envelope` accepts, and nothing else: an envelope with
-known fields only, whose texts are printable. Of anything else it says nothing, and the caller asks
-pydantic, which also has the reasons. So the models of `eventsrc.envelope` alone define what is
+known fields only, whose texts are printable. For anything else it returns None, and the caller uses
+pydantic, which also gives the reasons. So the models of `eventsrc.envelope` alone define what is
 valid; a property test compares the two over texts that are made to tell them apart.
 """
 
@@ -116,5 +116,5 @@ def _is_plain(envelope: PlainEnvelope) -> bool:
         if model is not None and not model.isprintable():
             return False
     ids = [d.det_id for d in envelope.detections if d.det_id is not None]
-    # An id that is given may be the same as another, or as one that is made for who has none.
+    # An id that is given may be the same as another, or as one generated for a detection without.
     return not ids or (len(set(ids)) == len(envelope.detections) and all(map(str.isprintable, ids)))

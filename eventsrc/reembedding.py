@@ -1,4 +1,4 @@
-"""Give a log's detections vectors of another space, made of the crops that it keeps.
+"""Add vectors of another embedding space to a log, encoded from the crops that it keeps.
 
 New vectors are appended in groups, each an event of its own on ``mapfold/embeddings`` that is
 synced before the next is made. At the end one command, ``reembed``, puts all of them into force:
@@ -60,7 +60,7 @@ class Fault(NamedTuple):
 
 @dataclass
 class Reembedding:
-    """What a run did. Of the ``detections`` of a log ``own`` were recorded with a vector of the
+    """Counts of a run. Of the ``detections`` of a log ``own`` were recorded with a vector of the
     space and ``known`` have one by an earlier run; ``added`` have one now. ``without_crop`` have
     none in the log; the crops of ``corrupt`` cannot be decoded, and for those of ``unusable`` the
     encoder answered NaN or zero. ``command`` is the offset of the command if one was appended."""
@@ -99,9 +99,9 @@ def reembed(
 ) -> Reembedding:
     """Add vectors of ``encoder`` for the detections that have a crop and no vector of its space.
 
-    ``progress`` gets the number of events looked at and of all; when ``stopped`` says so, it ends
-    after the group at hand and gives no command. Raises LogBusy while another writes the log,
-    LogNotFound, MisuseError if vectors of the space have another dimension or are of another
+    ``progress`` gets the number of events looked at and of all; when ``stopped`` returns True, it
+    ends after the current group and appends no command. Raises LogBusy while another writes the
+    log, LogNotFound, MisuseError if vectors of the space have another dimension or are of another
     encoder.
     """
     with LogReader(log):

@@ -1,4 +1,4 @@
-"""Encode crops: an ONNX image tower of CLIP, SigLIP or the like, and how it wants its pictures.
+"""Encode crops with an ONNX image tower (CLIP, SigLIP or the like), and prepare pictures for it.
 
 A JSON file beside the model, of the same name, says how; docs/detector.md has it for common ones:
 

@@ -1,4 +1,4 @@
-"""The keyframe gate: which pictures are worth looking at.
+"""The keyframe gate: which pictures become keyframes.
 
 A picture is a keyframe when the robot has moved or turned far enough since the last keyframe with a
 pose, or when the time since the last keyframe is up. A picture without a pose has only the time.
@@ -13,7 +13,7 @@ MOVED_M = 0.5
 TURNED_DEG = 15.0
 AFTER_S = 5.0
 _SLACK = 1e-6
-"""Metres and radians: half a metre in steps of 5 cm is half a metre."""
+"""Tolerance for rounding, metres and radians: ten steps of 5 cm count as half a metre."""
 
 
 class Pose(NamedTuple):
@@ -34,7 +34,8 @@ class GateLimits:
 
 
 class KeyframeGate:
-    """Asked about each picture in turn, and told which ones were taken."""
+    """Decides for each picture in turn whether it is a keyframe, and keeps the last one that was
+    taken."""
 
     def __init__(self, limits: GateLimits) -> None:
         self._limits = limits

@@ -20,15 +20,15 @@ from .vision import encode_jpeg, shrunk
 
 FIRST_KEYFRAME: Final = 1
 CROP_SIDE: Final = 640
-"""Crops that are kept are no wider or higher: more than encoders take, and less than the 1 MiB that
-a log keeps, whatever is in them."""
+"""Largest width and height of kept crops: more than encoders take, and always under the 1 MiB that
+a log keeps."""
 _TOLD: Final = 5
-"""How often something is said of one kind of fault; after that it is only counted."""
+"""Messages for each kind of fault; further ones are only counted."""
 
 
 @dataclass
 class Counts:
-    """What became of the pictures. Each is one of ``between`` (the robot had hardly moved),
+    """Counts of pictures by outcome. Each is one of ``between`` (too near the last keyframe),
     ``unreadable`` or ``keyframes``."""
 
     pictures: int = 0
@@ -36,7 +36,7 @@ class Counts:
     unreadable: int = 0
     keyframes: int = 0
     without_pose: int = 0
-    """Of the keyframes."""
+    """Detections in the keyframes."""
     detections: int = 0
     not_encoded: int = 0
     """Detections without an embedding, because the encoder's answer was not finite or zero."""
@@ -49,7 +49,7 @@ class Counts:
 
     @property
     def lost(self) -> int:
-        """How many things did not become what they should have."""
+        """The number of faults: pictures, detections and boxes that could not be used."""
         return self.unreadable + self.not_encoded + self.not_finite + self.cut
 
 
@@ -68,7 +68,7 @@ class Keyframe(NamedTuple):
 
 
 class Keyframes:
-    """Looks at pictures one after the other; ``note`` is called with lines about faults."""
+    """Detects objects in one picture after the other; ``note`` receives lines about faults."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
-"""Pictures and poses as they come in over Zenoh.
+"""Pictures and poses received over Zenoh.
 
-Zenoh's thread only puts messages into queues. That of pictures is short and the newest wins: a
-detector that is slower than the camera looks at what the robot sees now, and counts what it missed.
+Zenoh's thread only puts messages into queues. The queue of pictures is short and drops the oldest:
+a detector that is slower than the camera processes current pictures, and counts those it missed.
 """
 
 import threading

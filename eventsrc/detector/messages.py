@@ -4,8 +4,8 @@ Pictures: a JPEG or PNG as it is, or in CDR sensor_msgs/CompressedImage or senso
 bridge of ROS 2 forwards them. A picture without a stamp of its own was taken when it came in.
 
 Poses: JSON with ``x``, ``y``, ``yaw`` (or ``map_x`` …) and ``stamp`` or ``timestamp``, or in CDR
-geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry. Which of them a message
-is, its length tells.
+geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry. The type of a message
+follows from its length.
 """
 
 import json
@@ -31,7 +31,7 @@ _NORM_SLACK: Final = 0.1
 
 
 class MessageError(ValueError):
-    """A message that is no picture or no pose; the text says why."""
+    """A message that is no picture or no pose; the text is the reason."""
 
 
 def picture_of(payload: bytes, name: str, received_s: float) -> Picture:

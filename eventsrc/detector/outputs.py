@@ -1,4 +1,4 @@
-"""Where keyframes go: over Zenoh through a robot's spool, or into a file of JSON lines."""
+"""Outputs for keyframes: over Zenoh through a robot's spool, or a file of JSON lines."""
 
 import json
 import threading
@@ -21,8 +21,8 @@ _LAST_CHANCE_S: Final = 2.0
 
 @dataclass
 class Delivered:
-    """What became of the keyframes. ``waiting`` and ``refused`` are in the spool, ``no_room`` found
-    it full."""
+    """Counts of keyframes by outcome. ``waiting`` and ``refused`` are in the spool, ``no_room`` did
+    not fit into it."""
 
     published: int = 0
     waiting: int = 0
@@ -38,13 +38,13 @@ class Output(Protocol):
 
     @property
     def delivered(self) -> Delivered:
-        """What became of them so far."""
+        """The counts so far."""
 
     def send(self, keyframe: Keyframe) -> None:
         """Take one keyframe."""
 
     def close(self, wait_s: float) -> None:
-        """Finish, with so many seconds for what is still on its way."""
+        """Finish; wait at most so many seconds for acknowledgements."""
 
 
 class FileOutput:
@@ -105,7 +105,7 @@ class ZenohOutput:
 
     @property
     def delivered(self) -> Delivered:
-        """What became of the keyframes so far, and what the spool holds now."""
+        """The counts so far, and the number of envelopes in the spool."""
         spooled = self._publisher
         return replace(self._counts, waiting=spooled.unacknowledged, refused=spooled.refused_count)
 

@@ -33,7 +33,7 @@ _READ_BYTES: Final = 64 * 1024
 
 
 class PictureError(ValueError):
-    """These bytes are no picture that can be used; the message says why."""
+    """Bytes that are no usable picture; the message is the reason."""
 
 
 @dataclass(frozen=True, slots=True)

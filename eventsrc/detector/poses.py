@@ -1,5 +1,5 @@
-"""The robot's poses by time, from a file or as they come in, and the pose that a picture was taken
-at.
+"""The robot's poses by time, from a file or as they arrive, and the pose at which a picture was
+taken.
 
 A picture has a pose when one is known within `NEAR_S` of its stamp. With such a pose on each side
 it is between them, in proportion to the time; otherwise it is the nearest one.
@@ -21,11 +21,11 @@ from .messages import MessageError, pose_of
 
 NEAR_S: Final = 0.1
 _KEPT: Final = 20_000
-"""Poses that are kept as they come in: 100 s of 200 a second."""
+"""Most poses kept of those that arrive: 100 s of 200 a second."""
 _KEPT_BYTES: Final = 16 * 1024 * 1024
-"""Of messages that were not read yet: 20,000 of Odometry with covariances take 14 MB."""
+"""Most bytes of unread messages: 20,000 of Odometry with covariances take 14 MB."""
 _SLACK_S: Final = 1e-6
-"""A hundred milliseconds in floating point are a hundred milliseconds."""
+"""Tolerance for rounding: stamps 100 ms apart are still within 100 ms."""
 
 
 class Poses(Protocol):
@@ -109,10 +109,9 @@ def poses_of_file(path: Path) -> PoseTrack:
 
 
 class LivePoses:
-    """Poses as they come in: Zenoh's thread puts messages, another asks and reads them.
+    """Poses as they arrive: Zenoh's thread queues messages, another thread reads and decodes them.
 
-    Of messages that nobody has asked for yet the newest are kept, at most `_KEPT` of them and
-    `_KEPT_BYTES`.
+    Of unread messages only the newest are kept, at most `_KEPT` of them and `_KEPT_BYTES`.
     """
 
     def __init__(self) -> None:
@@ -125,14 +124,14 @@ class LivePoses:
         self.count = 0
         """Poses that were read."""
         self.dropped = 0
-        """Messages that were dropped for newer ones, since nobody asked."""
+        """Unread messages that were dropped for newer ones."""
         self.bad = 0
         """Messages that are no pose."""
         self.bad_reason: str | None = None
-        """What is wrong with the last of them."""
+        """The reason why the last of them is no pose."""
 
     def put(self, payload: bytes, received_s: float) -> None:
-        """Note a message; it is read when somebody asks."""
+        """Queue a message; it is decoded when a pose is asked for."""
         with self._came:
             self._messages.append((payload, received_s))
             self._bytes += len(payload)
@@ -165,7 +164,7 @@ class LivePoses:
 
     def _reaches(self, stamp_s: float) -> bool:
         """Whether the poses of that time have come: one soon after it, or the last two are both of
-        later. A single one far in the future, of a clock that was wrong, says nothing."""
+        later. A single pose far in the future, from a wrong clock, does not count."""
         return self._track.has_soon_after(stamp_s) or min(self._last_two_s) >= stamp_s
 
     def _read(self, payload: bytes, received_s: float) -> None:

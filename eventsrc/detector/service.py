@@ -12,7 +12,7 @@ from .picture import Picture
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What was done: about pictures, keyframes on their way, and what came in over Zenoh."""
+    """Counts of pictures, of keyframes by delivery, and of messages received over Zenoh."""
 
     counts: Counts
     delivered: Delivered
@@ -45,7 +45,7 @@ class Detection:
         self._stopped = False
 
     def run(self, pictures: Iterable[Picture], watch: Callable[[Report], None]) -> None:
-        """Look at all pictures, or until ``stop`` is set; ``watch`` is called after each.
+        """Process all pictures, or until ``stop`` is set; ``watch`` is called after each.
 
         Pictures that come in over Zenoh have no last one: they end by themselves with ``stop``.
         """
@@ -63,7 +63,7 @@ class Detection:
         self._output.close(wait_s)
 
     def report(self) -> Report:
-        """The numbers now."""
+        """The counts so far."""
         counts, delivered = self._keyframes.counts, self._output.delivered
         stopped = self._stopped
         if self._live is None:

@@ -1,6 +1,6 @@
 """OpenCV: pictures decoded, resized, cut and encoded, and videos read. Only this module imports it.
 
-docs/decisions/opencv.md says why OpenCV. It is imported when the first picture is at hand.
+docs/decisions/opencv.md says why OpenCV. It is imported when the first picture is decoded.
 """
 
 import functools

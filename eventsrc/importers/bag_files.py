@@ -68,7 +68,7 @@ class BagContents:
     first_ns: int | None = None
     last_ns: int | None = None
     damage: str | None = None
-    """Why it could not be read to its end."""
+    """The reason why it could not be read to its end."""
 
     @property
     def count(self) -> int:
@@ -80,7 +80,7 @@ class BagContents:
         return self.topics.setdefault(new.name, new)
 
     def span(self, received_ns: int) -> None:
-        """Take note of when a message was received."""
+        """Extend the time span by a message's time of receipt."""
         if self.first_ns is None or received_ns < self.first_ns:
             self.first_ns = received_ns
         if self.last_ns is None or received_ns > self.last_ns:

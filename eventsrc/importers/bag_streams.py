@@ -23,7 +23,7 @@ from .bag_files import BagContents, Topic
 TF_POSE: Final = "tf"
 """``--pose`` of transforms."""
 NONE: Final = "none"
-"""What switches a kind of topic off."""
+"""The value that switches a kind of topic off."""
 _BASES: Final = ("base_link", "base_footprint")
 _MAP: Final = "map"
 _FIRST_TRANSFORMS: Final = 300
@@ -77,7 +77,7 @@ class Choice:
 
 def sampled(type_name: str, number: int) -> bool:
     """Whether `choose` needs a message of a type, by its number on its topic. Of transforms those
-    later on too: a localiser tells of the map once it knows where it is."""
+    later on too: a localiser publishes the map frame only once it is localised."""
     if type_name == ros.TF:
         few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
         return few or number < _FIRST_TRANSFORMS

@@ -35,7 +35,7 @@ class BagTopicReport:
 
 @dataclass
 class BagReport:
-    """What was in a bag, and what became of it. ``streams`` are by topic of detections."""
+    """What a bag held, and what was imported. ``streams`` are by topic of detections."""
 
     name: str
     messages: int

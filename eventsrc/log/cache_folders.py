@@ -1,7 +1,7 @@
 """The folders of caches beside a log: ``<log>.history`` and ``<log>.snapshots``.
 
-They are no part of the log and safe to delete at any time. Whoever may not read the log may not
-read them either: they hold what it holds.
+They are not part of the log and safe to delete at any time. They hold the log's data, so their
+permissions are at most those of the log.
 """
 
 import contextlib

@@ -100,18 +100,19 @@ def same_but_sealed(before: Sequence[str], now: Sequence[str]) -> bool:
 def _is_same_but_sealed(old: str, new: str) -> bool:
     was, _, was_begun = old.partition(_BEGUN)
     now, _, now_begun = new.partition(_BEGUN)
-    if was_begun and was_begun != now_begun:  # earlier versions did not say
+    if was_begun and was_begun != now_begun:  # signatures of earlier versions lack it
         return False
     return now == was or (_SEALED not in was and now.startswith(was + _SEALED))
 
 
 def _signature(segment: SegmentPath) -> str:
     """The base of a growing segment; for a sealed one also its size and the checksum at its end.
-    Of both, when it was begun: a segment that was lost and recorded anew has the same base."""
+    Both include the time when it was begun, as a lost segment that is recorded anew has the same
+    base."""
     with segment.path.open("rb") as file:
         try:
             head = read_head(segment.path, file.read(HEAD_BYTES), segment.base)[0]
-        except LogError:  # whoever reads its events says so
+        except LogError:  # reported when its events are read
             head = {}
         about = str(segment.base)
         if segment.sealed:

@@ -6,7 +6,8 @@ offset.
 Gaps: a gap ledger is folded over the log, as by `log info` and `status`; late keyframes close gaps.
 
 Log times: each event should be logged after the one before. Occupancy maps are left out of this: a
-map is imported when it is at hand, before recordings of any age, and nothing depends on its time.
+map is imported when it becomes available, before recordings of any age, and nothing depends on its
+time.
 
 Stamps: a robot numbers its keyframes in the order it took them, so its stamps should grow with
 their numbers, in whatever order they reached the log. A finding is a keyframe stamped before its

@@ -82,8 +82,8 @@ class _Passed(Generic[Item]):
 
 
 class Assembler(Generic[Item]):
-    """Takes messages, gives envelopes. An ``Item`` given to `put` comes out as it is, after what
-    came before it."""
+    """Makes envelopes of messages. An ``Item`` given to `put` comes out as it is, after what came
+    before it."""
 
     def __init__(self, streams: Iterable[Stream]) -> None:
         self._queue: deque[_Picture | _Passed[Item]] = deque()
@@ -314,7 +314,8 @@ class _Track:
 
 
 def _encode(document: dict[str, Any]) -> bytes:
-    """JSON, with NaN and infinity as Python writes them: the door of the log names them then."""
+    """JSON, with NaN and infinity as Python writes them; the log's validation rejects and names
+    them."""
     try:
         payload = msgspec.json.encode(document)
     except (UnicodeError, ValueError):  # a lone surrogate

@@ -1,7 +1,7 @@
 """Fields of ROS messages: from a decoded message to plain values.
 
 A message is any object with the attributes of its definition, such as one that rosbags decodes.
-What is missing or of another type raises BadMessage; NaN is passed on, for the door of the log to
+What is missing or of another type raises BadMessage; NaN is passed on, for the log's validation to
 refuse with its reason.
 """
 

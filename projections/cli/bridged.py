@@ -243,7 +243,7 @@ def say_topics(log: Path, bridge: Bridge) -> None:
 def warn_of_silence(
     bridge: Bridge, watch: Callable[[RecorderReport], None], every_s: float
 ) -> Callable[[RecorderReport], None]:
-    """``watch``, and once a line if no bridge has told of any topic some seconds after the
+    """``watch``, plus one warning if no bridge has announced a topic some seconds after the
     start."""
     calls = 0
 

@@ -210,7 +210,7 @@ def foxglove(
     """Show a log's map in Foxglove, whose timeline sets the time.
 
     Seek, play and pause show the map as it was. In Foxglove: Open connection, Foxglove WebSocket.
-    Whoever can reach the address can read the log. Ctrl-C ends it.
+    Anybody who can reach the address can read the log. Ctrl-C ends it.
     """
     try:
         from projections.foxglove.layout import layout_json

@@ -1,4 +1,4 @@
-"""Options of the commands of ``mapfold fleet``, and the bar over all sites."""
+"""Options of ``mapfold fleet``, the engine that ``--engine`` names, and the bar over all sites."""
 
 import contextlib
 from collections.abc import Iterator, Sequence

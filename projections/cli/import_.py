@@ -257,7 +257,7 @@ def _passed_over(report: ImportReport) -> Iterator[str]:
     elif report.nothing_of_something and not report.rejected:
         yield (
             "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
-            "takes a topic of JSON all the same, and tells of each message what is wrong"
+            "imports a topic of JSON nevertheless and reports what is wrong with each message"
         )
 
 

@@ -1,9 +1,9 @@
 """The progress bar of every command: what `eventsrc.progress` reports, once it takes a second.
 
-Commands need not do anything for it. It is on stderr, and only where that is a terminal. It gives
-way to a bar that a command shows itself (`terminal.Bar`, `terminal.FileBars`), and it is gone for
-good once data goes to stdout, unless that is a file: on a terminal, or in a pager, both would be
-mixed. What other threads do, of a server for example, is not shown.
+Commands need no code for it. It is shown on stderr if that is a terminal, and hidden while a
+command shows a bar of its own (`terminal.Bar`, `terminal.FileBars`). It ends once data is written
+to stdout, unless that is a file, because both would be mixed on a terminal or in a pager. Work in
+other threads, as of a server, is not shown.
 """
 
 import os

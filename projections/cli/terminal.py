@@ -151,8 +151,8 @@ class Bar:
             _own_bar(-1)
 
     def show(self, stage: str, done: int, total: int, unit: str = "events") -> None:
-        """Show the name of the current stage, and that ``done`` of ``total`` events, or what the
-        ``unit`` is, are through. With a total of 0, which nobody knows, only that it goes on."""
+        """Show the current stage and how much of it is done, ``done`` of ``total`` events or other
+        units. A total of 0 is unknown: then only activity is shown."""
         if stage != self._stage:
             self._stage = stage
             self._progress.reset(self._task)

@@ -148,7 +148,7 @@ def ui(
         url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
         url += shown_first
         if not local:
-            say(f"warning: others can reach {host}; who has the link below can read the log")
+            say(f"warning: others can reach {host}; anybody with the link below can read the log")
         say(f"showing {log} at {url}")
         if name != host:
             say(f"on another machine write an address of this one there, not {name}")

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Final
 
 STALLED_S: Final = 60.0
-"""Without any progress for so long, waiting ends."""
+"""Waiting ends after this time without any progress."""
 LEAST_CPU_S: Final = 0.6
-"""The processor time that counts as progress: 1 % of a processor in `STALLED_S`. What only waits
-for a message takes less."""
+"""The processor time that counts as progress: 1 % of a processor in `STALLED_S`. A process that
+only waits for messages uses less."""
 
 
 class Progress:

@@ -40,7 +40,7 @@ from projections.settings import Settings
 from .messages import MapTopics
 
 TICK_S: Final = 0.05
-"""Between two moments that are shown while it plays."""
+"""Seconds between two maps that are shown while playing."""
 ANSWERED_S: Final = 0.02
 """The SDK sends the answer to a request after the call that makes it, and has no way to say when. A
 client clears what it shows at the answer to a seek, so what it is to see comes so much later."""
@@ -124,7 +124,7 @@ class Playback(ServerListener):
             raise OSError(str(error)) from error
 
     def end(self) -> None:
-        """Let `run` end, and with it the server."""
+        """End `run`, and with it the server."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -147,7 +147,7 @@ class Playback(ServerListener):
             return self._state(asked.request_id, did_seek=asked.seek_time is not None)
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        """Show the moment to who begins to read a topic."""
+        """Publish the current map to a client that subscribes to a topic."""
         with self._changed:
             self._to_show = True
             self._changed.notify()
@@ -186,7 +186,7 @@ class Playback(ServerListener):
         return PlaybackState(status, self._now_ns, self._speed, did_seek, request_id)
 
     def _show(self) -> None:
-        """The whole moment, for who knows nothing of it."""
+        """Publish the whole map, for clients that have nothing yet."""
         with self._changed:
             self._to_show, now, shown = False, self._now_ns, self._shown
         view, merges = self._maps.at(shown)
@@ -197,7 +197,7 @@ class Playback(ServerListener):
         self._topics.scene(view, merges, now, digest=map_digest(view))
 
     def _pass(self, seconds: float) -> None:
-        """Let time pass, where it plays, and publish what happened."""
+        """Advance the time while playing, and publish what changed."""
         with self._changed:
             if not self._playing or self._to_show:
                 return

@@ -1,10 +1,10 @@
-"""A log's events, parsed, for one fold: in this process, or by others that read ahead of it.
+"""The parsed events of a log for one fold, read in this process or ahead of it by other processes.
 
 Reading, checking sums, decompressing and parsing are half of the work of a rebuild and need nothing
 but the event. The fold needs the one before, so it stays in this process, which gets the parsed
-events in the order of the log. Nothing depends on how many processes read: an event is the same
-whoever parses it, and what another process could not read, or was asked for when it died, is read
-again here. So damage is found at the same event, with the same message, as without processes.
+events in the order of the log. The result does not depend on the number of processes: every process
+parses an event alike, and this one reads again whatever another could not read or had not returned
+when it died. So damage is found at the same event, with the same message, as without processes.
 
 While the processes start, this one reads the first ranges itself.
 """
@@ -112,7 +112,7 @@ class ParsedLog:
             return False
 
     def _taken(self, process: ParsingProcess) -> Iterator[list[ParsedEvent]] | None:
-        """What a process has parsed; None if it could not, or is gone."""
+        """The events parsed by a process; None if it failed or has ended."""
         if process not in self._alive:
             return None
         try:

@@ -189,7 +189,7 @@ class Answerer:
             self._complaints(f"mapfold: {error}")
             raise
         except MapfoldError:
-            raise  # it says nothing of the database
+            raise  # not an error of the database
         self.database_up = True
 
 

@@ -1,8 +1,8 @@
 """``/docs``: Swagger UI for ``/openapi.json``, with nothing loaded from other servers.
 
-The files of Swagger UI are those of the package fastapi-offline, which only this module imports.
-The page may load scripts and styles from this server alone and ask nobody else, by its
-Content-Security-Policy; its own script is a file too, because inline ones are not allowed.
+The files of Swagger UI are those of the package fastapi-offline, which only this module imports. By
+its Content-Security-Policy the page may load from and connect to this server only; its own script
+is a file too, because inline scripts are not allowed.
 """
 
 from functools import cache

@@ -184,7 +184,7 @@ class _Cors(CORSMiddleware):
 
 
 class SafeHeaders:
-    """ASGI middleware: what browsers are told of every response that does not say it itself."""
+    """ASGI middleware that adds security headers to every response that does not set them."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

@@ -34,7 +34,7 @@ CREATE OR REPLACE TRIGGER audit AFTER INSERT OR UPDATE OF next_offset ON mapfold
 
 @dataclass(frozen=True, slots=True)
 class Killed:
-    """What came of a run: workers killed, sites begun (0 where that is not known), and sites whose
+    """The outcome of a run: workers killed, starts of sites (0 if unknown), and sites whose
     checkpoint was moved more than once."""
 
     workers: int

@@ -22,7 +22,7 @@ START_S = 60.0
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on now. A router keeps it across its restarts."""
+    """A TCP port without a listener. A router keeps it across its restarts."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

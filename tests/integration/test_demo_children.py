@@ -72,7 +72,7 @@ def test_leaving_the_block_ends_them_too(tmp_path: Path) -> None:
 
 
 def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
-    """One that waits for messages that nobody sends, and one that was stopped before it started."""
+    """One that waits for messages that never come, and one stopped before it started."""
     said = tmp_path / "said"
     with Children() as children:
         children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)

@@ -212,7 +212,7 @@ def test_a_stage_that_takes_long_gets_a_bar(screen: io.StringIO) -> None:
         assert bar._bar is None
     assert "reading the log" in screen.getvalue()
     assert "/100" in screen.getvalue()
-    report_progress("reading the log", 10, 100)  # nobody listens any more
+    report_progress("reading the log", 10, 100)  # dropped: no function is set
     assert bar._timer is None
 
 
@@ -223,7 +223,7 @@ def test_a_short_stage_gets_none(screen: io.StringIO) -> None:
     assert screen.getvalue() == ""
 
 
-def test_an_end_that_nobody_knows_is_shown_too(screen: io.StringIO) -> None:
+def test_a_stage_of_unknown_length_is_shown(screen: io.StringIO) -> None:
     with ReadingBar(0.0) as bar, working("drawing"):
         assert bar._timer is not None
         bar._timer.join()

@@ -78,7 +78,7 @@ class SpoolMachine(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def acknowledge(self, data: st.DataObject) -> None:
-        """Of payloads that wait, are set aside, or are nobody's here."""
+        """Of payloads that wait, are set aside, or are unknown here."""
         known = [entry[3] for entry in [*self.waiting, *self.aside] if entry[3] is not None]
         payloads = data.draw(
             st.lists(st.one_of(st.sampled_from([b"x", *known]), st.binary(max_size=3)), min_size=1)

@@ -290,7 +290,7 @@ def _pose(stamp: float, size: int = 0) -> bytes:
     return json.dumps(document).encode()
 
 
-def test_live_poses_that_nobody_reads_stay_within_bounds_of_number_and_bytes() -> None:
+def test_unread_live_poses_stay_within_bounds_of_number_and_bytes() -> None:
     for size in (0, 60_000):
         poses = LivePoses()
         for number in range(30_000 if not size else 1_000):
