@@ -10,13 +10,19 @@ changes are kept (`KeptVectors`).
 
 The checkpoint says which commands the new map knows, in the transaction of the swap. Whatever ends
 a refold, a command that no map knows yet makes the next tail refold.
+
+Its progress is in the checkpoints, for other processes to read. The refold's own connections are in
+the transaction of the swap, whose writes are not visible before it ends, so a thread writes the
+progress over connections of its own.
 """
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from types import TracebackType
+from typing import Final, Self
 
 from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
@@ -26,18 +32,79 @@ from projections.model.changes import BatchChanges
 from projections.model.fold import gc_paused
 from projections.model.view import MapView
 
-from . import vector_table
+from . import checkpoints, vector_table
 from .checkpoints import DeadLetter, dead_letter
 from .connection import Connection, database_errors, describe_connection
 from .inputs import LogInputs, MapInputs, commands_between
 from .labels import TABLE
 from .live_fold import LiveFold, batches
-from .refold_progress import RefoldProgress
 from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
 from .sink import Checkpoint, Shadow, SinkName
 from .statements import statements
 from .stores import DatabaseSink, Store
 from .vector_table import READERS, has_hnsw
+
+BEAT_S: Final = 1.0
+
+
+class RefoldProgress:
+    """A context manager around a refold of ``stores``. ``tell`` raises what the thread raised."""
+
+    def __init__(self, stores: Sequence[Store]) -> None:
+        self._stores = stores
+        self._at: tuple[int, int] | tuple[None, None] = (0, 0)
+        self._held = threading.Lock()
+        self._ended = threading.Event()
+        self._failed: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="refold-progress", daemon=True)
+        self._stack = contextlib.ExitStack()
+        self._connections: list[tuple[Store, Connection]] = []
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            for store in self._stores:
+                connection = stack.enter_context(store.throwaway_connection())
+                self._connections.append((store, connection))
+            self._write()
+            self._stack = stack.pop_all()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._stack.close()
+
+    def tell(self, done: int, total: int) -> None:
+        """``done`` of ``total`` events are folded. Raises what the thread raised."""
+        self._at = (done, total)
+        if self._failed is not None:
+            raise self._failed
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Write nothing for the length of the block, which changes the checkpoints; afterwards the
+        refold is over."""
+        with self._held:
+            yield
+            self._at = (None, None)
+
+    def _work(self) -> None:
+        try:
+            while not self._ended.wait(BEAT_S):
+                with self._held:
+                    self._write()
+        except BaseException as error:  # noqa: BLE001 - raised by `tell`
+            self._failed = error
+
+    def _write(self) -> None:
+        for store, connection in self._connections:
+            with database_errors(store.url):
+                for sink in store.sinks:
+                    checkpoints.write_refold(connection, sink.name, *self._at)
+
 
 TICK_EVENTS: Final = 256
 LOOK_S: Final = 0.5

@@ -322,7 +322,7 @@ def test_status_tells_how_far_a_refold_is(
     log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
-    monkeypatch.setattr("projections.database.refold_progress.BEAT_S", 0.01)
+    monkeypatch.setattr("projections.database.refold.BEAT_S", 0.01)
     tail(log, targets, SETTINGS, once=True)
     append_command(log, forget_run("run-b"))
     seen: list[tuple[SinkStatus, ...]] = []
