@@ -25,8 +25,7 @@ from projections.relocalize import Method, describe_value
 
 from .answering import MAX_TOP, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
-from .description import EXAMPLES, METRICS, QUESTION, refusals
-from .docs_page import add_docs
+from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals
 from .fair_queue import FairQueue
 from .metrics import ServiceMetrics
 from .models import Answer, Health, Objects, Places, StateQuery
