@@ -1,14 +1,19 @@
 """Record run A: one process publishes it, another records, over a router in this process.
 
-Meanwhile a tail in a thread of this process writes the log into the databases.
+Meanwhile a tail in a thread of this process writes the log into the databases. `Children` are
+mapfold commands as child processes, which end with the demo, even when it is killed.
 """
 
 import statistics
+import subprocess
+import sys
 import threading
 import time
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Final, Self
 
 from eventsrc.advised import advised
@@ -22,14 +27,108 @@ from projections.database import TailReport, rebuild, tail
 from projections.database.connection import Targets
 from projections.settings import Settings
 
-from .children import Children
 from .folder import DemoFolder
-from .progress import STALLED_S, Progress, size_of
+from .progress import STALLED_S, Progress, cpu_steps, size_of
+
+_END_S: Final = 10.0
+_POLL_S: Final = 0.05
+
+
+class Children:
+    """Child processes that end with the ``with`` block: terminated, after 10 s killed."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._stderr: dict[str, Path] = {}
+
+    def start(self, name: str, arguments: Sequence[str], stderr: Path) -> None:
+        """Start ``mapfold *arguments``; its stderr goes to the file ``stderr``."""
+        with stderr.open("wb") as errors:
+            self._running[name] = subprocess.Popen(  # noqa: S603  # our own program and arguments
+                [sys.executable, "-m", "projections.cli.child_process", *arguments],
+                stdin=subprocess.PIPE,  # its end stops the child process
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
+        self._stderr[name] = stderr
+
+    def wait(
+        self,
+        observe: Callable[[], Hashable],
+        *,
+        working: Sequence[str] = (),
+        stalled_s: float = STALLED_S,
+    ) -> None:
+        """Wait until all have ended, however long it takes while there is progress: what
+        ``observe`` returns changes, one of them ends or writes to stderr, or one that is named in
+        ``working`` uses its processor. Raises MapfoldError if one fails or there is none for
+        ``stalled_s`` seconds."""
+
+        def seen() -> Hashable:
+            written = tuple(map(size_of, self._stderr.values()))
+            return observe(), written, tuple(self._names_running()), self._cpu_steps(working)
+
+        progress = Progress(seen, stalled_s)
+        pause = threading.Event()
+        while names := self._names_running():
+            self._check()
+            if progress.is_stalled():
+                raise MapfoldError(
+                    f"mapfold {' and '.join(names)} made no progress for {stalled_s:g} s; "
+                    f"see {self._stderr[names[0]]}"
+                )
+            pause.wait(_POLL_S)
+        self._check()
+
+    def wait_for_output(self, name: str, text: str, stalled_s: float = STALLED_S) -> None:
+        """Wait until ``name`` has written ``text`` to stderr, while it writes or uses its
+        processor; raises as `wait` does."""
+        file = self._stderr[name]
+        progress = Progress(lambda: (size_of(file), self._cpu_steps([name])), stalled_s)
+        pause = threading.Event()
+        while text not in file.read_text("utf-8", "replace"):
+            self._check()
+            if progress.is_stalled():
+                raise MapfoldError(
+                    f"mapfold {name} did not start: no progress for {stalled_s:g} s; see {file}"
+                )
+            pause.wait(_POLL_S)
+
+    def _names_running(self) -> list[str]:
+        return [name for name, process in self._running.items() if process.poll() is None]
+
+    def _cpu_steps(self, names: Sequence[str]) -> tuple[int, ...]:
+        return tuple(cpu_steps(self._running[name].pid) for name in names)
+
+    def _check(self) -> None:
+        for name, process in self._running.items():
+            code = process.poll()
+            if code:
+                lines = self._stderr[name].read_text("utf-8", "replace").strip().splitlines()
+                last_line = lines[-1] if lines else "no output"
+                raise MapfoldError(f"mapfold {name} ended with exit {code}: {last_line}")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        for process in self._running.values():
+            process.terminate()  # does nothing to one that has ended
+        for process in self._running.values():
+            try:
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()  # not before: the end of its stdin is another SIGTERM
+
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 _WAIT_S: Final = 600
 """How long the publisher waits for the recorder, which is there; it makes progress meanwhile."""
-_POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)

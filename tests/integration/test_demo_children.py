@@ -13,13 +13,13 @@ import pytest
 from eventsrc.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
 from eventsrc.transport.session import Router, ZenohOptions
-from projections.demo.children import Children
 from projections.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
+from projections.demo.recording import Children
 
 STARTER = """
 import sys
 from pathlib import Path
-from projections.demo.children import Children
+from projections.demo.recording import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))
