@@ -14,10 +14,16 @@ from projections.deltas import PlacesMerged
 from projections.model.fold import FoldedEvent
 from projections.model.view import MapView
 
-from .base_layers import draw_drives, draw_floor, draw_regions, draw_walls
+from .base_layers import (
+    draw_drives,
+    draw_floor,
+    draw_map_walls,
+    draw_regions,
+    draw_walls,
+    wall_spots,
+)
 from .canvas import Canvas, check_suffix, new_canvas
 from .labels import Extent
-from .map_walls import draw_map_walls, wall_spots
 from .overlays import (
     DOT_M,
     draw_adjacency,

@@ -6,7 +6,7 @@ import pytest
 from eventsrc.occupancy_map import OccupancyMap
 from projections.deltas import MapGiven
 from projections.drawing import Floor
-from projections.drawing.map_walls import wall_spots
+from projections.drawing.base_layers import wall_spots
 from projections.drawing.picture import compose
 from projections.model.view import MapView
 from projections.settings import Settings
