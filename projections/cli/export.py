@@ -213,8 +213,7 @@ def foxglove(
     Anybody who can reach the address can read the log. Ctrl-C ends it.
     """
     try:
-        from projections.foxglove.layout import layout_json
-        from projections.foxglove.playback import PastMaps, Playback
+        from projections.foxglove.playback import PastMaps, Playback, layout_json
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold foxglove needs {error.name}, which is not installed;"
