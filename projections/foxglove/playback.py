@@ -1,4 +1,5 @@
-"""A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was.
+"""A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was;
+and a layout for its panels.
 
 The SDK calls the ``on_`` methods in its own thread; they only note what is asked. The thread that
 runs `Playback.run` folds and publishes.
