@@ -1,7 +1,7 @@
 """Parsed events as bytes in memory that two processes share.
 
 First the arrays of the vectors, stretch after stretch: float32 as recorded, then the unit vectors
-in float64. After them everything else in the format of `marshal`, which Python reads several times
+in int32. After them everything else in the format of `marshal`, which Python reads several times
 as quickly as a pickle, and which holds each float to the last bit. Both processes are of one
 program and of one Python, so nothing is checked when it is read; a log never has these bytes.
 
@@ -28,7 +28,6 @@ from .parsing import ParsedEvent, parse_events, parse_map
 _Record: TypeAlias = tuple[Any, ...]
 """Of an event: offset, logged_ns, and what was parsed, see `_record`."""
 _Model = TypeVar("_Model", bound=BaseModel)
-_ALIGNED: Final = 8
 
 
 class Packed(NamedTuple):
@@ -81,18 +80,18 @@ def _write_arrays(
 ) -> int:
     """Write the arrays at ``at``; the place after them."""
     total = sum(len(vector) for vector in vectors if vector is not None)
-    wide_at = _aligned(at + 4 * total)
-    end = wide_at + 8 * total
+    exact_at = at + 4 * total
+    end = exact_at + 4 * total
     if end > len(memory):
         raise NoRoom
     narrow = np.frombuffer(memory, np.float32, total, at)
-    wide = np.frombuffer(memory, np.float64, total, wide_at)
+    exact = np.frombuffer(memory, np.int32, total, exact_at)
     start = 0
     for vector, unit in zip(vectors, units, strict=True):
         if vector is not None and unit is not None:
             stop = start + len(vector)
             narrow[start:stop] = vector
-            wide[start:stop] = unit[0]
+            exact[start:stop] = unit[1]
             start = stop
     return end
 
@@ -103,8 +102,8 @@ def _read_arrays(
     edges = [0, *accumulate(dim or 0 for dim in dims)]
     total = edges[-1]
     narrow = np.frombuffer(memory, np.float32, total, at).copy()
-    wide = np.frombuffer(memory, np.float64, total, _aligned(at + 4 * total)).copy()
-    exact = wide.astype(np.int32)
+    exact = np.frombuffer(memory, np.int32, total, at + 4 * total).copy()
+    wide = exact.astype(np.float64)
     if dims and dims[0] is not None and dims.count(dims[0]) == len(dims):  # rows are quicker
         shape = len(dims), dims[0]
         rows = zip(wide.reshape(shape), exact.reshape(shape), norms, strict=True)
@@ -116,10 +115,6 @@ def _read_arrays(
         vectors.append(narrow[start:stop] if is_given else None)
         units.append((wide[start:stop], exact[start:stop], norm2) if norm2 is not None else None)
     return vectors, units
-
-
-def _aligned(at: int) -> int:
-    return -(-at // _ALIGNED) * _ALIGNED
 
 
 def _record(event: ParsedEvent, read: Event) -> _Record:
