@@ -25,19 +25,19 @@ from psycopg import sql
 
 from eventsrc.log import LogReader
 from projections.database import graph_schema as _graph_ddl
-from projections.database import rebuild
+from projections.database import rebuild, vector_table
 from projections.database.connection import Targets, connect
 from projections.database.embedded import EmbeddedServer
-from projections.database.labels import GRAPH, LABELS
+from projections.database.labels import GRAPH, LABELS, TABLE
 from projections.database.replaced_tables import wait_for_drop
-from projections.database.statements import statements
 from projections.model.fold import fold_log
 from projections.model.parsed_log import default_workers
 from projections.settings import Settings
 
-from .world import make_log
+from .world import DIM, make_log
 
 FLOOR_GRAPH = "floor_map"
+FLOOR_VECTORS = "floor_vectors"
 REPEATS = 3
 
 
@@ -130,26 +130,27 @@ def _copy(connection: psycopg.Connection[Any], files: dict[str, Path]) -> Second
     with connection.transaction():
         connection.execute("SET LOCAL search_path = ag_catalog, public")
         _graph_ddl.create(connection, FLOOR_GRAPH)
-        connection.execute(
-            "CREATE TABLE public.floor_vectors (LIKE public.detection_embeddings INCLUDING ALL)"
-        )
+        connection.execute("CREATE SCHEMA floor_vectors")
+        vector = vector_table.vector_type(connection)
+        vector_table.create(connection, FLOOR_VECTORS, vector, DIM)
         lap()
         for label in LABELS:
             query = sql.SQL("COPY {} FROM STDIN").format(sql.Identifier(FLOOR_GRAPH, label))
             _feed(connection, query, files[label])
-        query = sql.SQL("COPY public.floor_vectors FROM STDIN (FORMAT binary)").format()
+        query = sql.SQL("COPY {} FROM STDIN (FORMAT binary)").format(
+            sql.Identifier(FLOOR_VECTORS, TABLE)
+        )
         _feed(connection, query, files["vectors"])
         lap()
         _graph_ddl.index(connection, FLOOR_GRAPH)
         _graph_ddl.analyze(connection, FLOOR_GRAPH)
-        connection.execute(statements("vectors")["sample"])
-        connection.execute("ANALYZE public.floor_vectors (det_pk, det_id, run_id)")
+        vector_table.analyze(connection, FLOOR_VECTORS)
         lap()
         _graph_ddl.counts(connection, FLOOR_GRAPH)
-        connection.execute("SELECT count(*) FROM public.floor_vectors")
+        vector_table.count(connection, FLOOR_VECTORS)
         lap()
     lap()
-    connection.execute("DROP TABLE public.floor_vectors")
+    connection.execute("DROP SCHEMA floor_vectors CASCADE")
     with connection.transaction():
         _graph_ddl.drop(connection, FLOOR_GRAPH)
     lap()

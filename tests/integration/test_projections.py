@@ -1,5 +1,6 @@
 """Replay and tail make the same rows, and they are what the fold says."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -208,6 +209,27 @@ def test_wide_embeddings(tmp_path: Path, one_database: Targets) -> None:
     assert [row[2] for row in vector_rows(one_database.vector_url)] == [
         o.det_id for o in searchable
     ]
+
+
+def test_no_part_of_a_row_that_fits_a_page_is_stored_apart(
+    tmp_path: Path, one_database: Targets, pg: psycopg.Connection
+) -> None:
+    rebuild(write_log(tmp_path / "log", walk(5, dim=512)), one_database, SETTINGS)
+    assert vector_rows(one_database.vector_url)
+    row = pg.execute(
+        "SELECT pg_relation_size(reltoastrelid) FROM pg_class"
+        " WHERE oid = 'public.detection_embeddings'::regclass"
+    ).fetchone()
+    assert row == (0,)
+
+
+def test_a_row_that_is_larger_than_a_page(tmp_path: Path, one_database: Targets) -> None:
+    name = "".join(hashlib.sha256(bytes([i])).hexdigest() for i in range(4))
+    seen = detection(name, [1.0] * 1900, det_id=name, embedding_model=name)
+    log = write_log(tmp_path / "log", [envelope(0, run_id=name, detections=[seen])])
+    rebuild(log, one_database, SETTINGS)
+    rows = vector_rows(one_database.vector_url)
+    assert [(row[1], row[2], row[4], row[10]) for row in rows] == [(name,) * 4]
 
 
 @pytest.mark.slow

@@ -21,11 +21,14 @@ COMMENT ON TABLE {schema}.detection_embeddings IS 'mapfold: made from the log; r
 
 -- name: plain
 -- In the row itself: 512 dimensions fit a page, and a search that reads every row stays out of TOAST.
-ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding SET STORAGE PLAIN
+-- So do the other columns: by default the server stores the bbox of any row above 2 kB in TOAST.
+ALTER TABLE {schema}.detection_embeddings
+    ALTER COLUMN embedding SET STORAGE PLAIN, SET (toast_tuple_target = 8160)
 
 -- name: external
 -- Too wide for a page; at least not compressed, which embeddings do not do.
-ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding SET STORAGE EXTERNAL
+ALTER TABLE {schema}.detection_embeddings
+    ALTER COLUMN embedding SET STORAGE EXTERNAL, RESET (toast_tuple_target)
 
 -- name: redimension
 ALTER TABLE {schema}.detection_embeddings ALTER COLUMN embedding TYPE {vector}({dimension})
