@@ -1,4 +1,4 @@
 """eventsrc: the append-only log of what a robot saw and where it was.
 
-It never imports `projections`, which says what the log means.
+It never imports `projections`, which interprets the log.
 """

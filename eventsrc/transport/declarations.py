@@ -245,7 +245,7 @@ def parse_heartbeat(sample: zenoh.Sample) -> SequenceNumber | None:
 
 
 def check_key_length(key: str) -> None:
-    """TransportError for a key so long that Zenoh would panic and take the session with it."""
+    """Raise TransportError for a key so long that Zenoh would panic and end the session."""
     size = len(key.encode())
     if size > _MAX_KEY_BYTES:
         raise TransportError(

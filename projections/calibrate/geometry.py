@@ -26,7 +26,7 @@ _TO_PART = 10.0
 _HINT_SIGMAS = 6.0
 _HINT_LEAST = 0.06
 _LEAST_INFORMATION = 1e-6
-"""So that boxes that are all in the middle of the picture tell nothing."""
+"""Least variation needed: boxes that are all in the middle of the picture are not informative."""
 
 
 class Errors(NamedTuple):

@@ -23,7 +23,7 @@ it surer."""
 _ROUNDS = 6
 _WORST = 20.0
 _UNSURE_M2 = 1.0
-"""A half that knows its thing less well tells nothing."""
+"""A half with a larger error is not informative."""
 _LEAST_M2 = 0.04
 _FEW = 10.0
 """So many things count as much as the assumption that errors are independent."""

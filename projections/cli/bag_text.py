@@ -1,4 +1,4 @@
-"""Bags of ROS 2 on the command line: options, the file of labels, and what was found in a bag."""
+"""Bags of ROS 2 on the command line: options, the file of labels, and the report of a bag."""
 
 import functools
 import math
@@ -17,7 +17,7 @@ from eventsrc.text import counted, visible
 _PANEL: Final = "Bags of ROS 2"
 _MOST_UNUSED: Final = 10
 _MOST_RUN_ID: Final = 100
-"""So that run ids and default detection ids keep within their limits."""
+"""Longest run id, so that default detection ids keep within their limit."""
 _NS: Final = 1_000_000_000
 MAX_GAP_S: Final = 3_600.0
 
@@ -138,7 +138,7 @@ def labels_by_number(path: Path | None) -> dict[str, str]:
 
 
 def bag_lines(report: BagReport) -> Iterator[str]:
-    """What was in a bag, what was used, and what not and why."""
+    """A bag's contents: what was used, and what was not and why."""
     topics = counted(len(report.topics), "topic")
     yield (
         f"{report.name}: {counted(report.messages, 'message')} of {topics}, "

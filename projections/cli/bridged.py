@@ -1,4 +1,4 @@
-"""`mapfold record --ros2dds`: the options of a bridge from ROS, and what is said at the start."""
+"""`mapfold record --ros2dds`: the options of a bridge from ROS, and the messages at the start."""
 
 import functools
 from collections.abc import Callable
@@ -97,7 +97,7 @@ TopicOption = Annotated[
 
 
 class BridgeChoice(NamedTuple):
-    """What the options of `mapfold record` say about ROS."""
+    """The values of the ROS options of `mapfold record`."""
 
     namespace: str
     detections: list[str] | None
@@ -133,7 +133,7 @@ NOTHING: Final = BridgeChoice(
     DEFAULT_MAX_GAP_NS / 1e9,
     None,
 )
-"""What they say when none is given."""
+"""The values of these options when none is given."""
 
 
 def check_unused(choice: BridgeChoice) -> None:
@@ -224,7 +224,7 @@ def used_topics(recording: RosRecording) -> list[str]:
 
 
 def _camera(topic: str) -> str:
-    """What tells a run of one of several topics of detections from those of the others."""
+    """The part of a run id that tells apart the runs of several topics of detections."""
     return topic.strip("/").removesuffix("/detections")
 
 
@@ -234,7 +234,7 @@ def _run_id(namespace: str, now_ns: int) -> str:
 
 
 def say_topics(log: Path, bridge: Bridge) -> None:
-    """Say what is recorded, and of which runs the keyframes are."""
+    """Print what is recorded, and the run ids of the keyframes."""
     runs = ", ".join(visible(stream.run_id) for stream in bridge.recording.streams)
     keys = ", ".join(bridge.keys)
     say(f"recording of a zenoh-bridge-ros2dds to {log}: {keys}; keyframes of {runs}")

@@ -1,4 +1,4 @@
-"""What the options of `mapfold detect` are checked for and parsed to."""
+"""Check and parse the options of `mapfold detect`."""
 
 import datetime
 import math
@@ -38,7 +38,7 @@ def check_sources(
 
 
 def timing_of(start: str, fps: float | None) -> Timing:
-    """What ``--start`` and ``--fps`` say."""
+    """Parse ``--start`` and ``--fps``."""
     if fps is not None and not 0.0 < fps <= 10_000.0:
         raise MisuseError(f"--fps {fps:g}: a number above 0 and up to 10,000")
     try:
@@ -71,7 +71,7 @@ def run_id_of(given: str | None) -> RunId:
 
 
 def device_of(text: str) -> Device:
-    """What ``--device`` says."""
+    """Parse ``--device``."""
     if text == "cpu":
         return "cpu"
     if text == "cuda":
@@ -80,7 +80,7 @@ def device_of(text: str) -> Device:
 
 
 def limits_of(moved: float, turned: float, after: float | None, *, posed: bool) -> GateLimits:
-    """What makes a keyframe: without poses and ``--after`` every picture."""
+    """The rule for keyframes: without poses and ``--after`` every picture is one."""
     for name, value in (("--moved", moved), ("--turned", turned), ("--after", after or 0.0)):
         if not math.isfinite(value):
             raise MisuseError(f"{name} {value}: give a finite number")
@@ -89,7 +89,7 @@ def limits_of(moved: float, turned: float, after: float | None, *, posed: bool) 
 
 
 def spool_path() -> Path:
-    """The spool without ``--spool``."""
+    """The default of ``--spool``."""
     return Path(os.environ.get("MAPFOLD_HOME") or ".mapfold") / "detect-spool.sqlite"
 
 

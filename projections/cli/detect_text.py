@@ -37,7 +37,7 @@ pictures, --encoder turns each crop into an embedding. To have both in a few min
 Then, for a folder of pictures named by their times, with poses in a file:
   mapfold detect --images DIR --poses poses.csv --detector D.onnx --encoder E.onnx
 """
-"""What to fetch, printed when a model is not given."""
+"""Where to get a model, printed when none is given."""
 
 
 @contextlib.contextmanager

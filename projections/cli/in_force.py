@@ -1,7 +1,6 @@
-"""What the running command was given, for the command lines that its messages advise.
-
-Such a line needs the same log, the same settings and the same databases, or it does something else:
-a check that found a fault under ``--settings F`` is repaired under these settings only.
+"""Options of the running command, for the command lines that its messages advise. Such a line needs
+the same log, settings and databases, or it does something else: a fault that a check found under
+``--settings F`` is repaired under these settings only.
 """
 
 import inspect
@@ -25,7 +24,7 @@ _CARRIED: Final = (
 """In the order in which they are added."""
 _DATABASES: Final = frozenset({"--db", "--vector-db"})
 _ANSWERS_OTHERS: Final = frozenset({"serve", "ui"})
-"""Commands whose messages go to other machines too, which are not told where the databases are."""
+"""Commands whose messages also go to other machines, which must not learn the databases' URLs."""
 _LOG: Final = "log"
 _CONTEXT: Final = "running_context"
 

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and what they are parsed to.
+"""Options and arguments that several commands share, and their parsing.
 
 What only some commands need (databases, re-localisation, pictures) is imported in the
 function that uses it: the imports of all of them take longer than most commands.
@@ -41,7 +41,7 @@ LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's fold
 # Points of a log
 
 W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
-"""What W may be, for help texts."""
+"""The forms of W, for help texts."""
 
 
 def point(reader: LogReader, text: str) -> Offset:
@@ -87,7 +87,7 @@ SettingsOption = Annotated[
 def settings_from(
     file: Path | None, assignments: list[str] | None, corrections: Corrections = NO_CORRECTIONS
 ) -> Settings:
-    """The settings a command runs with: those of ``--settings``, else those that the log names
+    """The settings of a command: those of ``--settings``, else those that the log names
     (``use-settings``), else the defaults; ``--set`` changes them.
 
     Raises SettingsError naming file and field.
@@ -136,7 +136,7 @@ def past_settings(
 
 
 def say_defaults(settings: Settings) -> None:
-    """Say, after a fold with default settings, that the live map may have others."""
+    """Print, after a fold with default settings, that the live map may have others."""
     if settings == Settings():
         say("folded with the default settings; a live map made with others needs its --set here")
 
@@ -207,7 +207,7 @@ PublishKeyOption = Annotated[str, typer.Option("--key", help="Zenoh key to publi
 def zenoh_options(
     connect: list[str] | None, listen: list[str] | None, config: Path | None
 ) -> ZenohOptions:
-    """What ``--connect``, ``--listen`` and ``--zenoh-config`` say."""
+    """The Zenoh configuration of ``--connect``, ``--listen`` and ``--zenoh-config``."""
     return ZenohOptions(tuple(connect or ()), tuple(listen or ()), config)
 
 

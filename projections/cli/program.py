@@ -1,4 +1,4 @@
-"""The ``mapfold`` program: starting it, its standard streams, and what it exits with.
+"""The ``mapfold`` program: its start, its standard streams and its exit codes.
 
 Starting. Only the module of the command that was asked for is imported: all of them together take a
 third of a second, longer than most commands work. The cyclic garbage collector is off while modules
@@ -224,7 +224,7 @@ class _Interrupted(Exception):
 
 
 class _ReaderGone(Exception):
-    """The reader of stdout has left: ``mapfold log cat L | head``."""
+    """The reader of stdout has closed it: ``mapfold log cat L | head``."""
 
 
 @contextlib.contextmanager

@@ -219,7 +219,7 @@ def _gap_history(log: Path) -> GapLedger[RunId] | None:
 
 
 def _edits(log: Path, writer: LogWriter) -> Edits:
-    """What takes commands. If the log's own cannot be read, it refuses all."""
+    """The receiver of commands; it refuses all of them if those in the log cannot be read."""
     known: KnownCommands | str
     try:
         with LogReader(log) as reader:

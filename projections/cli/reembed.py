@@ -1,4 +1,4 @@
-"""`mapfold reembed`: vectors of another encoder for the detections of a log, of their crops."""
+"""`mapfold reembed`: add vectors of another encoder to a log, made from its crops of detections."""
 
 import hashlib
 import re
@@ -109,10 +109,10 @@ def reembed_log(
     ] = "",
     json_: JsonOption = False,
 ) -> None:
-    """Give a log's detections vectors of another encoder, made of the crops that it keeps.
+    """Add vectors of another encoder to a log, made from the crops that it keeps.
 
-    They are appended; `--space NAME` then maps the log in their space. What was interrupted is
-    continued by the same command. Exit 3 when crops cannot be decoded or encoded.
+    They are appended; `--space NAME` then maps the log in their space. Run an interrupted command
+    again to continue it. Exit 3 when crops cannot be decoded or encoded.
     """
     model = CropModel(encoder, device_of(device), threads)
     with stop_on_signals() as stop, Bar() as bar:

@@ -1,7 +1,7 @@
 """`mapfold relocalize`: which Place is this, from a few object crops or classes.
 
 With ``--track`` it answers questions one after the other, each with a line of JSON. A line that is
-no question is answered with what is wrong, and the next one is read.
+no question is answered with an error, and the next one is read.
 """
 
 import contextlib
@@ -138,7 +138,7 @@ def _refuse_to_track(classes: list[str] | None, method: Method) -> None:
 
 
 def _question(query: str | None, classes: list[str] | None) -> Question:
-    """What is asked: QUERY, or things of the classes in one picture. Raises MisuseError."""
+    """The question: QUERY, or one picture with things of the classes. Raises MisuseError."""
     if (query is None) == (not classes):
         raise MisuseError("give either QUERY, the crops that the robot sees, or --class CLASS")
     if query is not None:

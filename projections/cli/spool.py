@@ -1,4 +1,4 @@
-"""`mapfold spool`: what a robot's spool holds, and envelopes in it that a recorder has refused."""
+"""`mapfold spool`: the contents of a robot's spool, and envelopes in it that a recorder refused."""
 
 from pathlib import Path
 from typing import Annotated, Final

@@ -1,4 +1,4 @@
-"""What commands print: data on stdout, messages and a progress bar on stderr, and the exit code 3.
+"""Output of commands: data on stdout, messages and progress bars on stderr, and the exit code 3.
 
 Everything printed goes through `eventsrc.text`, which escapes control characters: keys, names and
 reasons come from the network.
@@ -22,8 +22,8 @@ EXIT_FINDINGS = 3
 class _People(Console):
     @property
     def is_terminal(self) -> bool:
-        """Whether the stream is one. FORCE_COLOR and TTY_COMPATIBLE, by which rich takes a pipe or
-        a file for a terminal, must not put progress bars into it."""
+        """Whether the stream is a terminal. FORCE_COLOR and TTY_COMPATIBLE, by which rich takes a
+        pipe or a file for a terminal, must not put progress bars into it."""
         try:
             return self.file.isatty()
         except ValueError:  # closed
@@ -35,7 +35,7 @@ people = _People(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
 class OutputLost(Exception):
-    """A write to stdout failed; the text says why."""
+    """A write to stdout failed; the text is the reason."""
 
 
 def say(message: str) -> None:
@@ -58,7 +58,7 @@ def display(text: str) -> None:
 
 
 def say_metrics(address: tuple[str, int], port: int) -> None:
-    """Say where the metrics of ``--metrics`` are served, and warn when others can read them."""
+    """Print where the metrics of ``--metrics`` are served, and warn when others can read them."""
     from eventsrc.transport.config import is_loopback
 
     say(f"metrics on http://{address[0]}:{port}/metrics")
@@ -98,17 +98,18 @@ class _Listeners:
 
 
 def on_output(told: Callable[[], None] | None) -> None:
-    """Have this called before data goes to stdout."""
+    """Register a function that is called before data is written to stdout."""
     _Listeners.output = told
 
 
 def on_own_bar(told: Callable[[int], None] | None) -> None:
-    """Have this called with 1 before a command shows a bar of its own, and with -1 after it."""
+    """Register a function that is called with 1 before a command shows a bar of its own, and with
+    -1 after it."""
     _Listeners.own_bar = told
 
 
 def output_begins() -> None:
-    """To be called before data goes to stdout."""
+    """Call the registered function; for code that writes to stdout by itself."""
     if _Listeners.output is not None:
         _Listeners.output()
 
@@ -120,7 +121,7 @@ def _own_bar(opened: int) -> None:
 
 class Bar:
     """A progress bar with rate and time left; prints nothing when stderr is not a terminal. Unless
-    it is ``announced``, it is that of `reading_bar`, which all others take the place of."""
+    it is ``announced``, it is that of `reading_bar`, which gives way to all others."""
 
     def __init__(self, *, announced: bool = True) -> None:
         from rich import progress  # here: importing it takes a tenth of a short command

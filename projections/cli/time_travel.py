@@ -291,7 +291,7 @@ def bisect(
 
 @contextlib.contextmanager
 def _columns_shown() -> Iterator[None]:
-    """Show where an expression is wrong, above the line that says why."""
+    """Print an expression with a mark where it is wrong, above the error message."""
     try:
         yield
     except ExpressionError as error:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from projections.ui.service import UiService
 
 _EVERY_ADDRESS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  not a bind
-"""What listens on every address is not called so: here, it is reached at these."""
+"""The address of this machine for a server that listens on all addresses."""
 _KINDS: Final = ("place", "object", "keyframe", "merge")
 """What ``--select`` may name."""
 
@@ -90,7 +90,7 @@ def ui(
     settings_file: SettingsOption = None,
     no_cache: NoCacheOption = False,
 ) -> None:
-    """Look at a log's map in a browser, and drag time.
+    """Show a log's map in a browser, at any point in time.
 
     The map at every moment, merges and their causes, what changed, what would be under other
     settings. Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
@@ -188,7 +188,7 @@ def _editor(service: "UiService", connect: list[str] | None, config: Path | None
 def _tails(
     stack: ExitStack, log: Path, db: str, vector_db: str | None
 ) -> "Callable[[], list[dict[str, Any]]]":
-    """What the databases' sinks do now, read at each call."""
+    """The status of the databases' sinks, read at each call."""
     from projections.database.connection import open_targets
     from projections.database.status import projection_status
 

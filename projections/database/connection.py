@@ -159,7 +159,7 @@ def pin_session_settings(connection: Connection) -> None:
     """Disable timeouts and pin the output formats, whatever the server's defaults.
 
     A rebuild folds for minutes between two statements, an index of many vectors takes longer, and a
-    tail may be idle all night. TCP keepalives end the session when its client is gone.
+    tail may be idle all night. TCP keepalives end the session when its client has died.
     """
     connection.execute(
         "SELECT set_config(name, wanted ->> name, false)"

@@ -64,10 +64,10 @@ def _renaming(connection: Connection, graph: str, *, is_graph: bool) -> str:
 
 
 def adopt_if_empty(connection: Connection, graph: str) -> None:
-    """Make a graph ours that somebody else made and that has no vertex, edge or other table. Inside
-    a transaction. The rights on its schema stay, unless it has labels: then another one takes its
-    place, because labels get their numbers in the order in which they are made. It is renamed and
-    dropped with the next replay: AGE 1.5 may end a session that drops a graph."""
+    """Take over a graph that another program made and that has no vertex, edge or other table.
+    Inside a transaction. The rights on its schema stay, unless it has labels: then another one
+    takes its place, because labels get their numbers in the order in which they are made. It is
+    renamed and dropped with the next replay: AGE 1.5 may end a session that drops a graph."""
     run = statements("graph")
     row = connection.execute(run["state"], {"graph": graph}).fetchone()
     if row is None or not row[0] or row[1] or not _is_empty(connection, graph):

@@ -116,7 +116,7 @@ class GraphSink:
         return GraphShadow(self._loader)
 
     def drop_replaced(self, connection: Connection) -> None:
-        """Have the replaced graph dropped once its last reader is gone."""
+        """Drop the replaced graph once its last reader has ended."""
         if wait_for_earlier_transactions(connection) and try_drop_lock(connection, self.name):
             graph_schema.drop_in_background(connection, OLD_GRAPH)
 

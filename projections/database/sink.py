@@ -125,7 +125,7 @@ class RebuildSink(Protocol[Conn]):
         """A shadow, not created yet."""
 
     def drop_replaced(self, connection: Conn) -> None:
-        """Drop what was replaced, now or once its last reader is gone.
+        """Drop what was replaced, now or once its last reader has ended.
 
         May close the connection while the server still drops.
         """

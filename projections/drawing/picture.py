@@ -63,7 +63,7 @@ def draw_map(
     bridges: Sequence[Bridge] = (),
     min_observations: int = 2,
 ) -> None:
-    """Draw ``view`` to ``out``; its suffix says how (.png, .svg, .pdf).
+    """Draw ``view`` to ``out``, in the format of its suffix (.png, .svg, .pdf).
 
     Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
     cannot be written or has another suffix.

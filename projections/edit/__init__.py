@@ -1,5 +1,4 @@
-"""Commands made from what a person types: resolved in the map as it is, checked, and recorded.
-
-`current` is that map, `make` builds the commands, `conflicts` names a command that stands in the
-way, `record` appends, `effect` says what a command changes.
+"""Corrections from user input: resolved in the current map, checked, and recorded as commands.
+`current` is that map, `make` builds commands, `conflicts` finds earlier commands that contradict
+them, `record` appends them, `effect` computes what a command changes.
 """

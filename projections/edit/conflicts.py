@@ -23,8 +23,8 @@ from .current import CurrentMap
 
 
 class EditRefused(MisuseError):
-    """A command is not recorded because of another one, which the message names, or because it
-    would change nothing."""
+    """A command is not recorded because it contradicts another one, which the message names, or
+    because it would change nothing."""
 
 
 def describe(recorded: RecordedCommand) -> str:
@@ -38,7 +38,7 @@ def describe(recorded: RecordedCommand) -> str:
 
 
 def refusal(what: str, recorded: RecordedCommand, log: object) -> EditRefused:
-    """``what``, by which command, and how to undo that."""
+    """The refusal ``what``, with the command that causes it and how to undo that."""
     command_id = recorded.command.command_id
     return EditRefused(
         f"{what} by {describe(recorded)}; undo that first: "
@@ -72,7 +72,7 @@ _T = TypeVar("_T", bound=Hashable)
 
 
 def _made_one(pairs: Iterable[tuple[_T, _T]], start: _T) -> dict[_T, tuple[_T, _T] | None]:
-    """What is one with ``start`` by these pairs, each with the first pair on the way to it."""
+    """All that these pairs join to ``start``, each with the first pair on the way to it."""
     pairs = list(pairs)
     reached: dict[_T, tuple[_T, _T] | None] = {start: None}
     frontier = [start]

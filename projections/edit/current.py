@@ -1,4 +1,4 @@
-"""The map of a log as it is now, with its corrections, and look-up of what a person typed in it."""
+"""The current map of a log under its corrections, and look-up of user input in it."""
 
 import re
 from collections.abc import Callable, Iterator, Sequence

@@ -36,7 +36,7 @@ Found = Sequence[tuple[RecordedCommand, Effect | None]]
 
 
 def what(command: Command) -> str:
-    """What a command is about, in short."""
+    """A short description of a command's subject."""
     match command:
         case NamePlace():
             return f"{_name(command.place)} is {command.name}"

@@ -1,8 +1,8 @@
-"""The commands, made from what a person typed and the map as it is.
+"""Make commands from user input and the current map.
 
 Each function takes the current map, the `Stamp` of the command and its arguments, and returns the
-command. It raises MisuseError when something is not there (with what is there), when another
-command stands in the way, or when the map would stay as it is.
+command. It raises MisuseError when something does not exist (with what does), when another command
+contradicts it, or when the map would not change.
 """
 
 import re
@@ -54,7 +54,7 @@ _C = TypeVar("_C", bound=Command)
 
 
 class Stamp(NamedTuple):
-    """Who gives a command and why; ``command_id`` is unique in a log."""
+    """The author of a command and the reason; ``command_id`` is unique in a log."""
 
     command_id: str
     issued_by: str
@@ -62,7 +62,7 @@ class Stamp(NamedTuple):
 
 
 def build(model: type[_C], stamp: Stamp, **fields: Any) -> _C:
-    """A command of this model. Raises MisuseError that names the field that is wrong."""
+    """A command of this model. Raises MisuseError naming an invalid field."""
     try:
         return model(**stamp._asdict(), **fields)
     except ValidationError as error:

@@ -1,7 +1,8 @@
 """The effect of a command, found by folding the log with it before it is recorded.
 
-A command that no fold can obey, or that would not do what it says, is refused. An undo may be
-recorded where the map cannot be folded without it either: it may be a step on the way out.
+A command that no fold can obey, or that would not have its effect, is refused. An undo may be
+recorded even if the map cannot be folded with it: it may be the first of several undos that are
+needed.
 """
 
 from collections.abc import Iterator
@@ -34,8 +35,8 @@ from .effect import Change, Effect
 
 
 class Outcome(NamedTuple):
-    """``effect`` is None if it cannot be worked out, ``unknown`` then says why; ``void`` are the
-    commands that have no effect any more, and why."""
+    """``effect`` is None if it cannot be computed, ``unknown`` is then the reason; ``void`` are the
+    commands that have no effect any more, with reasons."""
 
     change: Change
     effect: Effect | None
@@ -44,8 +45,8 @@ class Outcome(NamedTuple):
 
 
 def outcome_of(current: CurrentMap, command: Command, *, recorded: bool) -> Outcome:
-    """What comes of a command. One that is not ``recorded`` is refused with EditRefused if the map
-    cannot be folded with it but without it, or if it would not do what it says."""
+    """The outcome of a command. One that is not ``recorded`` is refused with EditRefused if the map
+    can be folded without it but not with it, or if it would not have its effect."""
     change = Change.by(current, command)
     try:
         effect = change.effect()

@@ -1,7 +1,6 @@
-"""Recording a command: straight into the log, or by the recorder that holds it.
-
-The command is made from the map as it is. If a newer command is in the log by the time it would be
-appended, it is made again from the map as it is then.
+"""Record a command: directly in the log, or by the recorder that holds it. The command is made from
+the current map. If another command has been appended meanwhile, it is made again from the map after
+that.
 """
 
 from collections.abc import Callable
@@ -35,12 +34,12 @@ _TRIES: Final = 10
 
 
 class _LogFree(Exception):
-    """The writer that held the log is gone."""
+    """The writer that held the log has ended."""
 
 
 class Made(NamedTuple):
-    """A command, the map that it was made from, and what comes of it; ``offset`` is None if it is
-    not recorded, ``repeated`` if it was recorded by an earlier call."""
+    """A command, the map that it was made from, and its outcome; ``offset`` is None if it is not
+    recorded, ``repeated`` if it was recorded by an earlier call."""
 
     command: Command
     current: CurrentMap

@@ -1,4 +1,4 @@
-"""A process that parses stretches of a log for the one that folds it.
+"""A process that parses ranges of a log for the process that folds it.
 
 It is asked for a range of offsets, parses it into one of the slots of a shared memory, and answers
 where in the slot. It writes nothing else anywhere, so it may be killed at any moment. If it cannot

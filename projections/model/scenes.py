@@ -15,7 +15,7 @@ from .space_vectors import new_map
 from .view import MapView
 
 SCENES: Final = 500
-"""Scenes of a recording unless ``every`` says otherwise; each holds the whole map."""
+"""Scenes of a recording unless ``every`` is given; each holds the whole map."""
 
 
 class Step(NamedTuple):

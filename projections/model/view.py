@@ -142,7 +142,7 @@ class MapView:
         return bool(self.floors) and self.floor_of(a) != self.floor_of(b)
 
     def type_of(self, place: PlaceOrdinal) -> PlaceType | None:
-        """The type of room that a place is, by its Objects or its name; None if neither says."""
+        """The type of room that a place is, by its Objects or its name; None if unknown."""
         return place_type(self.contents.of(place), self.all_places[place].name)
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:

@@ -45,7 +45,7 @@ def relocalize(
     method: Method = "joint",
     camera: Camera | None = None,
 ) -> Answer:
-    """Where a robot is that asks this, from the databases as they are now."""
+    """Answer a question for re-localisation from the databases as they are now."""
     crops = question.crops if isinstance(question, Question) else question
     with CandidateReader(targets) as reader:
         return rank(question, reader.candidates(crops), top=top, method=method, camera=camera)

@@ -73,7 +73,7 @@ class Connections:
         connection.abort()
 
     def close_handshakes(self) -> None:
-        """Close those in a TLS handshake, which uvicorn does not know."""
+        """Close those in a TLS handshake, which uvicorn does not track."""
         for connection in [*self._open]:
             if not connection.is_made:
                 connection.abort()
@@ -221,7 +221,7 @@ class Connection(H11Protocol):
         self._refuse(408, f"no complete request within {REQUEST_S:g} s")
 
     def _refuse(self, status: int, message: str) -> None:
-        """Send a refusal, if no answer was begun, and close."""
+        """Send a refusal, if no response has started, and close."""
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             body = encode({"error": {"kind": "bad_question", "message": message}})
             headers = [

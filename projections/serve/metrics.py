@@ -1,4 +1,4 @@
-"""What the service counts, for ``/metrics``: questions by transport, kind and result, their times,
+"""Metrics of the service for ``/metrics``: questions by transport, kind and result, their times,
 HTTP responses by status, and the state of queue, sessions and database."""
 
 import time

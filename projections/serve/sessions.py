@@ -33,7 +33,7 @@ class Sessions:
             return len(self._kept)
 
     def tracked(self, name: str, moved: Movement, answer: Answer) -> dict[str, Any]:
-        """What the session says of where the robot is, as JSON."""
+        """The session's estimate of the robot's pose, as JSON."""
         with self._lock:  # a step takes a few milliseconds of numpy, so one lock is enough
             self._forget()
             _, track = self._kept.pop(name, (0.0, None))

@@ -1,4 +1,4 @@
-"""What can be asked of the map's state: Places or Objects, near a position or all of them by pages.
+"""Queries of the map's state: Places or Objects, near a position or all of them by pages.
 
 Near a position they come nearest first. Without one they come in the order in which they were
 founded, at most `MAX_PAGE` at a time. A page's ``next`` is the number of its last one: the next

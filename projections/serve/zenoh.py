@@ -21,7 +21,7 @@ RELOCALIZE: Final = "mapfold/relocalize"
 STATE: Final = "mapfold/state"
 MAX_SELECTOR: Final = 4096
 _PEER: Final = "zenoh"
-"""Zenoh does not say who asks: all of its questions are one peer's."""
+"""Zenoh does not identify the client: all its questions count as one peer's."""
 _log = logging.getLogger(__name__)
 
 

@@ -1,5 +1,4 @@
-"""The web debugger: a page over one log, and the interface that it asks (docs/ui.md).
-
-The page gets a map's whole history as arrays and computes the map at any offset by itself; texts,
-digests and other settings are asked from the server.
+"""The web debugger: a page about one log, and its HTTP interface (docs/ui.md). The page gets a
+map's whole history as arrays and computes the map at any offset from them; texts, digests and maps
+under other settings come from the server.
 """

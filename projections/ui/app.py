@@ -222,7 +222,7 @@ async def _awaited(
 
 
 async def _disconnect(request: Request) -> None:
-    """Return when the client is gone."""
+    """Return when the client has disconnected."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 

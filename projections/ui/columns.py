@@ -1,4 +1,4 @@
-"""A map's whole history as columns, from which a browser makes the map at any offset by itself.
+"""A map's whole history as columns, from which a browser computes the map at any offset.
 
 The columns are read from a `History`, which one fold has filled; nothing is folded here. Ordinals
 of keyframes, places and objects are those of the fold: rows 0, 1, 2 … of ``kf_``, ``pf_`` and

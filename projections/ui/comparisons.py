@@ -115,7 +115,7 @@ def whatif_answer(
     opened: Opened, through: Offset, query: QueryParams, go_on: Callable[[], None]
 ) -> dict[str, Any]:
     """``set`` together make one alternative; each ``try``, ``grid`` and ``without`` as the options
-    of ``mapfold whatif``. Says how long the folds took: ``seconds``, and each its own."""
+    of ``mapfold whatif``. ``seconds`` is the time of all folds; each alternative has its own."""
     started = perf_counter()
     sets = assignments_of(query)
     tries, grids, without = (query.getlist(name) for name in _OPTIONS)

@@ -1,4 +1,4 @@
-"""Server-sent events of a log that grows, one whenever something changed.
+"""Server-sent events for a growing log, one whenever something changed.
 
 A thread looks for new events; each page has a stream, which ends with the service. The lag of the
 databases' tails is asked for only where a database is named.
@@ -26,7 +26,8 @@ Tails = Callable[[], list[dict[str, Any]]]
 
 
 class LiveWatch:
-    """Looks for new events until closed; use it in a ``with`` block. ``close`` ends all streams."""
+    """Polls the log for new events until closed; use it in a ``with`` block. ``close`` ends all
+    streams."""
 
     def __init__(self, service: UiService, tails: Tails | None = None) -> None:
         self._service, self._tails = service, tails

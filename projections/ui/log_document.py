@@ -1,4 +1,4 @@
-"""What a page shows of a log as a whole."""
+"""The page's facts about a whole log, as JSON."""
 
 import resource
 import sys
@@ -13,7 +13,7 @@ from .log_map import MOST_ALTERNATIVES, MOST_HISTORIES, LogMap
 from .opened import Opened
 
 _KIB: Final = 1 if sys.platform == "darwin" else 1024
-"""What ``ru_maxrss`` counts in."""
+"""The unit of ``ru_maxrss``, bytes."""
 
 
 def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[str, Any]:

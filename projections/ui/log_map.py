@@ -1,6 +1,6 @@
 """One log under one choice of settings, as far as it can be read and folded.
 
-What cannot be read or folded is a sentence in ``problems``, and the map ends before it. The history
+Where the log cannot be read or folded, the map ends, with a sentence in ``problems``. The history
 is folded once and then look-ups answer; new events are folded when `refresh` finds them. Not for
 several threads at once.
 """
@@ -119,7 +119,7 @@ class LogMap:
     def refresh(self, end: Offset | None = None) -> bool:
         """Fold the events recorded since, at most to ``end``; whether anything is new.
 
-        Raises nothing for a log that is damaged, gone or cannot be folded: `problems` says it.
+        Errors of a log that is damaged, deleted or cannot be folded are in `problems`, not raised.
         """
         before = self.through, self._lost, self._stopped
         if end is not None:
@@ -183,7 +183,7 @@ class LogMap:
 
 
 def _files(path: Path) -> tuple[int, ...]:
-    """Tells another folder, or another last segment, from those that were there."""
+    """Identifies the folder and its last segment, to detect replaced ones."""
     try:
         status = [path.stat(), *(entry.path.stat() for entry in list_growing(path)[-1:])]
     except OSError:

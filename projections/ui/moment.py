@@ -1,4 +1,5 @@
-"""What a question about the map names: W, what is known, and the command that asks the same."""
+"""The point in time of a question about the map: W, ``known_at``, and the equivalent command
+line."""
 
 import shlex
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ class Moment:
 
     @property
     def known(self) -> KnownHistory:
-        """The history under what is known."""
+        """The history under the commands before ``known_at``."""
         return self.shown.timeline.knowing(self.known_at)
 
     def document(self) -> dict[str, int]:

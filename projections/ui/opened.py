@@ -9,7 +9,7 @@ from projections.history.timeline import SettingsChoice
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A log and how it is looked at.
+    """A log and the options of the debugger.
 
     ``settings`` gives those of the map under some corrections: of ``settings_file`` or the log,
     changed by ``sets`` (``name=value``). ``truth``, of ``truth_files``, scores what-ifs. ``edits``:

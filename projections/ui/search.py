@@ -1,4 +1,4 @@
-"""Finding things by their names: places, objects, classes, detections, keyframes and runs."""
+"""Search by name: places, objects, classes, detections, keyframes and runs."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
@@ -98,8 +98,8 @@ there are very many, only those that contain what is wanted."""
 
 
 def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """What is called like ``q``, best first: the same name, then names that begin or end so, then
-    names that contain it. Letter case does not matter. ``kind`` asks for one kind only."""
+    """The things whose name matches ``q``, best first: the same name, then names that begin or end
+    so, then names that contain it. Letter case does not matter. ``kind`` asks for one kind only."""
     moment = Moment.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")

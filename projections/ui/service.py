@@ -1,4 +1,4 @@
-"""The log that a page shows: its map under the log's own settings, and under a few others.
+"""The log shown by the page: its map under the log's own settings, and under a few others.
 
 Answers are made on two threads: one for the log's own map, one for maps under other settings and
 for answers whose folds take long. The first fold begins at once on the first of them. A fold is
@@ -60,7 +60,7 @@ class Loading:
 
 
 class _Thread:
-    """A thread that answers one question after the other."""
+    """A thread that answers one question at a time."""
 
     def __init__(self, ending: threading.Event) -> None:
         self._queue = FairQueue(1, max_wait_s=_MAX_WAIT_S)
