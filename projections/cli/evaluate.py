@@ -12,6 +12,7 @@ from projections.evaluate import evaluate as score
 from projections.evaluate import read_truth
 from projections.evaluate.picture import draw_failures
 from projections.evaluate.questions import DEFAULT_SEED
+from projections.model.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 from projections.relocalize import Method
 
 from .options import (
@@ -108,6 +109,17 @@ def evaluate(
     ] = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers",
+            metavar="N",
+            min=0,
+            max=MAX_WORKERS,
+            help="Processes that ask beside this one. Default: as many as there are further"
+            f" processors, at most {DEFAULT_WORKERS}.",
+        ),
+    ] = None,
     json_: JsonOption = False,
 ) -> None:
     """How good places, objects and re-localisation are.
@@ -138,6 +150,7 @@ def evaluate(
             camera=camera_from(hfov, image),
             seed=seed,
             own=self_,
+            workers=workers,
             note=say,
         )
         if asked:

@@ -12,11 +12,12 @@ have split it off.
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from eventsrc.envelope import RunId
-from eventsrc.progress import reported
+from eventsrc.log.seek import Note
 from eventsrc.text import counted
 from projections.deltas import ObservationOrdinal
 from projections.exact import to_float32
@@ -25,6 +26,7 @@ from projections.model.view import MapView
 from projections.relocalize import Answer, Crop, ExactIndex, Match, rank
 
 from .baselines import best_cosine, plain_position
+from .parallel import call_all
 from .questions import DEFAULT_SEED, draw_key, spread
 from .trials import RIGHT_WITHIN_M
 
@@ -60,40 +62,70 @@ class OwnAnswer:
         return self.known and self.error_m is not None and self.error_m <= RIGHT_WITHIN_M
 
 
-def ask_own_questions(
-    view: MapView, crops: int, *, most: int = MOST, seed: int = DEFAULT_SEED
-) -> Iterator[OwnAnswer]:
-    """Ask from up to ``most`` of the keyframes that have ``crops`` crops: first with the visit
-    taken out, then with the things shown taken out too."""
-    index = ExactIndex(view)
-    constants = index.constants
-    lowered = constants.evidence.session_shift * (1.0 - constants.different)
-    runs, by_class = _by_run(view), _by_class(view)
-    askable = [
-        (keyframe, seen)
-        for keyframe in view.keyframes
-        if keyframe.pose is not None and len(seen := _drawn(view, keyframe, crops, seed)) == crops
-    ]
-    chosen = spread(askable, most)
-    stage = f"asking about itself, {counted(crops, 'crop')}"
-    for keyframe, seen in reported(chosen, stage, len(chosen), "keyframes"):
-        asked = [_crop(view.observations[ordinal]) for ordinal in seen]
-        visit = _visit(runs, keyframe)
-        shown = _observations_of_things(view, by_class, seen)
-        for taken_out, without in ((False, visit), (True, visit | shown)):
-            found = index.search(asked, without=without)
+class OwnQuestions:
+    """The questions with ``crops`` crops from up to ``most`` of the keyframes that have as many."""
+
+    def __init__(
+        self, view: MapView, crops: int, *, most: int = MOST, seed: int = DEFAULT_SEED
+    ) -> None:
+        self._view, self._crops = view, crops
+        self._index = ExactIndex(view)
+        self._runs, self._by_class = _by_run(view), _by_class(view)
+        askable = [
+            (keyframe, seen)
+            for keyframe in view.keyframes
+            if keyframe.pose is not None
+            and len(seen := _drawn(view, keyframe, crops, seed)) == crops
+        ]
+        self._chosen = spread(askable, most)
+
+    def __len__(self) -> int:
+        """Keyframes that are asked from."""
+        return len(self._chosen)
+
+    def ask(self, number: int) -> tuple[OwnAnswer, OwnAnswer]:
+        """Ask from one of the keyframes: first with the visit taken out, then with the things shown
+        taken out too."""
+        keyframe, seen = self._chosen[number]
+        constants = self._index.constants
+        lowered = constants.evidence.session_shift * (1.0 - constants.different)
+        asked = [_crop(self._view.observations[ordinal]) for ordinal in seen]
+        visit = _visit(self._runs, keyframe)
+        shown = _observations_of_things(self._view, self._by_class, seen)
+
+        def answered(taken_out: bool) -> OwnAnswer:
+            found = self._index.search(asked, without=visit | shown if taken_out else visit)
             rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
             answer = rank(asked, replace(found, matches=rows), top=1, camera=constants.camera)
             pose = None if answer.pose is None else (answer.pose.x, answer.pose.y)
-            yield OwnAnswer(
-                crops,
+            return OwnAnswer(
+                self._crops,
                 taken_out,
                 not taken_out and bool(shown - visit),
-                answer,
+                replace(answer, hypotheses=None),
                 _error(keyframe, pose),
                 _error(keyframe, plain_position(rows)),
                 best_cosine(rows),
             )
+
+        return answered(False), answered(True)
+
+
+def ask_own_questions(
+    view: MapView,
+    crops: int,
+    *,
+    most: int = MOST,
+    seed: int = DEFAULT_SEED,
+    workers: int = 0,
+    note: Note | None = None,
+) -> list[OwnAnswer]:
+    """All answers to `OwnQuestions`. ``workers`` and ``note``: see `call_all`."""
+    questions = OwnQuestions(view, crops, most=most, seed=seed)
+    calls = [partial(questions.ask, number) for number in range(len(questions))]
+    stage = f"asking about itself, {counted(crops, 'crop')}"
+    answers = call_all(calls, workers, stage, "keyframes", note)
+    return [answer for pair in answers for answer in pair]
 
 
 def _by_run(view: MapView) -> dict[RunId, list[KeyframeRecord]]:

@@ -8,6 +8,7 @@ within 1.5 m of the truth. ``plain`` and ``best_cosine`` are what a few lines do
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from eventsrc.log.seek import Note, resolve
 from projections.corrections import Corrections
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
+from projections.model.parsed_log import default_workers
 from projections.model.view import MapView
 from projections.relocalize import Camera, Method
 from projections.settings import Settings
@@ -68,13 +70,17 @@ def evaluate(
     camera: Camera | None = None,
     seed: int = DEFAULT_SEED,
     own: bool = False,
+    workers: int | None = None,
     note: Note | None = None,
 ) -> Evaluation:
     """Score the map of ``map_log`` (folded to ``until`` under its corrections) and questions from
     ``query_logs``. ``settings`` may depend on the log's corrections. With ``own`` the map is asked
-    questions of its own too, which need no truth.
+    questions of its own too, which need no truth. ``workers`` is how many processes may ask many
+    questions beside this one, 0 for none, by default `default_workers`; the scores do not depend on
+    it.
 
-    ``note`` is called with what the user should know about ``until`` (`eventsrc.log.seek.resolve`).
+    ``note`` is called with what the user should know about ``until`` (`eventsrc.log.seek.resolve`),
+    and when a process has died.
     Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
     """
     with LogReader(map_log) as reader:
@@ -88,11 +94,14 @@ def evaluate(
         check_truth(keyframes, truth)
     rooms = RoomIndex(list(read_keyframes([map_log])), keyframes, truth)
     runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
-    trials = {n: runner.run(make_questions(keyframes, truth, n, seed)) for n in CROPS}
-    views = {
-        n: runner.run(spread(make_view_questions(keyframes, truth, n, seed), MOST_VIEWS))
-        for n in VIEWS
-    }
+    if workers is None:
+        workers = default_workers()
+    asked = [make_questions(keyframes, truth, n, seed) for n in CROPS]
+    asked += [spread(make_view_questions(keyframes, truth, n, seed), MOST_VIEWS) for n in VIEWS]
+    answered = iter(runner.run(chain.from_iterable(asked), workers, note))
+    each = [list(islice(answered, len(questions))) for questions in asked]
+    trials = dict(zip(CROPS, each, strict=False))
+    views = dict(zip(VIEWS, each[len(CROPS) :], strict=True))
     scores: dict[str, Any] = {
         "places": place_scores(view, truth),
         "objects": object_scores(view, truth),
@@ -104,7 +113,9 @@ def evaluate(
     }
     if own:
         scores["self"] = {
-            str(crops): own_scores(list(ask_own_questions(view, crops, seed=seed)))
+            str(crops): own_scores(
+                ask_own_questions(view, crops, seed=seed, workers=workers, note=note)
+            )
             for crops in OWN_CROPS
         }
     return Evaluation(scores, trials, view)

@@ -4,16 +4,19 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from eventsrc.ingest import Accepted
-from eventsrc.progress import reported
+from eventsrc.log.seek import Note
+from projections import relocalize
 from projections.model.view import MapView
 from projections.relocalize import Answer, Camera, ExactIndex, Method, rank
 
 from .baselines import best_cosine, plain_position
+from .parallel import call_all
 from .questions import Question
 from .scores import instances_of
 from .truth import Key, Truth
@@ -92,8 +95,43 @@ class Trial:
         return self.known and self.pose_error_m is not None and self.pose_error_m <= RIGHT_WITHIN_M
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a map answers, without the truth: see `Trial`. Positions are in metres."""
+
+    answer: Answer
+    plain_at: tuple[float, float] | None
+    plain_place_at: tuple[float, float] | None
+    best_cosine: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Asks a map by exact search."""
+
+    index: ExactIndex
+    camera: Camera | None
+    method: Method
+
+    def ask(self, question: relocalize.Question) -> Asked:
+        """The answer, without the poses that it was chosen from; three places asked for."""
+        began = time.perf_counter()
+        candidates = self.index.search(question.crops)
+        answer = rank(question, candidates, top=3, method=self.method, camera=self.camera)
+        seconds = time.perf_counter() - began
+        plain = rank(question, candidates, top=1, method="plain").pose
+        return Asked(
+            replace(answer, hypotheses=None),
+            plain_position(candidates.matches),
+            None if plain is None else (plain.x, plain.y),
+            best_cosine(candidates.matches),
+            seconds,
+        )
+
+
 class TrialRunner:
-    """Asks questions of a folded map by exact search, and scores them with the map's own truth."""
+    """Asks questions of a folded map, and scores them with the map's own truth."""
 
     def __init__(
         self,
@@ -105,11 +143,11 @@ class TrialRunner:
         room_index: RoomIndex | None = None,
     ) -> None:
         self._room_index = room_index
-        self._index = ExactIndex(view)
-        self._camera, self._method = camera, method
+        self._asker = Asker(ExactIndex(view), camera, method)
         self._instances = {i for _, i in instances_of(view, truth) if i is not None}
         self._rooms: dict[str, Counter[str]] = {p.place_id: Counter() for p in view.places.values()}
-        self._keyframes: list[tuple[float, float, str | None, str | None]] = []
+        self._keyframes: list[tuple[str | None, str | None]] = []
+        positions = []
         for keyframe in view.keyframes:
             if keyframe.pose is None:
                 continue
@@ -117,28 +155,27 @@ class TrialRunner:
             place_id = view.place_id(keyframe.place)
             if room is not None and place_id is not None:
                 self._rooms[place_id][room] += 1
-            self._keyframes.append(
-                (keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6, room, place_id)
-            )
-
+            self._keyframes.append((room, place_id))
+            positions.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6))
+        self._positions = np.array(positions, dtype=np.float64).reshape(-1, 2)
         self._rooms_in_map = {room for rooms in self._rooms.values() for room in rooms}
 
-    def run(self, questions: Iterable[Question]) -> list[Trial]:
-        """One trial for each question, three places asked for."""
+    def run(
+        self, questions: Iterable[Question], workers: int = 0, note: Note | None = None
+    ) -> list[Trial]:
+        """One trial for each question. ``workers`` and ``note``: see `call_all`."""
         asked = list(questions)
-        return [
-            self._run(question) for question in reported(asked, "asking", len(asked), "questions")
-        ]
+        for question in asked:
+            self._asker.index.check_spaces(question.crops)
+        calls = [partial(self._asker.ask, question.asked) for question in asked]
+        answers = call_all(calls, workers, "asking", "questions", note)
+        return [self._scored(*each) for each in zip(asked, answers, strict=True)]
 
-    def _run(self, question: Question) -> Trial:
-        began = time.perf_counter()
-        candidates = self._index.search(question.crops)
-        answer = rank(question.asked, candidates, top=3, method=self._method, camera=self._camera)
-        seconds = time.perf_counter() - began
-        plain = rank(question.asked, candidates, top=1, method="plain")
+    def _scored(self, question: Question, asked: Asked) -> Trial:
+        answer = asked.answer
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
-        true_place = self._nearest(question.x, question.y)[3]
+        true_place = self._nearest(question.x, question.y)[1]
         return Trial(
             question,
             answer,
@@ -146,7 +183,7 @@ class TrialRunner:
             _distance(None if pose is None else (pose.x, pose.y), question),
             None if pose is None or pose.yaw is None else _angle_size(pose.yaw - question.yaw),
             _distance((places[0].centroid_x, places[0].centroid_y) if places else None, question),
-            None if pose is None else self._nearest(pose.x, pose.y)[2],
+            None if pose is None else self._nearest(pose.x, pose.y)[0],
             None
             if pose is None or self._room_index is None
             else self._room_index.room(pose.x, pose.y, question.key),
@@ -154,17 +191,17 @@ class TrialRunner:
             tuple(self._room_of(place.place_id) for place in places),
             tuple((question.room or "") in self._rooms[place.place_id] for place in places),
             None if true_place is None or not places else places[0].place_id == true_place,
-            _distance(plain_position(candidates.matches), question),
-            _distance(None if plain.pose is None else (plain.pose.x, plain.pose.y), question),
-            best_cosine(candidates.matches),
-            seconds,
+            _distance(asked.plain_at, question),
+            _distance(asked.plain_place_at, question),
+            asked.best_cosine,
+            asked.seconds,
         )
 
-    def _nearest(self, x: float, y: float) -> tuple[float, float, str | None, str | None]:
-        """The map keyframe nearest to a position; ties go to the earlier one."""
+    def _nearest(self, x: float, y: float) -> tuple[str | None, str | None]:
+        """Room and place of the map keyframe nearest to a position; ties go to the earlier one."""
         if not self._keyframes:
-            return x, y, None, None
-        return min(self._keyframes, key=lambda k: (k[0] - x) ** 2 + (k[1] - y) ** 2)
+            return None, None
+        return self._keyframes[int(((self._positions - (x, y)) ** 2).sum(1).argmin())]
 
     def _room_of(self, place_id: str) -> str | None:
         rooms = self._rooms[place_id]

@@ -177,6 +177,12 @@ class ExactIndex:
             return Cosines()
         return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
+    def check_spaces(self, crops: Sequence[Crop]) -> None:
+        """Raise QuestionError when a crop is not of the map's embedding space."""
+        if len(self._ordinals):
+            for crop in crops:
+                check_space(crop, self._matrix.shape[1], self.model)
+
     def search(
         self,
         crops: Sequence[Crop],
@@ -185,9 +191,7 @@ class ExactIndex:
     ) -> Candidates:
         """The nearest observations of each crop, as if the map had none of those ``without``.
         Raises QuestionError for another space."""
-        if len(self._ordinals):
-            for crop in crops:
-                check_space(crop, self._matrix.shape[1], self.model)
+        self.check_spaces(crops)
         dropped = np.isin(self._ordinals, list(without)) if without else None
         objects = objects_of_a_class(crops)
         matches = tuple(
