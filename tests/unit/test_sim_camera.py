@@ -13,10 +13,15 @@ import pytest
 from eventsrc.detector.vision import decode
 from eventsrc.errors import MisuseError
 from eventsrc.sim import build_house
-from eventsrc.sim.camera import Camera, thing_colours
 from eventsrc.sim.detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, visible_objects
 from eventsrc.sim.house import House
-from eventsrc.sim.pictures import CameraPicture, camera_pictures, write_pictures
+from eventsrc.sim.pictures import (
+    Camera,
+    CameraPicture,
+    camera_pictures,
+    thing_colours,
+    write_pictures,
+)
 from eventsrc.sim.tour import TruePose, drive, plan_tour
 
 STEP_M = 0.004
