@@ -109,13 +109,13 @@ def _split(body: bytes) -> Iterator[ChunkBody]:
     _, _, channels, _, log_ns, stamp_ns = zip(*rows, strict=True)
     definitions = b"".join(body[start:end] for start, end in others)
     lead = b""
-    edges = _edges(len(body), starts)
+    edges, view = _edges(len(body), starts), memoryview(body)
     for first, last in pairwise(edges):
         at = starts[first] if first else 0
         end = starts[last] if last < len(starts) else len(body)
         shift = len(lead) - at
         yield ChunkBody(
-            lead + body[at:end] if len(edges) > 2 else body,
+            b"".join((lead, view[at:end])) if len(edges) > 2 else body,
             channels[first:last],
             log_ns[first:last],
             stamp_ns[first:last],
@@ -272,9 +272,10 @@ class _Builder:
     def _write_chunk(
         self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]
     ) -> None:
-        chunk = _mcap.encode_chunk(self._compressor, body, first_ns, last_ns)
+        head, data = _mcap.encode_chunk(self._compressor, body, first_ns, last_ns)
         start = self._at
-        self._write(chunk)
+        self._write(head)
+        self._write(data)
         indexes_at = self._at
         offsets: dict[int, int] = {}
         for channel_id in sorted(entries):
@@ -282,10 +283,10 @@ class _Builder:
             self._write(_mcap.encode_message_index(channel_id, entries[channel_id]))
         self._chunks.append(
             ChunkIndex(
-                chunk_length=len(chunk),
+                chunk_length=len(head) + len(data),
                 chunk_start_offset=start,
                 compression="zstd",
-                compressed_size=len(chunk) - _mcap.ZSTD_CHUNK_HEAD,
+                compressed_size=len(data),
                 message_end_time=last_ns,
                 message_index_length=self._at - indexes_at,
                 message_index_offsets=offsets,
