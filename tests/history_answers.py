@@ -81,6 +81,7 @@ def stories(known: KnownHistory) -> dict[str, Any]:
         "searches": searches(known, names),
         "pairs": [known.why_same(*pair).document() for pair in pairs],
         "diff": difference_of(first, last, {}, ()).document(),
+        "diff back": difference_of(last, first, {}, ()).document(),
         "skipped": list(history.skipped),
         "runs": history.runs,
         "edges": {pair: list(changes) for pair, changes in history.edges.items()},

@@ -5,18 +5,21 @@ other commands, can be compared too.
 """
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeAlias, TypeVar
+
+import msgspec
 
 from eventsrc.envelope import Offset, RunId
 from projections.corrections import RecordedCommand
 from projections.model.command_text import command_document
 from projections.model.digest import map_digest
-from projections.model.records import Estimate, Relocation
+from projections.model.records import Estimate, KeyframeRecord, Relocation
 from projections.model.view import MapView
 
 from .records import Cause
+from .stored_view import StoredView
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +51,7 @@ class ObjectRow:
     relocations: tuple[Relocation, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class KeyframeRow:
+class KeyframeRow(msgspec.Struct, frozen=True, gc=False):
     """A keyframe and its place; the pose is metres and radians, None when there was none."""
 
     run_id: RunId
@@ -118,18 +120,11 @@ class MapRows:
 
 def rows_of(view: MapView) -> MapRows:
     """The rows of a map, each table in the order of the view."""
-    ids = [place.place_id for place in view.all_places]
     return MapRows(
-        keyframes=_by(keyframe_key, _keyframe_rows(view, ids)),
-        places=_by(
-            place_key,
-            (
-                PlaceRow(p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name)
-                for p in view.places.values()
-            ),
-        ),
-        objects=_by(object_key, _object_rows(view, ids)),
-        edges=_by(edge_key, (EdgeRow(ids[a], ids[b], n) for a, b, n in view.edges())),
+        keyframes=_by(keyframe_key, _keyframe_rows(view, view.keyframes)),
+        places=_place_table(view),
+        objects=_by(object_key, _object_rows(view)),
+        edges=_edge_table(view),
     )
 
 
@@ -153,15 +148,29 @@ def _by(key: Callable[[R], K], rows: Iterable[R]) -> dict[K, R]:
     return {key(row): row for row in rows}
 
 
-def _keyframe_rows(view: MapView, ids: list[str]) -> Iterable[KeyframeRow]:
-    for k in view.keyframes:
+def _keyframe_rows(view: MapView, keyframes: Iterable[KeyframeRecord]) -> Iterator[KeyframeRow]:
+    ids = [place.place_id for place in view.all_places]
+    for k in keyframes:
         place = k.place
         pose = None if k.pose is None else (k.pose.x_um / 1e6, k.pose.y_um / 1e6, k.pose.yaw_rad)
         yield KeyframeRow(k.run_id, k.keyframe_id, pose, None if place is None else ids[place])
 
 
-def _object_rows(view: MapView, ids: list[str]) -> Iterable[ObjectRow]:
-    det_ids = [each.det_id for each in view.observations]
+def _place_table(view: MapView) -> dict[str, PlaceRow]:
+    return {
+        p.place_id: PlaceRow(p.place_id, p.centroid_x, p.centroid_y, p.keyframe_count, p.name)
+        for p in view.places.values()
+    }
+
+
+def _edge_table(view: MapView) -> Edges:
+    ids = [place.place_id for place in view.all_places]
+    return _by(edge_key, (EdgeRow(ids[a], ids[b], n) for a, b, n in view.edges()))
+
+
+def _object_rows(view: MapView) -> Iterator[ObjectRow]:
+    ids = [place.place_id for place in view.all_places]
+    det_ids = view.det_ids()
     for o in view.objects.values():
         yield ObjectRow(
             o.object_id,
@@ -264,6 +273,23 @@ def difference_of(
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
         commands=tuple(commands),
+    )
+
+
+def _keyframe_changes(first: MapView, second: MapView) -> Changes[tuple[str, int], KeyframeRow]:
+    moved = first.moved_keyframes(second) if isinstance(first, StoredView) else None
+    if moved is None:
+        tables = [_by(keyframe_key, _keyframe_rows(v, v.keyframes)) for v in (first, second)]
+        return changes(*tables)
+    both = min(len(first.keyframes), len(second.keyframes))
+    before, after = (
+        _keyframe_rows(view, (view.keyframes[number] for number in moved))
+        for view in (first, second)
+    )
+    return Changes(
+        added=tuple(_keyframe_rows(second, second.keyframes[both:])),
+        removed=tuple(_keyframe_rows(first, first.keyframes[both:])),
+        changed=tuple(zip(before, after, strict=True)),
     )
 
 

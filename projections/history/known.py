@@ -76,8 +76,8 @@ class KnownHistory:
         self.corrections = corrections
         self._note = note
         self._snapshot_tried = False
-        cached = TimelineCache(reader, settings, corrections, note) if cache else None
-        self._recorder = HistoryRecorder(reader, settings, corrections, cached, progress)
+        self._cache = TimelineCache(reader, settings, corrections, note) if cache else None
+        self._recorder = HistoryRecorder(reader, settings, corrections, self._cache, progress)
         self._history: StoredHistory | None = None
         self._latest: StoredView | None = None
         self._index: CountIndex | None = None
@@ -98,7 +98,7 @@ class KnownHistory:
         """The map up to `end`, not to be changed; its observations carry no embeddings."""
         history = self.history
         if self._latest is None or self._latest.next_offset != history.next_offset:
-            self._latest = StoredView(history, history.next_offset)
+            self._latest = StoredView(history, history.next_offset, self._cache)
         return self._latest
 
     def _history_of(self, end: Offset) -> StoredHistory:
@@ -141,7 +141,7 @@ class KnownHistory:
         """The map at ``end`` from a history of ``known`` events or more."""
         history = self._history_of(known)
         with gc_paused():
-            return StoredView(history, end)
+            return StoredView(history, end, self._cache)
 
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None

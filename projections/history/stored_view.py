@@ -4,7 +4,7 @@ Counts, places and objects are computed from whole columns. Keyframes and observ
 by one when somebody asks for them, and all of them before the view is changed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise, repeat
 from typing import Any, Final, cast
@@ -30,16 +30,23 @@ from .lazy_rows import Chunks
 from .moment import Moment
 from .stored_history import StoredHistory
 from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
+from .timeline_cache import TimelineCache
 
 _LAZY: Final = ("keyframes", "observations")
 
 
 class StoredView(MapView):
-    """The map after ``end`` events of a history of tables; the caller may change it."""
+    """The map after ``end`` events of a history of tables; the caller may change it.
 
-    def __init__(self, history: StoredHistory, end: Offset) -> None:
+    Its digest is kept in ``cache``, if there is one.
+    """
+
+    def __init__(
+        self, history: StoredHistory, end: Offset, cache: TimelineCache | None = None
+    ) -> None:
         super().__init__(history.settings, keep_embeddings=False, corrections=history.corrections)
         self._is_changed = False
+        self._cache = cache
         self._moment = moment = Moment(history, end)
         self.all_places = places_of(moment)
         for merge in moment.merges:
@@ -86,6 +93,24 @@ class StoredView(MapView):
         """Apply all deltas of the event at ``offset`` and advance past it."""
         self._make_all()
         super().apply_event(offset, deltas)
+
+    def known_digest(self) -> str | None:
+        """The digest of this map, if it was computed before."""
+        if self._cache is None or self._is_changed:
+            return None
+        return self._cache.digest_at(self.next_offset)
+
+    def keep_digest(self, digest: str) -> None:
+        """Keep the digest for the next who asks for it."""
+        if self._cache is not None and not self._is_changed:
+            self._cache.keep_digest(self.next_offset, digest)
+
+    def det_ids(self) -> Sequence[str]:
+        """The det_id of each observation."""
+        if self._is_changed:
+            return super().det_ids()
+        count = self._moment.count("observation")
+        return [each or "" for each in self._moment.tables.texts("observation", "det_id", 0, count)]
 
     def floor_of(self, place: PlaceOrdinal) -> str | None:
         """The name of the floor that a place is on; None if the log has none."""

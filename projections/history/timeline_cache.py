@@ -2,8 +2,10 @@
 
 For each choice of settings and commands in force there are parts, ``KEY-START-END.npz``, of which
 each has the history of the events from START to before END, and the fold at the last END,
-``KEY-END.fold``, from which it is folded on. Files appear whole (written beside, then renamed) and
-are never changed, so any number of processes may read and write: the same log gives the same files.
+``KEY-END.fold``, from which it is folded on. ``KEY-END.VERSION.digest`` has the digest of the map
+after END events, of the moments that somebody asked for last. Files appear whole (written beside,
+then renamed) and are never changed, so any number of processes may read and write: the same log
+gives the same files.
 
 A part is used only if it is of this log, these settings and commands and this version of the fold,
 if the segments that it was made from are as they were, and if the last event that it covers is
@@ -22,7 +24,7 @@ import stat
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from eventsrc.clock import system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
@@ -36,9 +38,10 @@ from eventsrc.log import (
     segment_signatures,
 )
 from projections.corrections import Corrections, map_fingerprint
+from projections.model.digest import VERSION
 from projections.model.snapshot import FOLD_VERSION, MalformedSnapshot, pack, unpack
 from projections.model.space_vectors import with_vectors
-from projections.reducers import part, prefixed
+from projections.reducers import State, part, prefixed
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
@@ -52,14 +55,19 @@ MOST_KEPT: Final = 4
 """Histories of a log that are kept: those used last."""
 MOST_BYTES: Final = 1024 * 1024 * 1024
 """All but the one used last are deleted, the oldest first, while together they take more."""
+MOST_DIGESTS: Final = 16
+"""Digests of a history that are kept: those made last."""
 _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
+_DIGEST: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.\d+\.digest")
+_OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|fold|digest)")
 _LEFT_OVER_S: Final = 3_600.0
 _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
 """Errors of opening what is no regular file."""
 _TRIES: Final = 3
 """Readings of a folder in which other processes replace files."""
 
+_T = TypeVar("_T")
 Note = Callable[[str], None]
 
 
@@ -110,22 +118,49 @@ class TimelineCache:
 
     def fold_at(self, end: Offset) -> SemanticMap | None:
         """The fold after ``end`` events, if it is kept."""
-        path = self._fold_path(end)
         semantic_map = SemanticMap(self._settings, self._corrections)
+
+        def load(state: State) -> SemanticMap:
+            semantic_map.load(part("map", state))
+            semantic_map.use_names(semantic_map.next_offset, self._corrections)
+            return semantic_map
+
+        loaded = self._loaded(self._fold_path(end), end, load)
+        return None if loaded is None else with_vectors(loaded, self._reader)
+
+    def digest_at(self, end: Offset) -> str | None:
+        """The digest of the map after ``end`` events, if it is kept."""
+        if end < MIN_EVENTS:
+            return None
+        return self._loaded(self._digest_path(end), end, lambda state: str(state["digest"]))
+
+    def keep_digest(self, end: Offset, digest: str) -> None:
+        """Keep the digest of the map after ``end`` events; of those kept before only the last."""
+        if end < MIN_EVENTS or not self.folder.is_dir():
+            return
+        try:
+            self._write_state(self._digest_path(end), end, {"digest": digest})
+            found = [path for path in self._paths() if self._is_own(_DIGEST, path)]
+            for path in sorted(found, key=_age_s)[MOST_DIGESTS:]:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            self._say(f"{self.folder}: no digest was kept: {error.strerror}")
+        except LogError as error:
+            self._say(f"{self.folder}: no digest was kept: {error}")
+
+    def _loaded(self, path: Path, end: Offset, load: Callable[[State], _T]) -> _T | None:
+        """What ``load`` makes of a file about the first ``end`` events; None without one."""
         try:
             state = unpack(_read(path))
             self._check(part("about", state), FIRST_OFFSET, end)
-            semantic_map.load(part("map", state))
-            semantic_map.use_names(semantic_map.next_offset, self._corrections)
-        except FileNotFoundError:
+            return load(state)
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, LogError, DamagedPart, MalformedSnapshot, zlib.error) as error:
             self._say(f"{path} is not used: {error}")
-            return None
         except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
             self._say(f"{path} is not used: its content does not fit together: {error!r}")
-            return None
-        return with_vectors(semantic_map, self._reader)
+        return None
 
     def is_worth(self, folded: int) -> bool:
         """Whether to keep a history after ``folded`` more events than are kept: the first time if
@@ -181,9 +216,11 @@ class TimelineCache:
 
     def _keep_fold(self, semantic_map: SemanticMap) -> None:
         end = semantic_map.next_offset
-        about = prefixed("about", self._about(FIRST_OFFSET, end))
-        data = pack(about | prefixed("map", semantic_map.dump()))
-        self._write(self._fold_path(end), lambda file: file.write(data))
+        self._write_state(self._fold_path(end), end, prefixed("map", semantic_map.dump()))
+
+    def _write_state(self, path: Path, end: Offset, state: State) -> None:
+        data = pack(prefixed("about", self._about(FIRST_OFFSET, end)) | state)
+        self._write(path, lambda file: file.write(data))
 
     def _write(self, path: Path, write: Callable[[Any], object]) -> None:
         beside = path.with_name(f"{path.name}.{os.getpid()}.new")
@@ -263,6 +300,14 @@ class TimelineCache:
     def _fold_path(self, end: Offset) -> Path:
         return self.folder / f"{self._key}-{end:020d}.fold"
 
+    def _digest_path(self, end: Offset) -> Path:
+        return self.folder / f"{self._key}-{end:020d}.{VERSION}.digest"
+
+    def _is_own(self, pattern: re.Pattern[str], path: Path) -> bool:
+        """Whether a file is of this history, and is named so."""
+        found = pattern.fullmatch(path.name)
+        return found is not None and found[1] == self._key
+
     def _touch(self, files: Sequence[_File]) -> None:
         """This history was used last."""
         for file in files:
@@ -294,7 +339,7 @@ class TimelineCache:
         used: dict[str, float] = {}
         by_key: dict[str, list[Path]] = {}
         for path in self._paths():
-            if (found := _PART.fullmatch(path.name) or _FOLD.fullmatch(path.name)) is not None:
+            if (found := _OF_A_HISTORY.fullmatch(path.name)) is not None:
                 with contextlib.suppress(FileNotFoundError):
                     status = path.stat()
                     key = found[1]

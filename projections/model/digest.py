@@ -26,6 +26,14 @@ _LINES_AT_ONCE = 500
 
 def map_digest(view: MapView) -> str:
     """The digest of a view: 64 hex digits."""
+    if (known := view.known_digest()) is not None:
+        return known
+    found = _computed(view)
+    view.keep_digest(found)
+    return found
+
+
+def _computed(view: MapView) -> str:
     digest = hashlib.sha256(f"mapfold map {VERSION}\n".encode())
     for name, lines in _SECTIONS.items():
         digest.update(f"{name}\n".encode())

@@ -128,7 +128,7 @@ def _type(found: PlaceType | None) -> dict[str, Any]:
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:
-    det_ids = [each.det_id for each in view.observations]
+    det_ids = view.det_ids()
     return [
         {
             "object_id": o.object_id,

@@ -8,7 +8,7 @@ survivor up, so a merge costs little however many keyframes move.
 
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
@@ -112,6 +112,13 @@ class MapView:
         """Set ``next_offset``: all events below it are in the view."""
         self.next_offset = next_offset
 
+    def known_digest(self) -> str | None:
+        """The digest of this map, where it was kept; see `projections.model.digest`."""
+        return None
+
+    def keep_digest(self, digest: str) -> None:
+        """Keep the digest, if this view comes from where one can be kept."""
+
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
         return None if place is None else self.all_places[place].place_id
@@ -144,6 +151,10 @@ class MapView:
     def type_of(self, place: PlaceOrdinal) -> PlaceType | None:
         """The type of room that a place is, by its Objects or its name; None if unknown."""
         return place_type(self.contents.of(place), self.all_places[place].name)
+
+    def det_ids(self) -> Sequence[str]:
+        """The det_id of each observation."""
+        return [each.det_id for each in self.observations]
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:
         """How many observations of an Object are of each class, most first; ties by name."""

@@ -76,7 +76,7 @@ def test_a_full_disk_costs_the_cache_alone(log: Path, right: str) -> None:
     done = run(log, "full")
     assert done.stdout.decode() == right
     assert "no history was kept: File too large" in done.stderr.decode()
-    assert [path.suffix for path in kept(log)] in ([], [".fold"])
+    assert {path.suffix for path in kept(log)} <= {".fold", ".digest"}  # these may be small enough
     assert answers(log, []) == right
 
 
@@ -103,7 +103,7 @@ def test_many_processes_at_once(log: Path, right: str) -> None:
             parts = sorted((int(f[1]), int(f[2])) for f in files if f[-1] == "npz")
             (fold,) = (int(f[1]) for f in files if f[-1] == "fold")
             assert [0, *(end for _, end in parts)] == [*(start for start, _ in parts), fold]
-            assert len(parts) + 1 == len(files)
+            assert len(parts) + 1 == sum(f[-1] != "digest" for f in files)
             write_log(log, drive(EVENTS, EVENTS + 40))
             right = answers(write_log_copy(log), [])
 
