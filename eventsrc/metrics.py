@@ -3,7 +3,7 @@ for a server of another kind (`Instruments`).
 
 Only this module imports prometheus_client. Values are read when they are scraped, so metrics cost
 the recording nothing. Each request has a thread, which a silent connection would keep, with its
-file descriptor, for ever. So a silent connection is closed after ``SILENT_S``, and beyond
+file descriptor, forever. So a silent connection is closed after ``SILENT_S``, and beyond
 ``MAX_CONNECTIONS`` the oldest is closed.
 """
 

@@ -31,7 +31,7 @@ def fails(number: int, _: Progress) -> NoReturn:
 
 
 def wait(folder: Path, _: Progress) -> None:
-    """Write the process's id, then wait for ever."""
+    """Write the process's id, then wait forever."""
     (folder / "pid.new").write_text(str(os.getpid()))
     (folder / "pid.new").rename(folder / "pid")
     threading.Event().wait()

@@ -92,7 +92,7 @@ class Sealer:
 
     def _seal_all(self, waiting: deque[Finished]) -> None:
         """Seal in order, because each segment carries the hash of the one before. After an OSError
-        the rest waits for the next call, after damage for ever."""
+        the rest waits for the next call, after damage forever."""
         while waiting and not self._damaged:
             try:
                 self._seal(waiting[0])

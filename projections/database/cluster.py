@@ -95,7 +95,7 @@ class Cluster:
         """True when a server accepts a connection on this folder's socket.
 
         The process table cannot tell: where process 1 does not reap, as in many containers, a
-        killed server stays in it for ever.
+        killed server stays in it forever.
         """
         self._refuse_untrusted()
         folder = self.socket_dir()

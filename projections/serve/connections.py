@@ -1,6 +1,6 @@
 """uvicorn's HTTP connections with limits on their number, time and memory.
 
-uvicorn waits for a request for ever, on as many connections as the process may open. Here
+uvicorn waits for a request forever, on as many connections as the process may open. Here
 
 * a request, head and body, must be complete ``REQUEST_S`` after its connection was opened or, on a
   connection that was used before, after its first byte; single bytes do not extend that;

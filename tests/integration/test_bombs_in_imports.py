@@ -61,7 +61,7 @@ def lz4_bomb() -> bytes:
 BOMBS: dict[str, Callable[[], bytes]] = {
     "a zstd frame that says so": lambda: chunk(b"zstd", zstd_bomb(True), GIB),
     "a chunk that says less than its zstd frame": lambda: chunk(b"zstd", zstd_bomb(True), 1000),
-    "a zstd frame that says nothing": lambda: chunk(b"zstd", zstd_bomb(False), 1000),
+    "a zstd frame without a size": lambda: chunk(b"zstd", zstd_bomb(False), 1000),
     "a chunk that says it holds a gibibyte": lambda: chunk(b"zstd", zstd_bomb(False), GIB),
     "lz4": lambda: chunk(b"lz4", lz4_bomb(), 1000),
     "lz4 that says so": lambda: chunk(b"lz4", lz4_bomb(), GIB),

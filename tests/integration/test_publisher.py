@@ -449,7 +449,7 @@ def test_publish_raises_when_the_sending_thread_has_died(
 
 @pytest.mark.parametrize("key", ["", "tb//detections", "/tb", "tb/*"])
 def test_an_invalid_key_is_misuse(tmp_path: Path, key: str) -> None:
-    """Else it would be tried for ever, and only the spool would grow."""
+    """Else it would be tried forever, and only the spool would grow."""
     with pytest.raises(MisuseError, match="nothing can be published under it"):
         EnvelopePublisher(ZenohOptions(), tmp_path / "spool", key)
 

@@ -75,7 +75,7 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
 def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disabled(
     targets: Targets, view: MapView
 ) -> None:
-    """A plan that the server has kept would search the index all the same."""
+    """A plan that the server has cached would search the index nevertheless."""
     crops = next(questions())[:1]
     expected = ExactIndex(view).search(crops)
     with CandidateReader(targets) as reader:

@@ -178,7 +178,7 @@ def test_no_form_of_writing_works_for_a_reader(projected: Targets, session: str)
 
 @pytest.mark.usefixtures("_readers_use_cypher")
 def test_a_writer_writes_through_cypher(projected: Targets) -> None:
-    """So the attempts above are refused for who asks, not for being wrong."""
+    """So the attempts above are refused because of the role, not because of an error."""
     url = as_role(projected, "a_writer").graph_url
     for name in ("set", "set on another", "set on a made-up edge", "delete a made-up edge"):
         before = all_rows(projected)

@@ -93,7 +93,7 @@ def recounted_votes(view: MapView, deltas: list[d.Delta]) -> list[int | None]:
 def check_recounts(folded: Folded, same: bool = False) -> None:
     """All that can be counted again from the observations of each Object."""
     view, deltas = folded.view, [delta for each in folded.deltas for delta in each]
-    seen_beside = {  # what a few pictures showed as two may be one all the same
+    seen_beside = {  # what a few pictures showed as two may still be one
         view.object_survivors.find(delta.survivor)
         for delta in deltas
         if isinstance(delta, d.ObjectsMerged)

@@ -223,7 +223,7 @@ def test_crops_without_boxes_or_looks_are_answered_near_their_things(kind: str) 
 @given(st.integers(0, 10_000), st.booleans())
 @settings(max_examples=examples(15), deadline=None)
 def test_a_class_is_no_likeness(seed: int, all_classes: bool) -> None:
-    """Its matches have the similarity 1, which says nothing of how sure the pose is."""
+    """Its matches have the similarity 1, which is no evidence of how sure the pose is."""
     scene, at, shown = random_scene(seed)
     question, candidates = scene.ask([(at, [shown[0], shown[-1]])], noise=0.05)
     (view,) = question.views

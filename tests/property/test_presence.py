@@ -58,7 +58,7 @@ class Known:
             self.run, self.run_misses, self.odds2 = run, 0, min(self.odds2, Fraction(1))
 
     def weight(self, run: int, pose: Pose, is_hit: bool) -> Fraction:
-        """The third look from a cell, with one outcome and no other run between, tells nothing."""
+        """The third look from a cell, with one outcome and no other run between, is no evidence."""
         look = run, pose.x_um // CELL, pose.y_um // CELL, is_hit
         self.looks = [known for known in self.looks if known[0] == run] + [look]
         return {1: Fraction(1), 2: Fraction(1, 2)}.get(self.looks.count(look), Fraction(0))

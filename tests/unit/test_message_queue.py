@@ -135,7 +135,7 @@ def test_messages_put_together_wake_who_waits_before_they_wait_for_room() -> Non
 
 
 def test_after_one_timeout_messages_are_lost_at_once_until_half_is_free() -> None:
-    """A sender that waits for ever would hang this test: only the first loss may take time."""
+    """A sender that waits forever would hang this test: only the first loss may take time."""
     queue = MessageQueue(4, max_wait_s=0.01)
     for n in range(20_000):
         queue.put(_message(str(n)))

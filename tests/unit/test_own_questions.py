@@ -34,7 +34,7 @@ def view() -> MapView:
 
 
 class _Recorder(ExactIndex):
-    """Notes each search: the crops, what was taken out, and what came back."""
+    """Records each search: the crops, what was taken out, and the result."""
 
     searches: list[tuple[list[str], set[int], Candidates]]
 

@@ -107,7 +107,7 @@ def test_the_table_is_whole() -> None:
     for usual in place_type_table._USUAL.values():
         named = [name for classes in usual.values() for name in classes.split(", ")]
         assert len(named) == len(set(named)), "a class has one grade"
-    assert all(len({*shares}) > 1 for shares in TABLE.values()), "a row that tells nothing"
+    assert all(len({*shares}) > 1 for shares in TABLE.values()), "an uninformative row"
     assert {*SYNONYMS.values()} <= TABLE.keys()
     assert not SYNONYMS.keys() & TABLE.keys()
     assert {*NAMES.values()} == {*TYPES}

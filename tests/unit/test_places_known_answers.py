@@ -187,7 +187,7 @@ def test_a_year_in_one_room_leaves_nothing_to_count() -> None:
 
 @pytest.mark.seconds
 def test_the_envelopes_of_two_rooms_with_a_wall_between_stay_short() -> None:
-    """Cells 1.6 m apart stay unlinked for ever, so every keyframe queries their reach indexes."""
+    """Cells 1.6 m apart stay unlinked forever, so every keyframe queries their reach indexes."""
     core_index, rng = CoreIndex(1_500_000, 3), random.Random(2)
     places = Places(core_index)
     for n in range(20_000):

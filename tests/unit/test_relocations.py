@@ -72,7 +72,7 @@ class Story:
         return told
 
     def miss(self, ordinal: int, run: int, times: int = 1) -> list[Moved]:
-        """Pairs told while an Object was looked for in vain."""
+        """Pairs reported while no Object was found."""
         return [p for _ in range(times) for p in self.fold(run, 10_000_000 * ordinal, [])]
 
     def fold(self, run: int, x_um: int, deltas: list[Delta]) -> list[Moved]:

@@ -1,4 +1,4 @@
-"""What time travel tells of places by rooms: why they were founded and merged, and refusals."""
+"""Time travel over places by rooms: why they were founded and merged, and refusals."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -103,7 +103,7 @@ def test_a_damaged_snapshot_is_passed_over_with_a_note(log: Path, damage: str) -
 
 @pytest.mark.usefixtures("eager")
 def test_a_damaged_snapshot_is_replaced_by_a_sound_one_of_the_same_offset(log: Path) -> None:
-    """Else it would cost a whole fold and a note for ever."""
+    """Else it would cost a whole fold and a note forever."""
     notes: list[str] = []
     _digest(log, 30, notes)
     (path,) = _files(log)

@@ -43,7 +43,7 @@ class SnapshotTarget(Target):
         return MAGIC + hashlib.sha256(body).digest() + body
 
     def check(self, data: bytes) -> None:
-        """Refused, or restored. That what is restored is true, no reader can know: whoever can
-        write here can make a false map, checksum and all."""
+        """Refused, or restored. A reader cannot know whether the content is true: anybody who can
+        write here can make a false map with its checksum."""
         with suppress(SnapshotRefused):
             restore(data, Settings(), "log")
