@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 from eventsrc.log import LogReader
 from eventsrc.text import counted, visible
-from projections.model.spaces import log_spaces
+from projections.model.space_vectors import log_spaces
 
 from .options import JsonOption, LogArgument
 from .terminal import Bar, display, emit

@@ -1,6 +1,11 @@
-"""The vectors that a log's ``reembed`` commands put into force, for the maps of their space."""
+"""Embedding spaces of a log: the vectors that its ``reembed`` commands put into force, for the maps
+of their space, and how many detections have a vector of each space."""
 
 import hashlib
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,13 +16,17 @@ from eventsrc.advised import advised
 from eventsrc.commands import Reembed
 from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope import DetId
+from eventsrc.ingest import Accepted
 from eventsrc.log import LogReader
 from eventsrc.system_events import EMBEDDINGS_KEY
+from eventsrc.upcast import read_envelope
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import FoldError
 from projections.reducers.embedding_space import Reembedded
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
+
+from .log_commands import read_corrections
 
 
 def new_map(
@@ -67,3 +76,62 @@ def _read(log: Path, _log_id: str, commands: tuple[Reembed, ...]) -> Reembedded:
                     f" `{advised('log', 'verify')}`, and undo the command to map without them",
                 )
     return Reembedded(commands[0].space, vectors)
+
+
+@dataclass(frozen=True, slots=True)
+class LogSpace:
+    """A space: its model, None where detections name none, and its dimension. ``recorded``
+    detections have a vector of it in their envelope, ``reembedded`` others by commands in force."""
+
+    model: str | None
+    dim: int
+    recorded: int
+    reembedded: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogSpaces:
+    """``spaces`` by their first vector, those without a recorded one last; ``bare`` of the
+    ``detections`` were recorded without a vector. Each det_id counts once."""
+
+    detections: int
+    bare: int
+    spaces: tuple[LogSpace, ...]
+
+
+def log_spaces(
+    reader: LogReader, progress: Callable[[int, int], None] = lambda *_: None
+) -> LogSpaces:
+    """Count the spaces of a log, from all its envelopes. Raises FoldError, LogDamaged."""
+    corrections = read_corrections(reader)
+    recorded: Counter[tuple[str | None, int]] = Counter()
+    spaces: dict[DetId, tuple[str | None, int] | None] = {}
+    for event in reader.read():
+        progress(event.offset + 1, reader.next_offset)
+        if not event.is_envelope:
+            continue
+        accepted = read_envelope(event, max_bytes=sys.maxsize)
+        if not isinstance(accepted, Accepted):
+            continue
+        detections = accepted.envelope.detections
+        for det_id, detection, vector in zip(
+            accepted.det_ids, detections, accepted.vectors, strict=True
+        ):
+            if det_id not in spaces:
+                space = None if vector is None else (detection.embedding_model, len(vector))
+                spaces[det_id] = space
+                if space is not None:
+                    recorded[space] += 1
+    given: Counter[tuple[str | None, int]] = Counter()
+    for model, dim in dict.fromkeys((each.space, each.dim) for each in corrections.reembedded):
+        chosen = Settings(embedding_model=model, embedding_dim=dim)
+        vectors = vectors_of(reader, chosen, corrections)
+        given[model, dim] = sum(
+            space != (model, dim) and vectors is not None and det_id in vectors
+            for det_id, space in spaces.items()
+        )
+    found = tuple(
+        LogSpace(model, dim, recorded[model, dim], given[model, dim])
+        for model, dim in dict.fromkeys((*recorded, *given))
+    )
+    return LogSpaces(len(spaces), sum(space is None for space in spaces.values()), found)
