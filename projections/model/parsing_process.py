@@ -27,7 +27,7 @@ from .parsing import READ_AHEAD, ParsedEvent
 SLOTS: Final = 4
 """Ranges that one process may be ahead."""
 SLOT_BYTES: Final = 8 * 1024 * 1024
-"""Three times what a range takes if it is of detections with embeddings and nothing else. Memory is
+"""Five times what a range takes if it is of detections with embeddings and nothing else. Memory is
 used only as far as it is written."""
 PATIENCE_S: Final = 60.0
 """How long to wait for one range, of which an idle machine parses a hundred a second."""
