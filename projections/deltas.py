@@ -164,12 +164,12 @@ class MeanDrive(msgspec.Struct, frozen=True, gc=False):
 class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
 
-    No KeyframePlaced is emitted for them: who keeps members must move them all. ``bridge`` is the
-    keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one pair
-    for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before
-    the merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's
-    two anchors, at whatever distance. ``drives`` are there for places by rooms, one for each
-    absorbed place but those in ``joined``.
+    No KeyframePlaced is emitted for them: code that keeps members must move them all. ``bridge`` is
+    the keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one
+    pair for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before the
+    merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's two
+    anchors, at whatever distance. ``drives`` are there for places by rooms, one for each absorbed
+    place but those in ``joined``.
     """
 
     offset: Offset
@@ -264,7 +264,7 @@ class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
     """Two Objects became one; the survivor's new values.
 
     All observations of ``absorbed`` belong to ``survivor`` from now on. No ObjectSeen is emitted
-    for them: who keeps observations must move them all. ``evidence`` is None where a
+    for them: code that keeps observations must move them all. ``evidence`` is None where a
     ``same-object`` command did it.
     """
 
@@ -359,7 +359,7 @@ class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
 class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
 
-    0 means the edge is gone (one of the two was absorbed, or relabelling moved the transitions).
+    0 removes the edge (one of the two was absorbed, or relabelling moved the transitions).
     """
 
     offset: Offset

@@ -33,8 +33,8 @@ many cells as it takes for a map to have at most so many blocks: that bounds the
 microseconds a block."""
 SMALL_M2: Final = 110
 SMALL_SHARE: Final = 4
-"""A region of up to so many square metres is one room, or nearly: a way in it counts as a quarter.
-Both were chosen on buildings with walls; docs/places.md has the figures."""
+"""Largest region, in square metres, that counts as one room: a way in it counts as a quarter. Both
+were chosen on buildings with walls; docs/places.md has the figures."""
 _SPREAD: Final = 5
 """Blocks: so far into a wall its cells are of the region beside it."""
 _TURN_BITS: Final = 30

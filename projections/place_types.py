@@ -48,7 +48,7 @@ class PlaceType:
 
 
 def place_type(counts: Mapping[str, float], name: str | None = None) -> PlaceType | None:
-    """The type of a place with so many Objects of each class; None if nothing tells about it."""
+    """The type of a place with these numbers of Objects of each class; None without evidence."""
     named = None if name is None else type_of_name(name)
     if named is not None:
         return PlaceType(named, 1.0, ((named, 1.0),), named=True)
@@ -93,8 +93,8 @@ def known_class(class_name: str) -> str | None:
 
 @lru_cache(maxsize=4096)
 def type_of_name(name: str) -> str | None:
-    """The type that a place's name says: of the types' names in it, also in the plural, the
-    longest, of several of one length the first; None if there is none."""
+    """The type in a place's name: of the types' names in it, also in the plural, the longest, of
+    several of one length the first; None if there is none."""
     words = re.split(r"[^a-z]+", name.casefold())
     plain = f" {' '.join(words)} {' '.join(word.removesuffix('s') for word in words)} "
     found = [(-len(each), plain.index(f" {each} "), each) for each in NAMES if f" {each} " in plain]

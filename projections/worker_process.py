@@ -1,13 +1,13 @@
-"""A process that works for this one: it gets questions over a connection, and answers there.
+"""A worker process that receives requests and sends answers over a connection.
 
-It has nothing to lose, so it may be killed at any moment, and is when its context manager ends. It
-has to end itself when its connection is closed, as it is when this process has died. It is in a
-process group of its own, so Ctrl-C in a terminal reaches this process only.
+It keeps no state, so it may be killed at any moment, and is when its context manager ends. It has
+to end itself when its connection is closed, as it is when this process has died. It is in a process
+group of its own, so Ctrl-C in a terminal reaches this process only.
 
 Not `multiprocessing`: its processes import the caller's main module again (the whole command line,
 or a script that has no ``if __name__ == "__main__"``), and it starts another process to remove
-named shared memory, which is in ``/dev/shm``, and stays there when both are killed. This memory
-has no name: it is gone with the processes that use it, and not bounded by ``/dev/shm``.
+named shared memory, which is in ``/dev/shm``, and stays there when both are killed. This memory has
+no name: it is freed with the processes that use it, and not bounded by ``/dev/shm``.
 """
 
 import contextlib

@@ -71,7 +71,7 @@ class LogReader:
 
     def check_end(self) -> None:
         """Raise LogDamaged if recorded events behind `next_offset` cannot be read, and LogNotFound
-        if the log is gone."""
+        if the log was deleted."""
         if not self.path.exists():
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
         report = _raise_at_gap(self.path)

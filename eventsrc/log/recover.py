@@ -286,7 +286,7 @@ def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
 
 
 def _origin(segment: SegmentPath | None) -> dict[str, str]:
-    """Metadata that says when the original was begun, if it can be read."""
+    """Metadata with the time when the original was begun, if it can be read."""
     if segment is None:
         return {}
     try:

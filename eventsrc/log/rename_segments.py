@@ -1,7 +1,7 @@
 """Rename every segment file by the base offset in its head: the first step of a recovery.
 
-Log id and base in the head of a segment say which log and which offsets it holds. Its name may be
-wrong, because people copy, restore and rename files. The rules:
+Log id and base in the head of a segment identify its log and its offsets. Its name may be wrong,
+because people copy, restore and rename files. The rules:
 
 * A segment of another log than most files here is set aside as ``….foreign``.
 * A segment under a wrong name is renamed.

@@ -74,7 +74,7 @@ class Scan:
 
 
 class SegmentFile:
-    """An open segment file and what its head says."""
+    """An open segment file with the content of its head."""
 
     def __init__(self, path: Path, base: Offset) -> None:
         self._fd = -1  # for __del__, should opening fail

@@ -47,7 +47,7 @@ class Corrected:
         return self.replayed.digest == self.folded.digest
 
     def document(self) -> dict[str, Any]:
-        """What ``mapfold demo --json`` says of it."""
+        """As JSON, for ``mapfold demo --json``."""
         return {
             "commands": [command_document(recorded) for recorded in self.commands],
             "named": None if self.named is None else asdict(self.named),

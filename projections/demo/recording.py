@@ -133,7 +133,7 @@ _WAIT_S: Final = 600
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What the recorder received of what was published.
+    """How many published envelopes the recorder received.
 
     ``intact`` says that the log holds every payload, in order, byte for byte.
     """

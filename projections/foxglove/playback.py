@@ -91,8 +91,8 @@ def layout_json() -> str:
 TICK_S: Final = 0.05
 """Seconds between two maps that are shown while playing."""
 ANSWERED_S: Final = 0.02
-"""The SDK sends the answer to a request after the call that makes it, and has no way to say when. A
-client clears what it shows at the answer to a seek, so what it is to see comes so much later."""
+"""Delay of messages after a seek, seconds. The SDK sends its answer after the call that makes it
+and does not report when; a client clears its display at that answer."""
 
 
 class PastMaps:
@@ -202,7 +202,7 @@ class Playback(ServerListener):
             self._changed.notify()
 
     def run(self) -> None:
-        """Publish what clients ask for, and let time pass, until `end`; then stop the server."""
+        """Publish what clients request, and advance the time, until `end`; then stop the server."""
         try:
             self._run()
         finally:

@@ -33,7 +33,7 @@ _SIZE = 0.15
 """A little more than in the estimate, where the error of a mean counts."""
 _OTHER_SIZES = 0.36
 _WORST_PART = -12.0
-"""Twice what box height, or elevation, can say against a thing at most."""
+"""Limit of the evidence of box height or elevation against a thing, times two."""
 _SIZE_KNOWN = 0.3
 _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0

@@ -1,4 +1,4 @@
-"""What an envelope says to places and to fusion: its camera, its pose, and what was detected.
+"""The input of places and fusion from an envelope: its camera, its pose, and its detections.
 
 A depth without a standard error has a twentieth of itself, at least 0.05 m; a position without one
 has 0.1 m.

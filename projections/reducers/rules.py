@@ -1,4 +1,4 @@
-"""The reducers that a map's settings and commands ask for."""
+"""Choose the reducers by a map's settings and commands."""
 
 from eventsrc.envelope import DetId
 from projections.corrections import Keyframe

@@ -1,4 +1,4 @@
-"""Sights: what one picture says about where the things in it stand, in the map frame.
+"""Sights: the evidence of one picture for the positions of the things in it, in the map frame.
 
 A sight is a ray from the camera. Its bearing comes from the box's centre in a level pinhole camera,
 f = width / 2 / tan(hfov / 2); a box that the picture's border cuts at a side has a larger bearing

@@ -307,7 +307,7 @@ class Solver:
 
 
 def _anywhere(x: float, y: float, prior: HeightPrior) -> Estimate:
-    """The estimate of a thing whose first sight tells nothing."""
+    """The estimate of a thing whose first sight has no information."""
     z_mean, z_prior, e_mean, e_prior = prior
     size, elevation = (z_mean, 0.0, 0.0, 1.0 / z_prior), (e_mean, 0.0, 0.0, 1.0 / e_prior)
     return Estimate(x, y, _MOST_VARIANCE_M2, 0.0, _MOST_VARIANCE_M2, *size, *elevation)

@@ -1,4 +1,4 @@
-"""What fusion by evidence knows of one Object: its observations' sums, its spots, its exemplars.
+"""The state of one Object in fusion by evidence: its observations' sums, its spots, its exemplars.
 
 Exemplars are looks that are kept to compare new ones with, by side and session: of one run and one
 eighth of the directions the newest `_OF_A_KIND`, and `MOST_EXEMPLARS` in all; then the oldest goes.

@@ -1,4 +1,4 @@
-"""Cues: what boxes tell about the distance of a landmark.
+"""Cues: the evidence of boxes for the distance of a landmark.
 
 Two quantities of a landmark, each the mean over the observations whose boxes the picture's border
 does not cut there:

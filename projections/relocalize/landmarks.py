@@ -1,4 +1,4 @@
-"""Landmarks: the things in the map that a crop may show, and what its box says beside each of them.
+"""Landmarks: the things in the map that a crop may show, and the evidence of its box for each.
 
 Where the map knows Objects with an estimate (fusion by evidence), a crop's matches are grouped by
 Object, whose position and covariance count. All others are triangulated from the matches themselves

@@ -106,8 +106,8 @@ class Answer:
     ``confidence`` that the pose is right within 1.5 m.
 
     ``hypotheses`` are what the pose was chosen from; None where there is no pose, and with the
-    plain method. ``thin`` says what there is too little of in the map
-    (`certainty.thinness`), None where there is enough.
+    plain method. ``thin`` names what the map has too little of (`certainty.thinness`), None where
+    it has enough.
     """
 
     places: tuple[RankedPlace, ...]

@@ -1,7 +1,8 @@
 """The JSON schema of questions, for people and generators of clients.
 
-It says all that `reading` checks, except what a schema cannot say: that embeddings are of the map's
-space and classes those of its Objects, and that `MAX_CROPS` counts the crops of all views together.
+It states all that `reading` checks, except what a schema cannot express: that embeddings are of the
+map's space and classes those of its Objects, and that `MAX_CROPS` counts the crops of all views
+together.
 """
 
 from collections.abc import Mapping

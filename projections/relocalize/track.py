@@ -45,7 +45,7 @@ _CARRIED: Final = 0.01
 _LEAST_LOST: Final = 0.005
 """Look-alikes deceive several questions in a row, which their likelihoods do not know."""
 _NEUTRAL: Final = 0.5
-"""`known` of a question that tells nothing about it, as one of classes alone."""
+"""`known` of a question without evidence for it, as one of classes alone."""
 _LEAST_DOUBT: Final = 0.125
 """One question whose things are not in the map makes the robot's being where it was taken to be at
 most so much less likely, as a ratio."""
@@ -74,7 +74,7 @@ _MIN_YAW_AGREEMENT: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """Where the robot is after so many ``questions``; no pose as long as none of them had one.
+    """The estimate after a number of ``questions``; no pose as long as none of them had one.
 
     ``confidence`` is the probability that the pose is right within 1.5 m. The pose's ``spread_m``
     is the root mean square distance of the particles from it.
@@ -117,7 +117,7 @@ class Track:
     ) -> Tracked:
         """One question: how the robot moved since the last one, and what it was answered with.
 
-        ``known`` is the probability that the map has the things shown; 0.5 tells nothing.
+        ``known`` is the probability that the map has the things shown; 0.5 is no evidence.
         """
         self._questions += 1
         random = np.random.Generator(np.random.PCG64([self._seed, self._questions]))
@@ -219,7 +219,7 @@ class Track:
 def _known_ratio(known: float) -> float:
     """How much likelier it is to see such things where the particles are than elsewhere.
 
-    Things that the map has are seen all over the map, so they do not speak for one spot in it.
+    Things that the map has are seen all over the map, so they are no evidence for one spot in it.
     """
     return 1.0 if known >= _NEUTRAL else max(known / (1.0 - known), _LEAST_DOUBT)
 

@@ -34,8 +34,8 @@ from .scene import Arrow, Graph, Lines, Part, Path, Points, map_parts, robot_par
 APPLICATION: Final = "mapfold"
 _MARGIN_M: Final = 1.0
 _NEVER: Final = timedelta(days=1_000)
-"""Rerun makes a chunk of so many bytes and after so much time; by bytes alone chunks are the same
-for the same log."""
+"""Rerun ends a chunk at a size or after a time; by size alone the same log gives the same
+chunks."""
 _INK: Final = 0x22262BFF
 _PAPER: Final = 0xFFFFFFFF
 _SERIES: Final = (
