@@ -4,6 +4,7 @@ First the arrays of the vectors, stretch after stretch: float32 as recorded, the
 in int32. After them everything else in the format of `marshal`, which Python reads several times
 as quickly as a pickle, and which holds each float to the last bit. Both processes are of one
 program and of one Python, so nothing is checked when it is read; a log never has these bytes.
+A unit vector's -0.0 in float64 comes back as 0.0, which changes no product and no sum.
 
 An envelope is read without its embeddings' base64: nothing needs it once they are decoded.
 """
