@@ -1,4 +1,4 @@
-"""Record from Zenoh to a log: callback → bounded queue → one writer thread."""
+"""Record from Zenoh to a log: Zenoh's channel → bounded queue → one writer thread."""
 
 from .queue import DEFAULT_QUEUE_SIZE
 from .recorder import DEFAULT_CROPS, DEFAULT_KEYS, Recorder

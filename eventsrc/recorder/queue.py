@@ -1,4 +1,4 @@
-"""The bounded queue between Zenoh's callback threads and the log's writer thread.
+"""The bounded queue between the threads that receive from Zenoh and the log's writer thread.
 
 A message that finds the queue full waits for room, for at most `MAX_WAIT_S`: meanwhile the network
 waits too, so a publisher that blocks is slowed down to the pace of the disk and loses nothing. The

@@ -1,4 +1,4 @@
-"""Record what is published over Zenoh: callback → bounded queue → one writer thread."""
+"""Record what is published over Zenoh: Zenoh's channel → bounded queue → one writer thread."""
 
 import threading
 from collections.abc import Callable, Sequence
