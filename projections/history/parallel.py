@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
 from eventsrc.errors import MapfoldError
@@ -37,8 +37,6 @@ from projections.deltas import (
     PlaceFormed,
     PlacesMerged,
 )
-from projections.evaluate.scores import object_scores, place_scores
-from projections.evaluate.truth import Truth
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
 from projections.model.space_vectors import new_map
@@ -48,6 +46,9 @@ from projections.settings import Settings
 from .history import History
 from .known import Progress
 from .records import PlaceHistory
+
+if TYPE_CHECKING:
+    from projections.evaluate.truth import Truth
 
 Offsets: TypeAlias = "array[int]"
 
@@ -116,7 +117,9 @@ class FoldResult:
     """The map itself, if asked for; do not change it."""
 
 
-def fold_result(view: MapView, history: History, truth: Truth | None, seconds: float) -> FoldResult:
+def fold_result(
+    view: MapView, history: History, truth: "Truth | None", seconds: float
+) -> FoldResult:
     """The result of a fold that took ``seconds``."""
     numbers = _place_numbers(history.places)
     fused = array("q", (NO_NUMBER if o.object is None else o.object for o in view.observations))
@@ -157,7 +160,10 @@ def fold_result(view: MapView, history: History, truth: Truth | None, seconds: f
     )
 
 
-def _scores(view: MapView, truth: Truth) -> dict[str, dict[str, Any]]:
+def _scores(view: MapView, truth: "Truth") -> dict[str, dict[str, Any]]:
+    # Here and not above: the scores are slow to import, and of few commands.
+    from projections.evaluate.scores import object_scores, place_scores
+
     return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
 
 
@@ -185,7 +191,7 @@ def fold_all(
     rules: Sequence[Rules],
     end: Offset,
     *,
-    truth: Truth | None = None,
+    truth: "Truth | None" = None,
     processes: int | None = None,
     progress: Progress | None = None,
     keep_views: bool = False,
@@ -207,7 +213,7 @@ def fold_in_this_process(
     log: Path,
     rules: Sequence[Rules],
     end: Offset,
-    truth: Truth | None = None,
+    truth: "Truth | None" = None,
     progress: Progress | None = None,
     *,
     keep_views: bool = False,
@@ -241,7 +247,7 @@ class _Fold:
         self.view.apply_event(offset, deltas)
         self.history.apply(offset, [delta for delta in deltas if type(delta) in self._needed])
 
-    def result(self, truth: Truth | None, *, keep_view: bool) -> FoldResult:
+    def result(self, truth: "Truth | None", *, keep_view: bool) -> FoldResult:
         result = fold_result(self.view, self.history, truth, self.seconds)
         return replace(result, view=self.view) if keep_view else result
 
@@ -260,7 +266,7 @@ def _in_processes(
     log: Path,
     shares: list[list[Rules]],
     end: Offset,
-    truth: Truth | None,
+    truth: "Truth | None",
     progress: Progress | None,
     *,
     keep_views: bool,
@@ -310,7 +316,7 @@ def _start_worker(done: "Synchronized[int]") -> None:
 
 
 def _fold_share(
-    log: Path, rules: list[Rules], end: Offset, truth: Truth | None, keep_views: bool
+    log: Path, rules: list[Rules], end: Offset, truth: "Truth | None", keep_views: bool
 ) -> list[FoldResult]:
     reported = 0
 

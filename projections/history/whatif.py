@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from eventsrc.envelope import Offset
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.errors import SettingsError
-from projections.evaluate.truth import Truth
 from projections.model.command_text import command_document, command_name
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings, assignment_texts
@@ -18,6 +17,9 @@ from .aligned import aligned
 from .known import Progress
 from .names import NoSuchThing
 from .parallel import FoldResult, Rules, fold_all
+
+if TYPE_CHECKING:
+    from projections.evaluate.truth import Truth
 
 MOST_ALTERNATIVES = 200
 
@@ -165,7 +167,7 @@ def what_if(
     others: Sequence[Trial | Settings],
     end: Offset,
     *,
-    truth: Truth | None = None,
+    truth: "Truth | None" = None,
     processes: int | None = None,
     progress: Progress | None = None,
     keep_views: bool = False,
