@@ -20,6 +20,7 @@ from pathlib import Path
 from eventsrc.envelope import Offset
 from eventsrc.log import LogWriter, parse_fsync
 from projections.history import Timeline
+from projections.history.diff import difference_of
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document
 from projections.model.digest import map_digest
@@ -56,8 +57,20 @@ def case(log: Path, name: str, asks: int) -> None:
                 say(f"{name}: {what}, {clock}", f"{times}, {_memory()}")
         place = known.history.places[0].place_id
         say(f"{name}: why {place}", f"{timed(lambda: known.why(place))[0]:.2f} s, {_memory()}")
-        seconds, _ = timed(lambda: map_digest(known.at(Offset(timeline.end // 2))))
-        say(f"{name}: digest of the map in the middle", f"{seconds:.2f} s, {_memory()}")
+        # Of other maps in each case: digests are kept.
+        last = Offset(timeline.end - len(name))
+        middle = Offset(last // 2)
+        for what in ("first", "again"):
+            started = time.process_time()
+            map_digest(known.at(middle))
+            spent = time.process_time() - started
+            say(f"{name}: digest of the middle, {what}", f"{spent:.2f} s of CPU")
+        started = time.process_time()
+        difference_of(known.at(middle), known.at(last), {}, ())
+        spent = time.process_time() - started
+        say(f"{name}: diff of the middle and the end", f"{spent:.2f} s of CPU, {_memory()}")
+        search = timed(lambda: known.bisect("noise_count < 5", scan=True))[0]
+        say(f"{name}: bisect, asked after every event", f"{search:.2f} s, {_memory()}")
 
 
 def _ready(known: KnownHistory) -> KnownHistory:
