@@ -3,6 +3,7 @@
 Other packages use it through `eventsrc.transport.session`, where the rules stand.
 """
 
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -193,28 +194,49 @@ def _receive_batches(
     handler: Callable[[list[Received]], None],
     limit: SizeLimit,
 ) -> None:
-    """Call ``handler`` with the messages in a channel until the subscription ends."""
+    """Call ``handler`` with the messages in a channel until the subscription has ended and the
+    channel is empty. An exception is reported and ends one batch only, as Zenoh does with those of
+    a callback."""
     pause = threading.Event()  # never set
     while True:
         try:
-            sample: zenoh.Sample | None = channel.recv()
-        except zenoh.ZError:  # the subscription has ended, and the channel is empty
+            first = channel.recv()
+        except zenoh.ZError:  # empty and closed
             return
         batch: list[Received] = []
-        size = 0
-        while sample is not None:
-            payload = sample.payload  # each access makes a new object
-            if len(payload) > limit.size_bytes:
-                limit.refuse(str(sample.key_expr), sequence_number(sample))
-            else:
-                data = payload.to_bytes()
-                batch.append(Received(str(sample.key_expr), data, sequence_number(sample)))
-                size += len(data)
-            full = size >= _MAX_BATCH_BYTES or len(batch) >= CHANNEL_SIZE
-            sample = None if full else channel.try_recv()
-        handler(batch)
+        try:
+            _take_batch(first, channel, batch, limit)
+            handler(batch)
+        except Exception:  # noqa: BLE001 - reported
+            raised, thread = sys.exc_info(), threading.current_thread()
+            threading.excepthook(threading.ExceptHookArgs((*raised, thread)))
         if len(batch) >= _MANY:
             pause.wait(_PAUSE_S)
+
+
+def _take_batch(
+    first: zenoh.Sample,
+    channel: "zenoh.handlers.Handler[zenoh.Sample]",
+    batch: list[Received],
+    limit: SizeLimit,
+) -> None:
+    """Append ``first`` and what else is in the channel, up to the bounds of a batch."""
+    sample: zenoh.Sample | None = first
+    size = 0
+    while sample is not None:
+        payload = sample.payload  # each access makes a new object
+        if len(payload) > limit.size_bytes:
+            limit.refuse(str(sample.key_expr), sequence_number(sample))
+        else:
+            data = payload.to_bytes()
+            batch.append(Received(str(sample.key_expr), data, sequence_number(sample)))
+            size += len(data)
+        if size >= _MAX_BATCH_BYTES or len(batch) >= CHANNEL_SIZE:
+            return
+        try:
+            sample = channel.try_recv()
+        except zenoh.ZError:  # empty and closed, which `recv` reports, too
+            return
 
 
 def _parameters(text: str) -> dict[str, str]:

@@ -4,12 +4,13 @@ import queue
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
 
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
-from eventsrc.transport.declarations import CHANNEL_SIZE
+from eventsrc.transport.declarations import CHANNEL_SIZE, _receive_batches
 from eventsrc.transport.session import (
     Query,
     Received,
@@ -71,6 +72,47 @@ def test_batches_hold_all_messages_in_order_but_those_over_the_limit(connected: 
     assert [message.payload for batch in batches for message in batch] == payloads
     assert {message.key for batch in batches for message in batch} == {"tb/detections"}
     assert max(map(len, batches)) > 1
+
+
+def _batches(subscriber: Any, handle: Callable[[list[Received]], None]) -> None:
+    """Receive in batches, in this thread, what the channel of an ended subscription holds."""
+    channel = subscriber.handler
+    subscriber.undeclare()
+    limit = SizeLimit(1_000, lambda key, _number: pytest.fail(f"{key} refused"))
+    _receive_batches(channel, handle, limit)
+
+
+@pytest.fixture
+def filled(connected: Sessions) -> Any:
+    """A subscriber with a channel in which there are the messages 0 … 299."""
+    session = connected().raw
+    subscriber = session.declare_subscriber("tf/n", zenoh.handlers.FifoChannel(1_000))
+    for number in range(300):
+        session.put("tf/n", b"%d" % number)
+    return subscriber
+
+
+def test_a_batch_that_is_taken_when_the_subscription_ends_is_handled(filled: Any) -> None:
+    got: list[bytes] = []
+    _batches(filled, lambda batch: got.extend(m.payload for m in batch))
+    assert got == [b"%d" % number for number in range(300)]
+
+
+def test_an_exception_is_reported_and_ends_one_batch_only(
+    filled: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", reported.append)
+    got: list[bytes] = []
+
+    def handle(batch: list[Received]) -> None:
+        if not reported:
+            raise MemoryError
+        got.extend(m.payload for m in batch)
+
+    _batches(filled, handle)
+    assert [args.exc_type for args in reported] == [MemoryError]
+    assert got == [b"%d" % number for number in range(CHANNEL_SIZE, 300)]
 
 
 def test_an_advanced_publishers_numbers_arrive_and_the_last_one_again(connected: Sessions) -> None:
