@@ -98,7 +98,7 @@ class _CallingProcess(WorkerProcess, Generic[T]):
             results[self.given.popleft()] = result
 
     def not_in(self, results: dict[int, T]) -> list[int]:
-        """The calls that it was given of which nobody has a result."""
+        """The calls that it was given and that have no result yet."""
         return [number for number in self.given if number not in results]
 
 
