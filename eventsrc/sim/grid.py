@@ -39,14 +39,15 @@ class DriveGrid:
         clearance = walls.clearance(centres)
         for rect in obstacles:
             clearance = np.minimum(clearance, rect_clearance(rect, centres))
-        self._clearance = clearance.reshape(self._rows, self._columns)
+        self._clearance: list[list[float]] = clearance.reshape(self._rows, self._columns).tolist()
+        self._known_neighbours: dict[Cell, list[tuple[Cell, int]]] = {}
 
     def clearance_at(self, x: float, y: float) -> float:
         """Distance in metres from the cell around (x, y) to the nearest wall or furniture."""
         i, j = self._cell((x, y))
         if not (0 <= i < self._columns and 0 <= j < self._rows):
             return 0.0
-        return float(self._clearance[j, i])
+        return self._clearance[j][i]
 
     def free(self, x: float, y: float) -> bool:
         """Whether a route may lead through (x, y)."""
@@ -61,7 +62,7 @@ class DriveGrid:
         for cell in self._cells_of(within):
             x, y = self._centre(cell)
             distance = math.hypot(x - around[0], y - around[1])
-            space = min(float(self._clearance[cell[1], cell[0]]), 0.7)
+            space = min(self._clearance[cell[1]][cell[0]], 0.7)
             if distance > radius_m or space < CLEARANCE_M:
                 continue
             rank = (-space, distance, cell)
@@ -74,14 +75,23 @@ class DriveGrid:
         """Whether there are routes between all of ``spots``, each moved to free floor nearby."""
         try:
             near = [self.clearest(spot, Rect.around(*spot, 3.0, 3.0), 1.5) for spot in spots]
-            for spot in near[1:]:
-                self.route(near[0], spot)
         except MapfoldError:
             return False
-        return True
+        wanted = {self._cell(spot) for spot in near}
+        reached = {self._cell(near[0])}
+        frontier = list(reached)
+        while frontier and not wanted <= reached:
+            for neighbour, _ in self._neighbours(frontier.pop()):
+                if neighbour not in reached:
+                    reached.add(neighbour)
+                    frontier.append(neighbour)
+        return wanted <= reached
 
     def route(self, start: Point, goal: Point) -> list[Point]:
-        """Waypoints from ``start`` to ``goal``, both included, joined by clear straight lines."""
+        """Waypoints from ``start`` to ``goal``, both included, joined by clear straight lines.
+
+        Raises MapfoldError when no free floor leads to ``goal``.
+        """
         cells = self._a_star(self._cell(start), self._cell(goal))
         points = [start, *(self._centre(cell) for cell in cells[1:-1]), goal]
         shortened = [points[0]]
@@ -106,29 +116,33 @@ class DriveGrid:
         frontier = [(self._estimate(start, goal), 0, start)]
         cost = {start: 0}
         previous: dict[Cell, Cell] = {}
+        estimate = self._estimate
         while frontier:
             _, spent, cell = heapq.heappop(frontier)
             if cell == goal:
                 return _path_to(previous, cell)
             if spent > cost[cell]:
                 continue
-            for neighbour, step in self._neighbours(cell, goal):
+            for neighbour, step in self._neighbours(cell):
                 total = spent + step
                 if total < cost.get(neighbour, total + 1):
                     cost[neighbour], previous[neighbour] = total, cell
-                    heapq.heappush(
-                        frontier, (total + self._estimate(neighbour, goal), total, neighbour)
-                    )
+                    heapq.heappush(frontier, (total + estimate(neighbour, goal), total, neighbour))
         raise MapfoldError(f"no way from cell {start} to cell {goal}; try another --seed")
 
-    def _neighbours(self, cell: Cell, goal: Cell) -> Iterator[tuple[Cell, int]]:
-        for di, dj, step in (*_STEPS, *_DIAGONALS):
-            i, j = cell[0] + di, cell[1] + dj
-            if not (0 <= i < self._columns and 0 <= j < self._rows):
-                continue
-            space = self._clearance[j, i]
-            if space >= CLEARANCE_M or (i, j) == goal:
-                yield (i, j), step if space >= _COMFORT_M else 2 * step
+    def _neighbours(self, cell: Cell) -> list[tuple[Cell, int]]:
+        """The free cells around ``cell``, each with the cost of a step there."""
+        known = self._known_neighbours.get(cell)
+        if known is None:
+            known = self._known_neighbours[cell] = []
+            for di, dj, step in (*_STEPS, *_DIAGONALS):
+                i, j = cell[0] + di, cell[1] + dj
+                if not (0 <= i < self._columns and 0 <= j < self._rows):
+                    continue
+                space = self._clearance[j][i]
+                if space >= CLEARANCE_M:
+                    known.append(((i, j), step if space >= _COMFORT_M else 2 * step))
+        return known
 
     @staticmethod
     def _estimate(a: Cell, b: Cell) -> int:

@@ -53,7 +53,7 @@ def _explore(house: House) -> tuple[Stop, ...]:
     stops = [Stop(here, look_around=True)]
     left = [view for view in views if view != here]
     while left:  # next the nearest unseen viewpoint, by the length of the route
-        here = min(left, key=lambda view: (_route_m(house, here, view), view))
+        here = nearest_by_route(house.grid, here, left)
         left.remove(here)
         stops.append(Stop(here, look_around=True))
     return (*stops, Stop(_opening(house), look_around=True))
@@ -96,9 +96,19 @@ def _opening(house: House) -> Point:
     return house.grid.clearest(door.centre, house.plan.outline, 0.5)
 
 
-def _route_m(house: House, start: Point, goal: Point) -> float:
-    points = house.grid.route(start, goal)
-    return sum(math.dist(a, b) for a, b in itertools.pairwise(points))
+def nearest_by_route(grid: DriveGrid, start: Point, goals: Sequence[Point]) -> Point:
+    """The goal with the shortest route; of several the least.
+
+    No route is shorter than the straight line, so goals that are farther away than the shortest
+    route found so far need none.
+    """
+    best = (math.inf, start)
+    for goal in sorted(goals, key=lambda goal: math.dist(start, goal)):
+        if math.dist(start, goal) > best[0] + _SLACK:
+            break
+        route = grid.route(start, goal)
+        best = min(best, (sum(math.dist(a, b) for a, b in itertools.pairwise(route)), goal))
+    return best[1]
 
 
 KEYFRAME_M = 0.5
