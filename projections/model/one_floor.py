@@ -1,6 +1,6 @@
 """The part of a map that is on one floor, as a view to draw."""
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from eventsrc.errors import MisuseError
 from eventsrc.text import visible
