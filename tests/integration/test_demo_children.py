@@ -100,12 +100,12 @@ def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:
         started = time.monotonic()
 
         def observe() -> int:
-            if time.monotonic() - started > 3.0 and not ended.is_set():
+            if time.monotonic() - started > 1.0 and not ended.is_set():
                 ended.set()
                 process.terminate()
             return next(seen)
 
-        children.wait(observe, stalled_s=0.3)
+        children.wait(observe, stalled_s=0.1)
     assert ended.is_set()
 
 

@@ -14,11 +14,11 @@ from eventsrc.append import append_payload
 from eventsrc.clock import system_clock
 from eventsrc.errors import LogDamaged, LogError, MisuseError
 from eventsrc.gap_history import ledger_of, save_ledger
-from eventsrc.gaps import Gap
+from eventsrc.gaps import DEFAULT_SETTLE_NS, Gap
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
 from eventsrc.recorder.checking import Batch, Checker
-from eventsrc.recorder.queue import MessageQueue
+from eventsrc.recorder.queue import MessageQueue, SequenceGaps
 from eventsrc.recorder.writer_thread import WriterThread
 from eventsrc.robot.acks import (
     MAX_PER_ACK,
@@ -38,18 +38,25 @@ from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import flip
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
 from tests.recorders import Running
+from tests.thorough import rounds
 
 Sessions = Callable[[], Session]
 KEY = "tb/detections"
+SETTLE_NS = rounds(DEFAULT_SETTLE_NS, DEFAULT_SETTLE_NS // 20)
+"""How long a gap is open before it counts, in tests that wait for it."""
 
 
 @contextmanager
 def recording(
-    session: Session, log: Path, keys: Sequence[str] = (KEY,), queue_size: int = 1_000
+    session: Session,
+    log: Path,
+    keys: Sequence[str] = (KEY,),
+    queue_size: int = 1_000,
+    settle_ns: int = DEFAULT_SETTLE_NS,
 ) -> Iterator[Running]:
     with LogWriter(log) as writer:
         with LogReader(log) as reader:
-            ledger = ledger_of(reader)
+            ledger = ledger_of(reader, settle_ns=settle_ns)
         running = Running(Recorder(session, writer, keys, queue_size=queue_size, ledger=ledger))
         try:
             yield running
@@ -293,10 +300,11 @@ def _losses(log: Path) -> list[Loss]:
 
 
 def test_gaps_in_sequence_numbers_are_recorded_as_losses(
-    connected: Sessions, tmp_path: Path
+    connected: Sessions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The numbers of an advanced publisher are put on by hand, so that some can be left out; and
     so is its heartbeat, which tells that there were two more."""
+    monkeypatch.setattr(SequenceGaps.__init__, "__defaults__", (SETTLE_NS,))
     with recording(connected(), tmp_path / "log") as running:
         robot = connected()
         publisher = robot.raw.declare_publisher(KEY)
@@ -324,12 +332,13 @@ def test_an_announcement_reveals_that_the_last_keyframes_are_missing(
 ) -> None:
     """The words of a publisher of ours, without the messages. What it says is nothing to record."""
     log = tmp_path / "log"
-    with recording(connected(), log, ["tb/*"]) as running:
+    with recording(connected(), log, ["tb/*"], settle_ns=SETTLE_NS) as running:
         robot = connected()
         publisher, teller = robot.publisher(KEY), robot.publisher(sent_key(KEY))
         assert publisher.wait_for_subscriber(DEADLINE_S)
         for message in _keyframes(1, 2):
             publisher.put(message)
+        running.wait_until(lambda report: report.recorded == 2)
         for said in (b"nonsense", b"{" * MAX_SENT_BYTES, b" " * (MAX_SENT_BYTES + 1)):
             teller.put(said)
         teller.put(Sent(run_id="run-a", last=5).encode())
