@@ -227,13 +227,18 @@ class Difference:
             "to": self.end,
             "same": self.same,
             "digests": list(self.digests),
-            "counts": {name: [n, self.counts[1][name]] for name, n in self.counts[0].items()},
+            "counts": self._counts(),
             "places": self._places(),
             "objects": _objects(self.objects),
             "keyframes": _keyframes(self.keyframes),
             "adjacency": _edges(self.edges),
             **({"commands": list(map(command_document, self.commands))} if self.commands else {}),
         }
+
+    def _counts(self) -> dict[str, list[int]]:
+        """What corrections leave out is counted only in a map that leaves out something."""
+        first, second = self.counts
+        return {name: [count, second.get(name, 0)] for name, count in first.items()}
 
     def _places(self) -> dict[str, Any]:
         return {

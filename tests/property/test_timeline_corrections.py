@@ -23,6 +23,8 @@ from projections.model.fold import fold_log
 from projections.model.log_commands import read_commands, read_corrections
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.commands_in_logs import forget_keyframes, undo
+from tests.envelopes import envelope
 from tests.fixtures_corrections import anchor, corrected_walks, write_mixed_log
 from tests.thorough import examples
 
@@ -117,6 +119,13 @@ def test_a_difference_applied_to_the_first_map_gives_the_second(
         assert diff.digests == (map_digest(first), map_digest(second))
         between = [i for i in range(*sorted((start, end))) if not isinstance(items[i], dict)]
         assert [c.offset for c in diff.commands] == ([] if known_at is not None else between)
+
+
+def test_counts_of_a_difference_are_of_both_maps_when_one_leaves_nothing_out() -> None:
+    walk = [envelope(n, 0.5 * n, 0.0) for n in range(6)]
+    forgotten = forget_keyframes(2, 3)
+    with timeline([*walk, forgotten, undo(forgotten)]) as opened:
+        assert opened.diff(7, 8).document()["counts"]["forgotten"] == [2, 0]
 
 
 @settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
