@@ -105,6 +105,7 @@ class _Looks:
         if left < 0.0 or known.same_back < known.same_class + known.session_shift:
             raise ValueError("such looks are none")
         self._noise = left
+        self._amplitudes = [math.sqrt(known.same_side * w) for w in _fourier(known.same_kappa)]
 
     def _direction(self, *key: object) -> NDArray[np.float64]:
         if key not in self._directions:
@@ -120,8 +121,7 @@ class _Looks:
         parts = math.sqrt(known.same_class) * self._direction("class", thing % len(known.sizes_m))
         parts = parts + math.sqrt(own) * self._direction("thing", thing)
         parts = parts + math.sqrt(known.session_shift) * self._direction("session", thing, run)
-        for n, weight in enumerate(_fourier(known.same_kappa)):
-            amplitude = math.sqrt(known.same_side * weight)
+        for n, amplitude in enumerate(self._amplitudes):
             parts = parts + amplitude * math.cos(n * angle) * self._direction("cos", thing, n)
             parts = parts + amplitude * math.sin(n * angle) * self._direction("sin", thing, n)
         noise = self._rng.normal(size=DIM)

@@ -80,7 +80,7 @@ def test_few_questions_leave_it_near_what_is_usual() -> None:
 
 @pytest.mark.seconds
 def test_nonsense_is_bounded() -> None:
-    wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(40_000)]
+    wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(14_000)]
     constants = correction(wrong)
     assert constants.known_scale == 0.25
     assert -4.0 <= constants.known_shift <= 4.0
