@@ -38,15 +38,21 @@ class Life:
 
 
 def lives(
-    log: Path, times: int, fsync: str, rng: random.Random, *, mixed: bool = False
+    log: Path,
+    times: int,
+    fsync: str,
+    rng: random.Random,
+    *,
+    mixed: bool = False,
+    longest_s: float = LONGEST_LIFE_S,
 ) -> Iterator[Life]:
-    """Start and kill ``times`` times, and recover after about half of them.
+    """Start and kill ``times`` times, within ``longest_s`` each, and recover after about half.
 
     Raises AssertionError when the log holds anything but a prefix of what was written.
     """
     checked = acknowledged = 0
     for _ in range(times):
-        acknowledged = max(acknowledged, _one_life(log, fsync, rng, mixed))
+        acknowledged = max(acknowledged, _one_life(log, fsync, rng, mixed, longest_s))
         if rng.random() < 0.5:
             continue  # the next writer finds what this one left, and may be killed recovering it
         with LogWriter(log) as writer:
@@ -55,7 +61,7 @@ def lives(
         yield Life(acknowledged, kept)
 
 
-def _one_life(log: Path, fsync: str, rng: random.Random, mixed: bool) -> int:
+def _one_life(log: Path, fsync: str, rng: random.Random, mixed: bool, longest_s: float) -> int:
     """The last offset a writer acknowledged before it was killed."""
     command = [sys.executable, "-m", "tests.chaos.log_writer", str(log), fsync]
     command += ["mixed"] * mixed
@@ -64,7 +70,7 @@ def _one_life(log: Path, fsync: str, rng: random.Random, mixed: bool) -> int:
         if rng.random() < 0.7:
             process.stdout.readline()  # it holds the lock and writes from here on
         try:
-            process.wait(rng.uniform(0.0, LONGEST_LIFE_S))
+            process.wait(rng.uniform(0.0, longest_s))
         except subprocess.TimeoutExpired:
             process.kill()
         told = [line.split() for line in process.stdout if line.endswith("\n")]

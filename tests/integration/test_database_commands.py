@@ -1,4 +1,5 @@
-"""replay, tail, status and db as a person runs them, against an embedded server of their own."""
+"""replay, tail, status and db as a person runs them: against an embedded server of their own where
+its start and stop matter, else against the one that all tests share."""
 
 import contextlib
 import os
@@ -27,57 +28,70 @@ REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfo
 
 
 @pytest.fixture
-def mapfold() -> Iterator[Commands]:
-    folder = Path(tempfile.mkdtemp(prefix="mapfold-test-commands-"))
+def folder() -> Iterator[Path]:
+    made = Path(tempfile.mkdtemp(prefix="mapfold-test-commands-"))
+    yield made
+    shutil.rmtree(made, ignore_errors=True)
+
+
+@pytest.fixture
+def own_server(folder: Path) -> Iterator[Commands]:
+    """Commands that start an embedded server and stop it."""
     commands = Commands.in_folder(folder)
     furnish(commands.home)
     yield commands
     server(commands).stop(discard_keep=True)
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture
-def log(mapfold: Commands) -> Path:
-    return write_log(mapfold.folder / "log", walk(40))
+def mapfold(folder: Path, pg_url: str) -> Commands:
+    """Commands on a fresh database of the server that all tests share."""
+    return Commands.in_folder(folder, MAPFOLD_DB=pg_url)
+
+
+@pytest.fixture
+def log(folder: Path) -> Path:
+    return write_log(folder / "log", walk(40))
 
 
 def server(commands: Commands) -> EmbeddedServer:
     return EmbeddedServer(commands.home)
 
 
-def test_replay_tail_status_and_check(mapfold: Commands, log: Path) -> None:
-    assert mapfold("status", log, code=3).out.count("missing") == 2
-    replayed = mapfold("replay", log, "--until", "run-a:29", "--json").json
+def test_replay_tail_status_and_check(own_server: Commands, log: Path) -> None:
+    assert own_server("status", log, code=3).out.count("missing") == 2
+    replayed = own_server("replay", log, "--until", "run-a:29", "--json").json
     assert replayed["events"] == 30
-    assert not server(mapfold).running
-    status = mapfold("status", log, "--json", code=3).json
-    assert status["sinks"]["graph"]["condition"] == "behind"
-    assert status["sinks"]["graph"]["lag"] == 10
-    tailed = mapfold("tail", log, "--once", "--json").json
-    assert (tailed["events"], tailed["next_offset"]) == (10, 40)
-    status = mapfold("status", log, "--json").json
-    assert [s["condition"] for s in status["sinks"].values()] == ["idle", "idle"]
-    assert status["sinks"]["graph"]["versions"].keys() == {"postgresql", "age", "vector"}
-    checked = mapfold("db", "check", log, "--json").json
-    assert [s["differing"] for s in checked["sinks"]] == [0, 0]
-    assert (
-        mapfold("state", log, "--digest").out.strip()
-        == mapfold("replay", log, "--json").json["digest"]
-    )
+    assert not server(own_server).running
+    with server(own_server):  # so that not each command starts it
+        status = own_server("status", log, "--json", code=3).json
+        assert status["sinks"]["graph"]["condition"] == "behind"
+        assert status["sinks"]["graph"]["lag"] == 10
+        tailed = own_server("tail", log, "--once", "--json").json
+        assert (tailed["events"], tailed["next_offset"]) == (10, 40)
+        status = own_server("status", log, "--json").json
+        assert [s["condition"] for s in status["sinks"].values()] == ["idle", "idle"]
+        assert status["sinks"]["graph"]["versions"].keys() == {"postgresql", "age", "vector"}
+        checked = own_server("db", "check", log, "--json").json
+        assert [s["differing"] for s in checked["sinks"]] == [0, 0]
+        assert (
+            own_server("state", log, "--digest").out.strip()
+            == own_server("replay", log, "--json").json["digest"]
+        )
 
 
-def test_check_and_repair(mapfold: Commands, log: Path) -> None:
-    mapfold("db", "start")
-    mapfold("replay", log)
-    with psycopg.connect(mapfold("db", "url").out.strip()) as connection:
+def test_check_and_repair(own_server: Commands, log: Path) -> None:
+    own_server("db", "start")
+    own_server("replay", log)
+    with psycopg.connect(own_server("db", "url").out.strip()) as connection:
         connection.execute("DELETE FROM detection_embeddings WHERE det_pk = 1")
-    found = mapfold("db", "check", log, code=3)
+    found = own_server("db", "check", log, code=3)
     assert "missing detection_embeddings 1" in found.out
     assert "db check --repair" in found.err
-    assert "rebuilt" in mapfold("db", "check", log, "--repair", code=3).err
-    mapfold("db", "check", log)
-    mapfold("db", "stop")
-    assert not server(mapfold).running
+    assert "rebuilt" in own_server("db", "check", log, "--repair", code=3).err
+    own_server("db", "check", log)
+    own_server("db", "stop")
+    assert not server(own_server).running
 
 
 def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
@@ -195,10 +209,10 @@ def test_a_complete_replay_prints_no_left_out_line(mapfold: Commands, log: Path)
     assert "left out" not in mapfold("replay", log).err
 
 
-def test_db_stop_says_whether_anything_ran(mapfold: Commands) -> None:
-    assert mapfold("db", "stop").err == "it was not running\n"
-    mapfold("db", "start")
-    assert mapfold("db", "stop").err == "stopped\n"
+def test_db_stop_says_whether_anything_ran(own_server: Commands) -> None:
+    assert own_server("db", "stop").err == "it was not running\n"
+    own_server("db", "start")
+    assert own_server("db", "stop").err == "stopped\n"
 
 
 @pytest.mark.slow
@@ -246,12 +260,12 @@ def test_roles_are_sql(mapfold: Commands) -> None:
 
 @pytest.mark.parametrize("signum", mostly_slow([signal.SIGTERM, signal.SIGINT]))
 def test_a_signal_ends_a_live_tail_after_its_batch_and_leaves_no_server(
-    mapfold: Commands, log: Path, signum: signal.Signals
+    own_server: Commands, log: Path, signum: signal.Signals
 ) -> None:
     running = subprocess.Popen(
         [str(PROGRAM), "tail", str(log), "--metrics", "0"],
-        env=dict(mapfold.env),
-        cwd=mapfold.folder,
+        env=dict(own_server.env),
+        cwd=own_server.folder,
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -270,21 +284,21 @@ def test_a_signal_ends_a_live_tail_after_its_batch_and_leaves_no_server(
         if running.stderr is not None:
             running.stderr.close()
     assert "the databases are at offset" in told
-    assert not server(mapfold).running
+    assert not server(own_server).running
 
 
 @pytest.mark.slow
 def test_sigterm_in_the_middle_of_a_replay_leaves_no_server_and_the_old_map(
-    mapfold: Commands, log: Path
+    own_server: Commands, log: Path
 ) -> None:
-    mapfold("replay", log, "--until", "20")
-    big = write_log(mapfold.folder / "log", walk(4000, first=40, detections=4))
+    own_server("replay", log, "--until", "20")
+    big = write_log(own_server.folder / "log", walk(4000, first=40, detections=4))
     running = subprocess.Popen(
-        [str(PROGRAM), "replay", str(big)], env=dict(mapfold.env), cwd=mapfold.folder,
+        [str(PROGRAM), "replay", str(big)], env=dict(own_server.env), cwd=own_server.folder,
         stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        with server(mapfold) as shared:  # the server is up once this returns
+        with server(own_server) as shared:  # the server is up once this returns
             with psycopg.connect(shared.url, autocommit=True) as witness:
                 while witness.execute(REPLAYS).fetchone() == (0,):
                     assert running.poll() is None
@@ -293,6 +307,6 @@ def test_sigterm_in_the_middle_of_a_replay_leaves_no_server_and_the_old_map(
     finally:
         running.kill()
         running.wait()
-    assert not server(mapfold).running
-    status = mapfold("status", log, "--json", code=3).json
+    assert not server(own_server).running
+    status = own_server("status", log, "--json", code=3).json
     assert status["sinks"]["graph"]["next_offset"] == 20

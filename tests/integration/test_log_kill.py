@@ -21,9 +21,9 @@ from projections.model.fold import fold_event, fold_log
 from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
-from tests.chaos.log_killer import lives
+from tests.chaos.log_killer import LONGEST_LIFE_S, lives
 from tests.fixtures_log import flip
-from tests.thorough import mostly_slow
+from tests.thorough import THOROUGH, mostly_slow
 from tests.verbatim import mixed_events
 
 SEED = 20260324
@@ -102,7 +102,9 @@ def _digests(log: Path) -> set[str]:
 
 
 def _kill(log: Path, fsync: str, times: int, *, mixed: bool = False) -> None:
-    lived = list(lives(log, times, fsync, random.Random(SEED), mixed=mixed))
+    longest_s = LONGEST_LIFE_S if THOROUGH else LONGEST_LIFE_S / 3  # all of it is read again
+    rng = random.Random(SEED)
+    lived = list(lives(log, times, fsync, rng, mixed=mixed, longest_s=longest_s))
     assert lived
     assert sum(life.acknowledged for life in lived) > 0
     assert [life.lost for life in lived] == [0] * len(lived)

@@ -69,7 +69,8 @@ def test_a_preset_is_an_alternative_of_whatif(mapfold: Commands, log: Path) -> N
     assert "places=rooms" in table
 
 
-def test_state_and_replay_warn_and_name_the_preset(mapfold: Commands, log: Path) -> None:
+def test_state_and_replay_warn_and_name_the_preset(log: Path, pg_url: str) -> None:
+    mapfold = Commands.in_folder(log.parent, MAPFOLD_DB=pg_url)
     told = (
         "all 60 keyframes with a pose are in one place; if that is more than one room,"
         " --preset rooms tells them apart\n"
