@@ -89,7 +89,7 @@ def test_equal_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
 def test_a_long_chain_of_merges_can_be_pickled(tmp_path: Path) -> None:
     """Each place is absorbed by the one founded before it, the last one first: a pickle that went
     from survivor to survivor would go too deep."""
-    far, count = Settings(eps_m=1.0, min_samples=2), rounds(3_000, 1_200)
+    far, count = Settings(eps_m=1.0, min_samples=2), rounds(3_000, 600)
     first = [envelope(n, 1.5 * n) for n in range(count)]
     second = [envelope(count + n, 1.5 * n + 0.1) for n in reversed(range(count))]
     between = [envelope(2 * count + n, 1.5 * n + 0.8) for n in range(count - 1)]
