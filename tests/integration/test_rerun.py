@@ -15,7 +15,6 @@ from eventsrc.log import LogReader
 from projections.cli.export import _recorder
 from projections.model.scenes import RecordedFold
 from projections.palette import place_colour
-from projections.rerun.recording import write_recording
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
@@ -69,6 +68,8 @@ def rrd(command: str, *arguments: str | Path, home: Path) -> "subprocess.Complet
 
 
 def record(log: Path, path: Path, *, every: int | None = None, end: int | None = None) -> int:
+    from projections.rerun.recording import write_recording  # takes half a second to import
+
     with LogReader(log) as reader:
         until = reader.next_offset if end is None else Offset(end)
         return write_recording(RecordedFold(reader, SETTINGS, until, every=every), path, "test")
@@ -215,7 +216,7 @@ def test_what_cannot_be_recorded_is_said(
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "projections.rerun.recording")
-    monkeypatch.delattr("projections.rerun.recording")
+    monkeypatch.delitem(sys.modules, "projections.rerun.recording", raising=False)
+    monkeypatch.delattr("projections.rerun.recording", raising=False)
     with pytest.raises(MisuseError, match=r"--rerun needs rerun.*pip install 'mapfold\[rerun\]'"):
         _recorder("rerun", "")
