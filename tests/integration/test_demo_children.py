@@ -2,10 +2,10 @@
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,19 +13,21 @@ import pytest
 from eventsrc.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
 from eventsrc.transport.session import Router, ZenohOptions
+from projections.demo import progress
 from projections.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
 from projections.demo.recording import Children
+from tests.fixtures_zenoh import Program
 
 STARTER = """
-import sys
+import signal, sys
 from pathlib import Path
 from projections.demo.recording import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))
     children.wait_for_output("record", "recording")
-    print("ready", flush=True)
-    sys.stdin.read()
+    print("ready", file=sys.stderr, flush=True)
+    signal.pause()
 """
 
 
@@ -42,23 +44,15 @@ def _wait_until_free(log: Path, timeout_s: float) -> None:
             return
 
 
-def test_a_recorder_ends_cleanly_when_its_starter_is_killed(tmp_path: Path) -> None:
+def test_a_recorder_ends_cleanly_when_its_starter_is_killed(
+    start_code: Callable[..., Program], tmp_path: Path
+) -> None:
     log, said = tmp_path / "log", tmp_path / "said"
     with Router(ZenohOptions(listen=("tcp/127.0.0.1:0",))) as router:
-        starter = subprocess.Popen(
-            [sys.executable, "-c", STARTER, str(log), router.endpoints[0], str(said)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        try:
-            assert starter.stdout is not None
-            assert starter.stdout.readline() == b"ready\n"
-            starter.send_signal(signal.SIGKILL)
-            starter.wait(60)
-            _wait_until_free(log, 60)
-        finally:
-            starter.kill()
-            starter.communicate()
+        starter = start_code(STARTER, str(log), router.endpoints[0], str(said))
+        starter.wait_for("ready")
+        starter.end(signal.SIGKILL)
+        _wait_until_free(log, 60)
     assert said.read_text().splitlines()[-1].startswith(f"{log}: 0 recorded")
 
 
@@ -124,9 +118,11 @@ def test_progress_is_any_change_within_the_bound(bound: float) -> None:
     assert not progress.is_stalled()
 
 
-def test_processor_time_is_counted_in_steps() -> None:
+def test_processor_time_is_counted_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    step_s = LEAST_CPU_S / 6
+    monkeypatch.setattr(progress, "LEAST_CPU_S", step_s)
     before = cpu_steps(os.getpid())
-    ends = time.process_time() + 1.5 * LEAST_CPU_S
+    ends = time.process_time() + 1.5 * step_s
     while time.process_time() < ends:
         sum(range(1000))
     if sys.platform == "linux":

@@ -52,7 +52,7 @@ def _drive(run: str) -> list[bytes]:
 def _questions() -> list[bytes]:
     """What another drive sees, two crops or more."""
     seen = [payload for payload in _drive("b")[:120:4] if payload.count(b'"class"') > 1]
-    return seen[: rounds(6, 2)]
+    return seen[: rounds(6, 1)]
 
 
 @cache
