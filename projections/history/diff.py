@@ -238,7 +238,8 @@ class Difference:
     def _counts(self) -> dict[str, list[int]]:
         """What corrections leave out is counted only in a map that leaves out something."""
         first, second = self.counts
-        return {name: [count, second.get(name, 0)] for name, count in first.items()}
+        names = dict.fromkeys((*first, *second))
+        return {name: [first.get(name, 0), second.get(name, 0)] for name in names}
 
     def _places(self) -> dict[str, Any]:
         return {

@@ -126,6 +126,7 @@ def test_counts_of_a_difference_are_of_both_maps_when_one_leaves_nothing_out() -
     forgotten = forget_keyframes(2, 3)
     with timeline([*walk, forgotten, undo(forgotten)]) as opened:
         assert opened.diff(7, 8).document()["counts"]["forgotten"] == [2, 0]
+        assert opened.diff(6, 7).document()["counts"]["forgotten"] == [0, 2]
 
 
 @settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
