@@ -46,7 +46,7 @@ def used(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         found.append(sum(process.has_answer(60) for process in processes))
         return processes
 
-    monkeypatch.setattr(parallel, "CALLS_PER_WORKER", 10)
+    monkeypatch.setattr(parallel, "CALLS_PER_WORKER", 8)
     monkeypatch.setattr(parallel, "_start", ready)
     return found
 

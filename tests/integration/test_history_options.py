@@ -32,7 +32,7 @@ def test_every_command_answers_the_same_with_and_without_it(log: Path) -> None:
     plain = answers("--no-cache")
     assert not kept.exists()
     assert answers() == plain
-    assert sorted(path.suffix for path in kept.iterdir()) == [".fold", ".npz"]
+    assert sorted(path.suffix for path in kept.iterdir()) == [".digest", ".fold", ".npz"]
     (part,) = kept.glob("*.npz")
     made = part.stat().st_ino
     assert answers(count=1) == plain[:1]
