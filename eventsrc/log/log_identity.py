@@ -107,7 +107,7 @@ def _is_same_but_sealed(old: str, new: str) -> bool:
 
 def _signature(segment: SegmentPath) -> str:
     """The base of a growing segment; for a sealed one also its size and the checksum at its end.
-    Both include the time when it was begun, as a lost segment that is recorded anew has the same
+    Both include the time at which the segment was started: one recorded again has the same
     base."""
     with segment.path.open("rb") as file:
         try:
