@@ -116,6 +116,8 @@ MAX_VARIANCE = 1e6
 """Bound of a pose's variances: a standard error of a kilometre, or of 1000 radians."""
 _SAME = 1e-6
 """How far the two halves of a covariance may differ, of the greatest that they may be."""
+_ROUNDING = 1e-12
+"""What rounding may leave off the diagonal beside a variance of 0, of the greatest variance."""
 
 
 def covariance_fault(nine: Sequence[float]) -> str | None:
@@ -129,13 +131,15 @@ def covariance_fault(nine: Sequence[float]) -> str | None:
             return (
                 f"has the variance {variance:g} of {name}, which is not from 0 to {MAX_VARIANCE:g}"
             )
+    rounding = _ROUNDING * max(nine[::4])
     for row, column in ((0, 1), (0, 2), (1, 2)):
         one, other = nine[3 * row + column], nine[3 * column + row]
         most = math.sqrt(nine[4 * row] * nine[4 * column])
         names = f"{_OF_POSE[row]} and {_OF_POSE[column]}"
-        if abs(one - other) > _SAME * most:
+        slack = _SAME * most + rounding
+        if abs(one - other) > slack:
             return f"is not symmetric: {one:g} and {other:g} for {names}"
-        if abs(one) > most * (1.0 + _SAME):
+        if abs(one) > most + slack:
             return f"has {one:g} for {names}, more than their variances allow ({most:g})"
     return None
 

@@ -349,7 +349,17 @@ def _covariance(**changed: float) -> list[float]:
     return [changed.get(f"e{at}", value) for at, value in enumerate(_NINE)]
 
 
-@pytest.mark.parametrize("nine", [_NINE, [0.0] * 9, _covariance(e1=0.06, e3=0.06)])
+@pytest.mark.parametrize(
+    "nine",
+    [
+        _NINE,
+        [0.0] * 9,
+        _covariance(e1=0.06, e3=0.06),
+        # what rounding leaves beside a variance of 0
+        _covariance(e0=0.0, e1=1e-17, e3=-1e-17),
+        [0.0, 0.0, 5.5e-195, 0.0, 0.0, 0.0, 5.5e-195, 0.0, 1.0],
+    ],
+)
 def test_the_covariance_of_a_pose_is_taken(nine: list[float]) -> None:
     assert accepted(envelope(pose_covariance=nine)).envelope.pose_covariance == tuple(nine)
     assert accepted(envelope()).envelope.pose_covariance is None
@@ -363,6 +373,7 @@ def test_the_covariance_of_a_pose_is_taken(nine: list[float]) -> None:
         (_covariance(e1=0.02), "not symmetric: 0.02 and 0.01 for x and y"),
         (_covariance(e1=0.07, e3=0.07), "0.07 for x and y, more than their variances allow"),
         (_covariance(e0=0.0), "0.01 for x and y, more than their variances allow (0)"),
+        (_covariance(e0=0.0, e1=1e-9, e3=1e-9), "1e-09 for x and y, more than their"),
         (_covariance(e4=float("nan")), "finite"),
         (_covariance(e2=float("inf")), "finite"),
         (_NINE[:8], "at least 9 items"),
