@@ -14,8 +14,9 @@ from typing import BinaryIO, Final, NamedTuple
 import zstandard
 from lz4.frame import LZ4FrameDecompressor
 
+from eventsrc.crc import crc32
+
 from . import mcap_records as _mcap
-from .crc import crc32
 from .event import MessageFormat
 from .format import ENVELOPE_VERSION_KEY, envelope_version, is_verbatim, message_format
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode, Schema

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
 
 from . import mcap_records as _mcap
-from .crc import crc32
 from .durable_files import FsyncPolicy
 from .event import MessageFormat, NewEvent
 from .format import NO_SCHEMA, key_channel, schema_of, verbatim_channel

@@ -40,9 +40,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
-
-from .crc import crc32
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"

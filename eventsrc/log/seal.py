@@ -24,11 +24,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
-from .crc import crc32
 from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
 from .format import (
     ACTIVE,

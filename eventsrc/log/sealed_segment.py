@@ -12,11 +12,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from eventsrc.advised import advised
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
-from .crc import crc32
 from .format import NO_SCHEMA, is_metadata_of, is_verbatim
 from .mcap_records import (
     BadRecord,

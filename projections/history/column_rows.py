@@ -1,12 +1,12 @@
 """Deltas as rows of columns, and the stripes that they fill while events are folded."""
 
-import zlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
 from projections.deltas import (
     Delta,
@@ -58,7 +58,7 @@ def _observation(delta: ObservationAdded) -> Row:
         delta.confidence,
         *delta.bbox,
         delta.embedding_model,
-        None if vector is None else zlib.crc32(vector.data),
+        None if vector is None else crc32(vector.data),
         delta.foreign_space,
     )
 

@@ -22,8 +22,8 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Offset
-from eventsrc.log.crc import crc32
 
 from .columns import TABLES, Array, Stripe, ends_of
 from .tables import DamagedPart

@@ -6,11 +6,11 @@ larger one and leaves keyframes with the place they joined; `KeyframeRecord.plac
 survivor up, so a merge costs little however many keyframes move.
 """
 
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import (
@@ -209,7 +209,7 @@ class MapView:
                 delta.bbox,
                 delta.embedding_model,
                 vector if self.keep_embeddings else None,
-                None if vector is None else zlib.crc32(vector.data),
+                None if vector is None else crc32(vector.data),
                 delta.foreign_space,
             )
         )

@@ -10,10 +10,10 @@ import marshal
 from collections.abc import MutableSequence
 from operator import attrgetter
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 
+from eventsrc.crc import crc32
 from eventsrc.envelope import Detection, DetId, KeyframeId, Offset, RunId, has_evidence, has_floor
 from eventsrc.ingest import Accepted
 from projections.deltas import KeyframeOrdinal, RunOrdinal

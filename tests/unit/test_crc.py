@@ -1,4 +1,4 @@
-"""The CRC-32 of the log is the one that zlib computes, with and without ISA-L."""
+"""Our CRC-32 is the one that zlib computes, with and without ISA-L."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ import zlib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.log.crc import crc32
+from eventsrc.crc import crc32
 
 
 @given(st.binary(max_size=40_000), st.integers(0, 2**32 - 1))
@@ -27,7 +27,7 @@ def test_pieces_give_the_crc_of_the_whole(pieces: list[bytes]) -> None:
 def test_zlib_computes_it_where_isal_is_not_installed() -> None:
     code = (
         "import sys, zlib; sys.modules['isal'] = None\n"
-        "from eventsrc.log.crc import crc32\n"
+        "from eventsrc.crc import crc32\n"
         "sys.exit(0 if crc32 is zlib.crc32 else 1)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
