@@ -1,9 +1,8 @@
-"""Start programs by forking a process that has imported their libraries already.
+"""Start programs by forking a process that has imported their modules already.
 
 A program started so is a process of its own, with its own arguments, folder, environment, streams
-and exit code. Only the interpreter's start and most imports are shared, four fifths of what a short
-command costs; the modules of projections.cli are imported after the fork, because they look at the
-environment. Under scripts/test_slow each is a new program instead.
+and exit code. Only the interpreter's start and most imports are shared, nine tenths of what a short
+command costs. Under scripts/test_slow each is a new program instead.
 """
 
 import atexit

@@ -1,4 +1,4 @@
-"""The process that `tests.prefork` has fork: it imports libraries, then forks at each request.
+"""The process that `tests.prefork` has fork: it imports modules, then forks at each request.
 
     python -m tests.prefork_server FD        FD is a listening socket; ends when stdin does
 
@@ -22,39 +22,30 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+import pydantic
+
+from projections.cli import COMMANDS, terminal
+
 MODULES = (
-    "numpy.typing",
-    "concurrent.futures.thread",
-    "msgspec",
-    "pydantic.main",
-    "pydantic.type_adapter",
-    "pydantic.types",
-    "pybase64",
-    "typer",
-    "typer.testing",
-    "typer._click.decorators",
-    "typer._adapters",
-    "rich.progress",
-    "mcap.reader",
-    "mcap.writer",
-    "zstandard",
-    "psycopg",
-    "psycopg_pool",
-    "pgvector.psycopg",
-    "eventsrc.log",
-    "eventsrc.recorder",
-    "eventsrc.transport.session",
-    "projections.database",
-    "projections.history",
-    "projections.model.export",
-    "importlib.metadata",
-    "email.parser",
+    *COMMANDS.values(),
     "email.policy",
+    "fastapi.responses",
     "matplotlib.figure",
     "matplotlib.patheffects",
-    "fastapi.responses",
+    "mcap.reader",
+    "mcap.writer",
+    "projections.drawing",
+    "projections.export",
+    "projections.palette",
+    "rich._emoji_codes",
+    "rich.progress",
+    "typer._adapters",
+    "typer._click._textwrap",
+    "typer._click.decorators",
+    "typer.testing",
     "uvicorn.protocols.http.h11_impl",
 )
+"""Those of the commands, and what these import when they run."""
 
 
 def _serve(listener: socket.socket) -> Mapping[str, Any]:
@@ -114,6 +105,7 @@ def _become(request: Mapping[str, Any], fds: list[int]) -> None:
     os.environ.clear()
     os.environ.update(request["env"])
     sys.argv = request["argv"]
+    terminal.people.__init__()  # a console of rich looks at the environment
 
 
 def _run(request: Mapping[str, Any]) -> int:
@@ -143,8 +135,6 @@ def _call(request: Mapping[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    import pydantic
-
     for module in MODULES:
         importlib.import_module(module)
     pydantic.create_model("First")  # has pydantic look for its plugins

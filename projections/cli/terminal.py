@@ -20,6 +20,10 @@ EXIT_FINDINGS = 3
 
 
 class _People(Console):
+    def __init__(self) -> None:
+        """Markup is off, since ids and reasons may hold any text."""
+        super().__init__(stderr=True, highlight=False, soft_wrap=True, markup=False)
+
     @property
     def is_terminal(self) -> bool:
         """Whether the stream is a terminal. FORCE_COLOR and TTY_COMPATIBLE, by which rich takes a
@@ -30,8 +34,8 @@ class _People(Console):
             return False
 
 
-people = _People(stderr=True, highlight=False, soft_wrap=True, markup=False)
-"""Stderr. Without markup, since ids and reasons may hold any text."""
+people = _People()
+"""Stderr."""
 
 
 class OutputLost(Exception):
