@@ -22,7 +22,7 @@ def wall_segments(given: OccupancyMap) -> list[list[float]]:
     walls = (given.cells >= MIN_WALL) & (given.cells <= OCCUPIED)
     step = 1
     while True:
-        mask = _pooled(walls, step)
+        mask = pooled(walls, step)
         across, along = _turns(mask), _turns(mask.T)
         # Each segment is two turns: counted before they are made, of noise there are millions.
         if np.count_nonzero(across) + np.count_nonzero(along) <= 2 * MOST_SEGMENTS:
@@ -31,7 +31,8 @@ def wall_segments(given: OccupancyMap) -> list[list[float]]:
         step *= 2
 
 
-def _pooled(mask: _Mask, step: int) -> _Mask:
+def pooled(mask: _Mask, step: int) -> _Mask:
+    """A cell for each square of ``step`` by ``step``: True where any of them is."""
     rows, columns = mask.shape
     padded = np.pad(mask, ((0, -rows % step), (0, -columns % step)))
     shape = padded.shape[0] // step, step, padded.shape[1] // step, step

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from eventsrc.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
 from projections import palette
 from projections.model.view import MapView
+from projections.wall_segments import pooled
 
 from .canvas import Canvas
 from .labels import Extent
@@ -180,7 +181,7 @@ def draw_map_walls(canvas: Canvas, view: MapView) -> None:
     if not cells.size:
         return
     step = max(1, -(-max(cells.shape) // _MOST_CELLS))
-    walls, free = _pooled(_is_wall(cells), step), _pooled(cells < MIN_WALL, step)
+    walls, free = pooled(_is_wall(cells), step), pooled(cells < MIN_WALL, step)
     height, width = (side * step for side in walls.shape)
     x, y, yaw = given.origin
     placed = Affine2D().translate(first_column, first_row).scale(given.resolution)
@@ -227,14 +228,6 @@ def _visible(
     top, left = (max(0, int(np.floor(at.min()))) for at in (rows, columns))
     bottom, right = (max(0, int(np.ceil(at.max()))) for at in (rows, columns))
     return top, left, given.cells[top:bottom, left:right]
-
-
-def _pooled(cells: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
-    """True where any of ``step`` by ``step`` cells is."""
-    rows, columns = cells.shape
-    padded = np.pad(cells, ((0, -rows % step), (0, -columns % step)))
-    shape = padded.shape[0] // step, step, padded.shape[1] // step, step
-    return np.asarray(padded.reshape(shape).any(axis=(1, 3)))
 
 
 def _image(drawn: NDArray[np.bool_], colour: str) -> NDArray[np.float64]:

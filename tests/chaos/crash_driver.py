@@ -62,12 +62,12 @@ class Bomb:
         psycopg.Transaction.__exit__ = stepping_leave  # type: ignore[method-assign]
 
 
-def killed_at(step: int, log: Path, targets: Targets) -> bool:
+def killed_at(step: int, log: Path, targets: Targets, batch_events: int = BATCH) -> bool:
     """Tail in a child that dies at ``step``; False when it came to its end before that."""
     child = os.fork()
     if child == 0:
         Bomb(step).arm()
-        tail(log, targets, SETTINGS, once=True, batch_events=BATCH)
+        tail(log, targets, SETTINGS, once=True, batch_events=batch_events)
         os._exit(0)
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status)

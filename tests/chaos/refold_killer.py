@@ -8,28 +8,16 @@ commands name places there is no swap, and batches are written one by one. Print
 """
 
 import json
-import os
 import sys
 from pathlib import Path
 
 from projections.database import rebuild, tail
 from projections.database.connection import Targets
-from tests.chaos.crash_driver import SETTINGS, Bomb
+from tests.chaos.crash_driver import SETTINGS, killed_at
 from tests.chaos.rebuild_killer import torn
 from tests.rows import all_rows
 
 BATCH = 4
-
-
-def killed_at(step: int, log: Path, targets: Targets) -> bool:
-    """Tail in a child that dies at ``step``; False when it came to its end before that."""
-    child = os.fork()
-    if child == 0:
-        Bomb(step).arm()
-        tail(log, targets, SETTINGS, once=True, batch_events=BATCH)
-        os._exit(0)
-    _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status)
 
 
 def main() -> None:
@@ -41,7 +29,7 @@ def main() -> None:
     while True:
         rebuild(log, targets, SETTINGS, until=old_end)  # type: ignore[arg-type]
         old = all_rows(targets)
-        killed = killed_at(step, log, targets)
+        killed = killed_at(step, log, targets, BATCH)
         found = all_rows(targets)
         if swaps and torn(found, old, new, targets):
             wrong.append(step)
