@@ -53,7 +53,9 @@ _count = struct.Struct(">h").pack
 _length = struct.Struct(">i").pack
 _int64 = struct.Struct(">iq").pack
 _pose = struct.Struct(">ididid").pack
-_fixed = struct.Struct(">iqidiiiiiiifififif").pack
+_REALS: Final = struct.pack(">iiiiii", 52, 1, 0, _FLOAT4_OID, 4, 1)
+"""The field of a ``real[]`` of four, up to its first element."""
+_fixed = struct.Struct(f">iqid{len(_REALS)}sififififi").pack
 _vector = struct.Struct(">ihh").pack
 
 
@@ -65,8 +67,13 @@ def copy_document(rows: Sequence[VectorRow], first: bool, last: bool) -> bytes:
         added = row.added
         if added.keyframe != keyframe:
             keyframe, shared = added.keyframe, _shared_fields(row)
+        det_id = added.det_id.encode()
+        try:
+            numbers = _numbers(added, added.bbox, len(det_id))
+        except OverflowError:  # a corner beyond float32
+            numbers = _numbers(added, row.bbox, len(det_id))
         names = _name_fields(added.class_name, added.embedding_model)
-        parts += (shared, _number_fields(row, added), _text(added.det_id), names, vector)
+        parts += (shared, numbers, det_id, names, vector)
     if last:
         parts.append(_TRAILER)
     return b"".join(parts)
@@ -95,17 +102,13 @@ def _shared_fields(row: VectorRow) -> bytes:
     ))  # fmt: skip
 
 
-def _number_fields(row: VectorRow, added: ObservationAdded) -> bytes:
-    try:
-        return _packed_numbers(added, *added.bbox)
-    except OverflowError:  # a corner beyond float32
-        return _packed_numbers(added, *row.bbox)
-
-
-def _packed_numbers(added: ObservationAdded, x0: float, y0: float, x1: float, y1: float) -> bytes:
-    key, confidence = added.observation + 1, added.confidence
-    array = (52, 1, 0, _FLOAT4_OID, 4, 1)
-    return _fixed(8, key, 8, confidence, *array, 4, x0, 4, y0, 4, x1, 4, y1)
+def _numbers(
+    added: ObservationAdded, bbox: tuple[float, float, float, float], id_length: int
+) -> bytes:
+    """The fields of numbers, and the length of the det_id, whose field is the next."""
+    x0, y0, x1, y1 = bbox
+    key = added.observation + 1
+    return _fixed(8, key, 8, added.confidence, _REALS, 4, x0, 4, y0, 4, x1, 4, y1, id_length)
 
 
 def _pose_fields(pose: tuple[float, float, float]) -> bytes:

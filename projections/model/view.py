@@ -271,12 +271,14 @@ class MapView:
             observation.object = delta.object
             observation.similarity_q40 = delta.similarity_q40
             found.observations.append(delta.observation)
+        is_counted = (found.obs_count > 1) is (delta.obs_count > 1)
         found.obs_count = delta.obs_count
         found.sum_x_um = delta.sum_x_um
         found.sum_y_um = delta.sum_y_um
         found.first_seen = delta.first_seen
         found.last_seen = delta.last_seen
-        self.contents.update(found)
+        if not is_counted:
+            self.contents.update(found)
 
     def _objects_merged(self, delta: ObjectsMerged) -> None:
         survivor = self.all_objects[delta.survivor]
