@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -30,7 +30,7 @@ from .envelope import (
     default_det_id,
     describe_error,
 )
-from .plain_envelopes import read_plain
+from .plain_envelopes import PlainEnvelope, read_plain
 from .text import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
@@ -115,6 +115,25 @@ def ingest_all(
         return [_accept(result, None) for result in read]
     vectors = iter(list(rows))
     return [_accept(result, vectors) for result in read]
+
+
+def ingest_plain(payloads: Sequence[bytes], *, max_bytes: int) -> list[Accepted] | None:
+    """`ingest_all` in half of the time, for callers that only read fields: each envelope is a
+    `PlainEnvelope`, which has the fields of an `Envelope` and the same values. None where
+    `ingest_all` must decide: one of them is unusual, or not all vectors are of one dimension."""
+    plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
+    envelopes = [e for e in plain if e is not None]
+    rows = _decode_uniform([d for e in envelopes for d in e.detections])
+    if len(envelopes) < len(plain) or rows is None:
+        return None
+    vectors = iter(list(rows))
+    accepted = []
+    for envelope in envelopes:
+        if isinstance(envelope.floor, int):
+            envelope.floor = str(envelope.floor)
+        own = tuple(islice(vectors, len(envelope.detections)))
+        accepted.append(Accepted(cast(Envelope, envelope), _plain_det_ids(envelope), own))
+    return accepted
 
 
 def check_all(
@@ -277,6 +296,15 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
             )
         seen.add(det_id)
     return tuple(ids)
+
+
+def _plain_det_ids(envelope: PlainEnvelope) -> tuple[DetId, ...]:
+    """Those given, which `read_plain` has compared, or those by default."""
+    given = [DetId(d.det_id) for d in envelope.detections if d.det_id is not None]
+    if given:
+        return tuple(given)
+    start = default_det_id(RunId(envelope.run_id), KeyframeId(envelope.keyframe_id), 0)[:-1]
+    return tuple([DetId(f"{start}{index}") for index in range(len(envelope.detections))])
 
 
 def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:

@@ -1,8 +1,9 @@
-"""Read envelopes of known fields in half of pydantic's time, for callers that keep only the bytes.
+"""Read envelopes of known fields in half of pydantic's time, for callers that need no models.
 
 `read_plain` accepts a part of what `eventsrc.envelope` accepts, and nothing else: an envelope with
 known fields only, whose texts are printable. For anything else it returns None, and the caller uses
-pydantic, which also gives the reasons. So the models of `eventsrc.envelope` alone define what is
+pydantic, which also gives the reasons. What it reads has the fields and values of the models,
+but for a floor that is an integer. So the models of `eventsrc.envelope` alone define what is
 valid; a property test compares the two over texts that are made to tell them apart.
 """
 
@@ -73,7 +74,8 @@ class PlainEnvelope(_Known):
     floor: _Text | _Int64 | None = None
     map_z: _Position | None = None
     pose_covariance: (
-        Annotated[list[float], Meta(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)] | None
+        Annotated[tuple[float, ...], Meta(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)]
+        | None
     ) = None
 
     @property

@@ -43,6 +43,7 @@ from .ingest import (
     check_cost,
     ingest,
     ingest_all,
+    ingest_plain,
 )
 
 BARE_LIST_VERSION = 1
@@ -115,6 +116,17 @@ def read_envelopes(
         if _must_convert(event, read[index]):
             read[index] = _converted(event, max_bytes)
     return read
+
+
+def read_fields(
+    events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
+) -> Sequence[Accepted | Rejected]:
+    """Like `read_envelopes`, faster, for callers that only read fields: see `ingest_plain`."""
+    if all(event.version == ENVELOPE_VERSION for event in events):
+        plain = ingest_plain([event.payload for event in events], max_bytes=max_bytes)
+        if plain is not None:
+            return plain
+    return read_envelopes(events, max_bytes=max_bytes)
 
 
 def check_envelopes(

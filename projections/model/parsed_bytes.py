@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from itertools import accumulate, pairwise
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
+import msgspec
 import numpy as np
 from pydantic import BaseModel
 
@@ -46,7 +47,7 @@ def pack(stretches: Iterable[list[Event]], memory: memoryview) -> Packed:
     """Parse the events and write them. Raises NoRoom."""
     documents, at = [], 0
     for events in stretches:
-        parsed = parse_events(events)
+        parsed = parse_events(events, fields_only=True)
         units = [unit for each in parsed for unit in each.units]
         vectors = [
             v for each in parsed if isinstance(each.parsed, Accepted) for v in each.parsed.vectors
@@ -85,15 +86,11 @@ def _write_arrays(
     end = exact_at + 4 * total
     if end > len(memory):
         raise NoRoom
-    narrow = np.frombuffer(memory, np.float32, total, at)
-    exact = np.frombuffer(memory, np.int32, total, exact_at)
-    start = 0
-    for vector, unit in zip(vectors, units, strict=True):
-        if vector is not None and unit is not None:
-            stop = start + len(vector)
-            narrow[start:stop] = vector
-            exact[start:stop] = unit[1]
-            start = stop
+    if total:
+        given = [vector for vector in vectors if vector is not None]
+        exact = [unit[1] for unit in units if unit is not None]
+        np.concatenate(given, out=np.frombuffer(memory, np.float32, total, at))
+        np.concatenate(exact, out=np.frombuffer(memory, np.int32, total, exact_at))
     return end
 
 
@@ -124,9 +121,10 @@ def _record(event: ParsedEvent, read: Event) -> _Record:
     parsed = event.parsed
     if isinstance(parsed, Accepted):
         envelope = _fields(parsed.envelope)
-        envelope["detections"] = [
-            _fields(detection) | {"embedding": None} for detection in parsed.envelope.detections
-        ]
+        detections = [_fields(detection) for detection in parsed.envelope.detections]
+        for detection in detections:
+            detection["embedding"] = None
+        envelope["detections"] = detections
         if parsed.envelope.camera is not None:
             envelope["camera"] = _fields(parsed.envelope.camera)
         digest = content_digest(parsed)
@@ -159,8 +157,10 @@ def _parsed(
     return ParsedEvent(offset, logged_ns, accepted, units[first:stop])
 
 
-def _fields(model: BaseModel) -> dict[str, Any]:
-    return dict(model.__dict__)
+def _fields(model: BaseModel | msgspec.Struct) -> dict[str, Any]:
+    return (
+        msgspec.structs.asdict(model) if isinstance(model, msgspec.Struct) else {**model.__dict__}
+    )
 
 
 _set: Final = object.__setattr__

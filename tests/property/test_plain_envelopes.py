@@ -4,13 +4,24 @@ import json
 import re
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 from eventsrc.envelope import Detection, Envelope, EnvelopeCamera
-from eventsrc.ingest import CheckedEnvelope, Rejected, check_all, ingest
+from eventsrc.ingest import (
+    Accepted,
+    CheckedEnvelope,
+    Rejected,
+    check_all,
+    ingest,
+    ingest_all,
+    ingest_plain,
+)
 from eventsrc.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope, read_plain
+from projections.reducers.folded_ids import content_digest
 from tests.envelopes import detection, envelope, payload
 from tests.thorough import examples
 
@@ -52,27 +63,39 @@ def written(members: Members) -> str:
     return "{" + ",".join(f'"{name}":{value}' for name, value in members) + "}"
 
 
-DETECTIONS = st.lists(
-    st.lists(st.tuples(st.sampled_from(OF_DETECTION), VALUES), max_size=1).map(
-        lambda odd: written(
-            [("class", '"cup"'), ("confidence", "0.5"), ("bbox", "[0,0,1,1]"), *odd]
-        )
-    ),
-    max_size=3,
-).map(lambda found: f"[{','.join(found)}]")
+def detections_with(more: Members) -> st.SearchStrategy[str]:
+    """Up to three detections with these members and perhaps another."""
+    known = [("class", '"cup"'), ("confidence", "0.5"), ("bbox", "[0,0,1,1]"), *more]
+    odd = st.lists(st.tuples(st.sampled_from(OF_DETECTION), VALUES), max_size=1)
+    found = st.lists(odd.map(lambda members: written([*known, *members])), max_size=3)
+    return found.map(lambda each: f"[{','.join(each)}]")
+
+
 ODD = st.lists(st.tuples(st.sampled_from(OF_ENVELOPE), VALUES), max_size=2)
-PAYLOADS = st.builds(
-    lambda odd, found, left_out, first: written(
-        ([*odd] if first else [])
-        + [m for m in PLAIN.items() if m[0] != left_out]
-        + [("detections", found)]
-        + ([] if first else [*odd])
-    ).encode(errors="surrogatepass"),
-    ODD,
-    DETECTIONS,
-    st.sampled_from([*PLAIN] + 20 * [""]),
-    st.booleans(),
+
+
+def payloads_of(detections: st.SearchStrategy[str]) -> st.SearchStrategy[bytes]:
+    """Envelopes with these detections and up to two odd members."""
+    return st.builds(
+        lambda odd, found, left_out, first: written(
+            ([*odd] if first else [])
+            + [m for m in PLAIN.items() if m[0] != left_out]
+            + [("detections", found)]
+            + ([] if first else [*odd])
+        ).encode(errors="surrogatepass"),
+        ODD,
+        detections,
+        st.sampled_from([*PLAIN] + 20 * [""]),
+        st.booleans(),
+    )
+
+
+PAYLOADS = payloads_of(detections_with([]))
+EMBEDDED_PAYLOADS = payloads_of(
+    detections_with([("embedding", '"AACAPwAAAAA="'), ("embedding_dim", "2")])
 )
+CAMERA = {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
+NINE = [0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.0004]
 
 
 def checked(raw: bytes) -> CheckedEnvelope | Rejected:
@@ -108,6 +131,47 @@ def test_what_is_read_quickly_is_what_the_models_read(raw: bytes) -> None:
     assert [d.embedding_dim for d in plain.detections] == [
         d.embedding_dim for d in whole.detections
     ]
+
+
+def fields(whole: BaseModel | msgspec.Struct | Any) -> Any:
+    """Names and values, to the last bit, of an envelope and of what is in it."""
+    if isinstance(whole, tuple | list):
+        return [fields(each) for each in whole]
+    if not isinstance(whole, BaseModel | msgspec.Struct):
+        return repr(whole)
+    model = isinstance(whole, BaseModel)
+    names = type(whole).model_fields if model else type(whole).__struct_fields__
+    return {name: fields(getattr(whole, name)) for name in names}
+
+
+@settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(EMBEDDED_PAYLOADS, min_size=1, max_size=3))
+@example([payload(envelope(0, detections=[detection("a", [1.0, 2.0], det_id="x")], floor=2))])
+@example([payload(envelope(1, detections=[detection("a", [1.0, 2.0])], pose_covariance=NINE))])
+@example([payload(envelope(2, detections=[detection("a", [1.0, 2.0])], camera=CAMERA))])
+def test_read_together_they_have_the_fields_and_vectors_of_the_models(raws: list[bytes]) -> None:
+    plain = ingest_plain(raws, max_bytes=1 << 20)
+    if plain is None:
+        return
+    for quick, whole in zip(plain, ingest_all(raws), strict=True):
+        assert isinstance(whole, Accepted)
+        assert fields(quick.envelope) == fields(whole.envelope)
+        assert quick.det_ids == whole.det_ids
+        assert [v.tobytes() for v in quick.vectors] == [v.tobytes() for v in whole.vectors]
+        assert content_digest(quick) == content_digest(whole)
+
+
+def test_usual_envelopes_are_read_together() -> None:
+    usual = [payload(envelope(n, detections=[detection("a", [1.0, 2.0])])) for n in range(3)]
+    assert ingest_plain(usual, max_bytes=1 << 20) is not None
+    for unusual in (
+        payload(envelope(4, detections=[detection("a", [1.0, 2.0, 3.0])])),
+        payload(envelope(4, detections=[detection("a")])),
+        payload(envelope(4, detections=[detection("a", [0.0, 0.0])])),
+        payload(envelope(4, note="more")),
+        b"{}",
+    ):
+        assert ingest_plain([*usual, unusual], max_bytes=1 << 20) is None
 
 
 @given(st.floats(0.0, 9e9))
