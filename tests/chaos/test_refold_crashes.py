@@ -61,7 +61,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold(
     write_log(log, walk(4, first=20))
     append_command(log, undo(forgotten))
     append_command(log, forget_keyframes(2, 9))
-    found = kills(log, request.getfixturevalue(kind), 11 * stride(13), "swaps")
+    found = kills(log, request.getfixturevalue(kind), 11 * stride(25), "swaps")
     assert found["wrong"] == []
     assert found["steps"] > 100
     assert found["old"] >= 1
@@ -73,7 +73,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold_that_keeps_the_vectors(
 ) -> None:
     append_command(log, keep_apart(0, 1))
     write_log(log, walk(4, first=20))
-    found = kills(log, one_database, 11 * stride(13), "swaps")
+    found = kills(log, one_database, 11 * stride(25), "swaps")
     assert found["wrong"] == []
     assert found["steps"] > 80
 
@@ -84,7 +84,7 @@ def test_a_tail_killed_between_any_two_statements_while_places_are_named(
     for n, name in enumerate(["kitchen", "hall", "kitchen again"]):
         append_command(log, name_place(3, name))
         write_log(log, walk(3, seed=n, first=20 + 3 * n))
-    found = kills(log, two_databases, 3 * stride(13), "batches")
+    found = kills(log, two_databases, 3 * stride(25), "batches")
     assert found["wrong"] == []
     assert found["steps"] > 20
 
@@ -98,7 +98,7 @@ def test_the_server_killed_at_any_statement_of_a_refold(
     write_log(log, walk(4, first=20))
     rebuild(log, one_database, SETTINGS)
     expected = all_rows(one_database)
-    execute, killed, steps = psycopg.Cursor.execute, 0, range(5, 10_000, 45 * stride(3))
+    execute, killed, steps = psycopg.Cursor.execute, 0, range(5, 10_000, 45 * stride(5))
     with server_to_kill() as server:
         targets = Targets(server.url, server.url, server)
         for step in steps:

@@ -22,7 +22,7 @@ from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
 from tests.servers import kill_postgres, server_to_kill
-from tests.thorough import rounds
+from tests.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 120.0
@@ -182,7 +182,7 @@ def test_commits_lost_while_no_event_comes_are_written_again(
     assert all_rows(one_database) == tailed
 
 
-@pytest.mark.parametrize("again", [1, 3])
+@pytest.mark.parametrize("again", mostly_slow([1, 3]))
 def test_a_connection_cut_again_while_the_checkpoint_is_read(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, again: int
 ) -> None:

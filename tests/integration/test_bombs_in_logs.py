@@ -3,6 +3,7 @@
 import os
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from eventsrc.log.recover import TooManyLosses
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, write_log
 from tests.memory import MOST_MIB, run_measured
 from tests.rewriting import rewrite
-from tests.thorough import mostly_slow
+from tests.thorough import THOROUGH, mostly_slow
 
 HUGE = 20 * 2**30
 EVENTS = 6
@@ -89,6 +90,7 @@ def sealed_with_a_hole_before_its_footer(log: Path) -> None:
         file.write(tail)
 
 
+@cache
 def zstd_of_zeros(size: int) -> tuple[bytes, int]:
     """The frame, which names its size, and the CRC of its content."""
     squeeze = zstandard.ZstdCompressor().compressobj(size=size)
@@ -243,7 +245,8 @@ def test_places_beyond_the_file_are_damage_and_recovered(
         write_log(log_path, [envelope(k) for k in range(3)])
     with pytest.raises(LogDamaged, match="run `mapfold log recover"):
         read_log(log_path)
-    for command in ("info", "cat", "verify", "recover", "cat"):
+    commands = ("info", "cat", "verify", "recover", "cat") if THOROUGH else ("verify", "recover")
+    for command in commands:
         ran = run_measured("log", command, log_path)
         assert "Traceback" not in ran.said, (command, ran.said)
         assert ran.peak_mib < MOST_MIB

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, EmbeddedServerError
 from tests.prefork import Process, start
 from tests.servers import furnish
+from tests.thorough import mostly_slow
 
 WAIT_S = 60
 
@@ -29,17 +31,17 @@ with databases(None, None) as targets:
 """
 
 
-@pytest.fixture
-def home(request: pytest.FixtureRequest) -> Iterator[Path]:
-    import shutil
-    import tempfile
+@pytest.fixture(scope="module")
+def furnished() -> Iterator[Path]:
+    """A home with a data folder, whose server each test leaves stopped."""
+    with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
+        yield furnish(Path(folder))
 
-    folder = Path(tempfile.mkdtemp(prefix="mapfold-test-home-"))
-    if request.node.name != "test_starts_serves_and_stops":  # that one makes a data folder
-        furnish(folder)
-    yield folder
-    EmbeddedServer(folder).stop(discard_keep=True)
-    shutil.rmtree(folder, ignore_errors=True)
+
+@pytest.fixture
+def home(furnished: Path) -> Iterator[Path]:
+    yield furnished
+    EmbeddedServer(furnished).stop(discard_keep=True)
 
 
 @contextmanager
@@ -68,19 +70,13 @@ def answers(server: EmbeddedServer) -> bool:
         return False
 
 
-def test_starts_serves_and_stops(home: Path) -> None:
-    with EmbeddedServer(home) as server:
-        assert answers(server)
-        assert server.data.stat().st_mode & 0o077 == 0
-    assert not server.running
-    assert not answers(server)
-
-
-def test_data_survives_a_restart_of_the_server(home: Path) -> None:
-    with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
-        connection.execute("CREATE TABLE kept AS SELECT 7 AS n")
-    with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
-        assert connection.execute("SELECT n FROM kept").fetchone() == (7,)
+def test_starts_serves_and_stops_at_a_path_with_spaces_quotes_and_percent() -> None:
+    with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
+        with EmbeddedServer(Path(folder) / "my robot's 100% café") as server:
+            assert answers(server)
+            assert server.data.stat().st_mode & 0o077 == 0
+        assert not server.running
+        assert not answers(server)
 
 
 def test_two_commands_share_it_and_the_last_one_stops_it(home: Path) -> None:
@@ -121,7 +117,7 @@ def test_db_stop_does_not_stop_a_server_in_use(home: Path) -> None:
         assert other.poll() is None
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", mostly_slow([signal.SIGTERM, signal.SIGINT]))
 def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) -> None:
     with holder(home) as (other, _):
         assert EmbeddedServer(home).running
@@ -140,7 +136,9 @@ def test_after_a_killed_command_the_next_command_stops_it(home: Path) -> None:
     assert not EmbeddedServer(home).running
 
 
-def test_starts_again_after_the_server_itself_was_killed(home: Path) -> None:
+def test_data_survives_a_restart_and_a_kill_of_the_server_itself(home: Path) -> None:
+    with EmbeddedServer(home) as server, psycopg.connect(server.url) as connection:
+        connection.execute("CREATE TABLE kept AS SELECT 7 AS n")
     with EmbeddedServer(home) as server:
         postmaster = int((server.data / "postmaster.pid").read_text().split()[0])
         with psycopg.connect(server.url, autocommit=True) as witness:
@@ -148,29 +146,29 @@ def test_starts_again_after_the_server_itself_was_killed(home: Path) -> None:
             with pytest.raises(psycopg.OperationalError):
                 list(witness.notifies(timeout=WAIT_S))
         server.start()
-        assert answers(server)
-
-
-def test_a_path_with_spaces_quotes_and_percent(home: Path) -> None:
-    with EmbeddedServer(home / "my robot's 100% café") as server:
-        assert answers(server)
+        with psycopg.connect(server.url) as connection:
+            assert connection.execute("SELECT n FROM kept").fetchone() == (7,)
 
 
 def test_a_server_that_cannot_start_quotes_its_log(home: Path) -> None:
     with EmbeddedServer(home) as server:
-        pass
-    (server.data / "postgresql.auto.conf").write_text("no_such_setting = 1\n")
-    with pytest.raises(EmbeddedServerError, match="no_such_setting") as caught:
-        server.start()
+        settings = server.data / "postgresql.auto.conf"
+    right = settings.read_text()
+    settings.write_text("no_such_setting = 1\n")
+    try:
+        with pytest.raises(EmbeddedServerError, match="no_such_setting") as caught:
+            server.start()
+    finally:
+        settings.write_text(right)
     assert "\n" not in str(caught.value)
     assert "--db" in str(caught.value)
     assert not server.running
 
 
-def test_a_home_that_cannot_be_made(home: Path) -> None:
-    (home / "file").touch()
+def test_a_home_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
     with pytest.raises(EmbeddedServerError, match="MAPFOLD_HOME"):
-        EmbeddedServer(home / "file" / "below").start()
+        EmbeddedServer(tmp_path / "file" / "below").start()
 
 
 def test_a_missing_library_is_not_taken_for_a_server_that_went_away(

@@ -36,7 +36,7 @@ EVIDENCE = Settings(fusion="evidence")
 
 @pytest.fixture(scope="module")
 def documents() -> list[dict[str, Any]]:
-    return flickering_house("a", 240) + flickering_house("b", 60)
+    return flickering_house("a", rounds(240, 140)) + flickering_house("b", rounds(60, 40))
 
 
 @pytest.fixture
@@ -124,8 +124,8 @@ def test_a_check_names_an_estimate_that_was_changed(
 def test_a_tail_starts_from_a_snapshot(log: Path, one_database: Targets) -> None:
     with LogReader(log) as reader:
         cache = SnapshotCache(log, reader.log_id, EVIDENCE, lambda _: None)
-        cache.keep(*fold_log(reader, EVIDENCE, Offset(150), keep_embeddings=False))
-    rebuild(log, one_database, EVIDENCE, until=Offset(180))
+        cache.keep(*fold_log(reader, EVIDENCE, Offset(100), keep_embeddings=False))
+    rebuild(log, one_database, EVIDENCE, until=Offset(120))
     folded: list[int] = []
     tail(log, one_database, EVIDENCE, once=True, on_fold=folded.append)
     assert parsed(graph_rows(one_database.graph_url)) == expected_graph(view_of(log))

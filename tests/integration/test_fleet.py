@@ -26,6 +26,7 @@ from tests.fleets import extend, fleet_databases, write_sites, wrong_rows
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.servers import furnish
 
+EVENTS = 30  # of each site
 NAMES = ['a\'; DROP "x" %s', "büro", "lab"]
 
 
@@ -35,7 +36,7 @@ class Fleet:
     def __init__(self, folder: Path, server: EmbeddedServer, template: str) -> None:
         self.sites, self.server, self.template = folder / "sites", server, template
         self.run = Commands.in_folder(folder, MAPFOLD_DB=template)
-        write_sites(self.sites, NAMES, 60)
+        write_sites(self.sites, NAMES, EVENTS)
         self.first = self.run("fleet", "replay", self.sites, "--jobs", "1", "--json")
 
     def url(self, name: str) -> str:
@@ -58,7 +59,7 @@ def test_a_replay_makes_the_database_of_each_site_equal_to_its_log(fleet: Fleet)
     for entry in first["sites"]:
         assert entry["outcome"] == "rebuilt"
         assert entry["attempts"] == 1
-        assert entry["report"]["events"] == entry["events"] == 60
+        assert entry["report"]["events"] == entry["events"] == EVENTS
         assert wrong_rows(fleet.sites / entry["site"], fleet.url(entry["site"])) == 0
     single = fleet.run("replay", fleet.sites / "lab", "--db", fleet.url("lab"), "--json").json
     report = first["sites"][2]["report"]
@@ -141,7 +142,7 @@ def test_status_is_a_table_of_all_sites(fleet: Fleet, tmp_path: Path) -> None:
     said = fleet.run("fleet", "status", listed, "--jobs", "1", code=3)
     head, *rows = [line.split() for line in said.out.splitlines()]
     assert head[:3] == ["site", "state", "events"]
-    assert rows[0][:3] == ["lab", "ok", "60"]
+    assert rows[0][:3] == ["lab", "ok", str(EVENTS)]
     assert rows[0][-2:] == ["idle", "idle"]
     assert rows[1][:3] == ["new", "findings", "20"]
     assert rows[1][-2:] == ["missing", "missing"]
@@ -171,7 +172,7 @@ def _without_ages(entry: dict[str, Any]) -> dict[str, Any]:
 
 def test_verify_reads_all_logs(fleet: Fleet, tmp_path: Path) -> None:
     said = fleet.run("fleet", "verify", fleet.sites, "--jobs", "1")
-    assert "3 sites: 180 events," in said.err
+    assert f"3 sites: {3 * EVENTS} events," in said.err
     assert said.err.endswith(": all good\n")
 
     damaged = write_log(tmp_path / "sites" / "damaged", walk(10))
@@ -186,7 +187,7 @@ def test_verify_reads_all_logs(fleet: Fleet, tmp_path: Path) -> None:
 
 
 def test_relocalize_ranks_the_sites(fleet: Fleet, tmp_path: Path) -> None:
-    keyframe = next(k for k in walk(60, seed=2) if len(k["detections"]) == 2)
+    keyframe = next(k for k in walk(EVENTS, seed=2) if len(k["detections"]) == 2)
     query = tmp_path / "query.json"
     query.write_text(json.dumps(keyframe))
     lines = [f"{name} {fleet.sites / name}" for name in NAMES[1:]]

@@ -23,13 +23,14 @@ from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from tests.chaos.log_killer import LONGEST_LIFE_S, lives
 from tests.fixtures_log import flip
-from tests.thorough import THOROUGH, mostly_slow
+from tests.thorough import THOROUGH
 from tests.verbatim import mixed_events
 
 SEED = 20260324
 
 
-@pytest.mark.parametrize(("fsync", "times"), mostly_slow([("5ms", 3), ("always", 3)]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("fsync", "times"), [("5ms", 3), ("always", 3)])
 def test_a_few_kills(log_path: Path, fsync: str, times: int) -> None:
     _kill(log_path, fsync, times)
 
