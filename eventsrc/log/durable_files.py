@@ -52,6 +52,14 @@ def sync_file(fd: int) -> None:
     getattr(os, "fdatasync", os.fsync)(fd)
 
 
+def drop_cached(fd: int, start: int, end: int) -> None:
+    """Let the system forget the bytes from ``start`` to ``end`` of a file that is synced, so that
+    their memory is used again. They stay on the disk. Nothing happens where a system has no such
+    call (macOS)."""
+    if hasattr(os, "posix_fadvise"):
+        os.posix_fadvise(fd, start, end - start, os.POSIX_FADV_DONTNEED)
+
+
 def sync_directory(path: Path) -> None:
     """Make names that were created, renamed or deleted in ``path`` survive a power cut."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)

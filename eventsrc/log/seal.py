@@ -29,7 +29,13 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
-from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
+from .durable_files import (
+    drop_cached,
+    replace_durably,
+    sync_file,
+    unlink_quietly,
+    write_all,
+)
 from .format import (
     ACTIVE,
     SEALED,
@@ -198,16 +204,19 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
     return sha256
 
 
-def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) -> str:
-    """`seal`, but only write and sync the file as ``temporary``, without renaming it."""
+def write_sealed(
+    plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path, *, cached: bool = True
+) -> str:
+    """`seal`, but only write and sync the file as ``temporary``, without renaming it. Unless it is
+    to stay ``cached``, what is synced leaves the system's page cache."""
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
-        builder = _Builder(fd, plan)
+        builder = _Builder(fd, plan, cached=cached)
         for body in rechunk(bodies):
             builder.add_chunk(body)
         builder.check_end(plan)
         builder.finish()
-        sync_file(fd)
+        builder.sync()
     except BadRecord as error:
         unlink_quietly(temporary)
         raise LogDamaged(f"{segment_path(plan.log, plan.base, ACTIVE)}: {error}") from None
@@ -222,8 +231,9 @@ def write_sealed(plan: SegmentPlan, bodies: Iterable[bytes], temporary: Path) ->
 class _Builder:
     """Writes a sealed file front to back and collects position, checksums and index."""
 
-    def __init__(self, fd: int, plan: SegmentPlan) -> None:
+    def __init__(self, fd: int, plan: SegmentPlan, *, cached: bool) -> None:
         self._fd = fd
+        self._cached = cached
         self._at = 0
         self._synced = 0
         self._crc = 0
@@ -252,6 +262,13 @@ class _Builder:
         self._crc = crc32(data, self._crc)
         self.sha256.update(data)
 
+    def sync(self) -> None:
+        """Bring what is written to the disk."""
+        sync_file(self._fd)
+        if not self._cached:
+            drop_cached(self._fd, self._synced, self._at)
+        self._synced = self._at
+
     def add_chunk(self, body: ChunkBody) -> None:
         """Write a chunk and its message indexes."""
         schemas, channels = _mcap.definitions(body.definitions)
@@ -266,8 +283,7 @@ class _Builder:
             self._counts[channel_id] += len(flat) // 2
         self._write_chunk(body.body, first_ns, last_ns, entries)
         if self._at - self._synced >= _SYNC_BYTES:
-            sync_file(self._fd)
-            self._synced = self._at
+            self.sync()
 
     def _write_chunk(
         self, body: bytes, first_ns: int, last_ns: int, entries: dict[int, list[int]]

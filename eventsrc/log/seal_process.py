@@ -7,6 +7,10 @@ the lock of the log, gives the file its name. When the writer dies, the process 
 segment, cannot send its answer, deletes its file and ends. So no process of a dead writer changes a
 log that the next writer holds.
 
+What is synced of a sealed segment leaves the page cache. A long recording would otherwise fill the
+memory with segments that nobody reads soon, and each event would take 3 to 7 µs more, because new
+memory is slower to write to than memory just used.
+
 One JSON document a line: a plan goes in, ``{"sha256": …, "temporary": …}`` or an error comes out.
 
 The process is in a process group of its own, so Ctrl-C in a terminal reaches the writer only, which
@@ -119,7 +123,8 @@ def _answer(question: dict[str, Any], temporary: Path) -> dict[str, Any]:
     plan = SegmentPlan(**{**question, "log": Path(question["log"])})
     try:
         file = ActiveFile(segment_path(plan.log, plan.base, ACTIVE), plan.base)
-        sha256 = write_sealed(plan, (file.read_chunk(chunk) for chunk in file.chunks), temporary)
+        bodies = (file.read_chunk(chunk) for chunk in file.chunks)
+        sha256 = write_sealed(plan, bodies, temporary, cached=False)
     except LogDamaged as error:
         return {"damaged": str(error)}
     except OSError as error:

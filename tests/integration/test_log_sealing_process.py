@@ -1,6 +1,7 @@
 """Sealing in a process of its own: the same bytes as in the writer, and no log depends on it."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -53,6 +54,35 @@ def test_it_writes_the_bytes_that_the_writer_would_write(tmp_path: Path) -> None
     assert seal(plan, (file.read_chunk(chunk) for chunk in file.chunks)) == sha256
     assert sealed.read_bytes() == by_process
     assert {p.name for p in plan.log.iterdir()} == {"lock", sealed.name, active.name}
+
+
+def is_cached(path: Path) -> bool:
+    """Whether the first bytes of a file are in the system's page cache."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        return os.preadv(fd, [bytearray(1)], 0, os.RWF_NOWAIT) == 1
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(fd)
+
+
+@pytest.mark.skipif(not hasattr(os, "RWF_NOWAIT"), reason="only Linux tells what is cached")
+def test_what_it_has_sealed_leaves_the_page_cache(tmp_path: Path) -> None:
+    plan = killed_writer(tmp_path / "log", events=400)  # more than a page is sealed of them
+    active = tmp_path / "log" / f"{FIRST_SEGMENT}.mcap.active"
+    assert is_cached(active)
+    process = SealingProcess()
+    process.seal(plan)
+    process.close()
+    sealed = tmp_path / "log" / f"{FIRST_SEGMENT}.mcap"
+    assert sealed.stat().st_size > os.sysconf("SC_PAGE_SIZE")
+    fd = os.open(active, os.O_RDWR)
+    os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
+    os.close(fd)
+    if is_cached(active):
+        pytest.skip("this file system keeps files in memory")
+    assert not is_cached(sealed)
 
 
 def test_it_starts_where_the_module_path_has_entries_that_python_passes_over(
