@@ -11,6 +11,8 @@ which has the same cells in a hundredth of the bytes.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import msgspec
+
 from eventsrc.transport.config import key_fault
 
 from .envelope import Offset, has_keyframe_id
@@ -31,7 +33,7 @@ class NewMap(NamedTuple):
 Result = CheckedEnvelope | NewMap | Rejected
 
 
-class Checked(NamedTuple):
+class Checked(msgspec.Struct, frozen=True, gc=False):
     """The version of a payload, and the result of its validation."""
 
     version: int
@@ -73,7 +75,7 @@ def append_payload(
 
 def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
     """The event of a payload that came under ``key`` and was checked."""
-    version, result = checked
+    version, result = checked.version, checked.result
     if isinstance(result, Rejected):
         return rejected_event(key, payload, result.reason, logged_ns)
     if isinstance(result, NewMap):
@@ -98,7 +100,7 @@ def check_payloads(
     two at a time is best, so that what is decoded of them fits the processor's cache.
     """
     pending = [
-        PendingEvent(Offset(offset), key, logged_ns, payload, version or detect_version(payload))
+        PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))
         for offset, (key, payload) in enumerate(messages, first)
     ]
     results: list[CheckedEnvelope | NewMap | Rejected] = [
@@ -109,9 +111,9 @@ def check_payloads(
     for index, event in enumerate(pending if faults else ()):
         if event.key in faults:
             results[index] = Rejected(f"key {abbreviate(event.key)} {faults[event.key]}")
-    for index, event in enumerate(pending):
-        if isinstance(results[index], Rejected) and event.key not in faults:
-            results[index] = _as_map(event, max_bytes) or results[index]
+    for index, result in enumerate(results):
+        if isinstance(result, Rejected) and pending[index].key not in faults:
+            results[index] = _as_map(pending[index], max_bytes) or result
     return [Checked(event.version, result) for event, result in zip(pending, results, strict=True)]
 
 

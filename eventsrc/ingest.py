@@ -10,7 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
-from typing import Any, Final, NamedTuple, Protocol, cast
+from typing import Any, Final, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -74,7 +74,7 @@ class Rejected(msgspec.Struct, frozen=True, gc=False):
     reason: str
 
 
-class CheckedEnvelope(NamedTuple):
+class CheckedEnvelope(msgspec.Struct, frozen=True, gc=False):
     """What stays of a valid envelope whose bytes are kept."""
 
     run_id: RunId
@@ -154,6 +154,8 @@ def check_all(
 
 def _have_vectors(detections: Sequence[_Embedded]) -> bool:
     """Whether all embeddings that there are can be decoded; together those of one dimension."""
+    if _decode_uniform(detections) is not None:  # the usual case
+        return True
     by_dim: defaultdict[int | None, list[_Embedded]] = defaultdict(list)
     for detection in detections:
         if detection.embedding is not None:

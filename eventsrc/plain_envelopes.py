@@ -111,12 +111,14 @@ def _is_plain(envelope: PlainEnvelope) -> bool:
     covariance = envelope.pose_covariance
     if covariance is not None and covariance_fault(covariance) is not None:
         return False
+    ids: list[str] = []
     for detection in envelope.detections:
         if not detection.class_name.isprintable():
             return False
-        model = detection.embedding_model
+        model, det_id = detection.embedding_model, detection.det_id
         if model is not None and not model.isprintable():
             return False
-    ids = [d.det_id for d in envelope.detections if d.det_id is not None]
+        if det_id is not None:
+            ids.append(det_id)
     # An id that is given may be the same as another, or as one generated for a detection without.
     return not ids or (len(set(ids)) == len(envelope.detections) and all(map(str.isprintable, ids)))

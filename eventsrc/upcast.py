@@ -23,13 +23,14 @@ To change the envelope: raise ENVELOPE_VERSION, add the upcaster from the versio
 import json
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
+
+import msgspec
 
 from .envelope import (
     ENVELOPE_VERSION,
     MAX_DETECTIONS,
     Detection,
-    Offset,
     contains_non_finite,
     has_evidence,
     has_floor,
@@ -69,10 +70,10 @@ Upcaster = Callable[[Any, VersionedEvent], Any]
 """From the JSON value of one version to that of the next. Raises ValueError if it is not valid."""
 
 
-class PendingEvent(NamedTuple):
+class PendingEvent(msgspec.Struct, frozen=True, gc=False):
     """A payload that is about to be appended, as a `VersionedEvent`."""
 
-    offset: Offset
+    offset: int
     key: str
     stamp_ns: int
     payload: bytes

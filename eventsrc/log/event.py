@@ -10,6 +10,8 @@ import json
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import msgspec
+
 from eventsrc.envelope import ENVELOPE_VERSION, Offset
 from eventsrc.system_events import is_system_key
 
@@ -72,7 +74,7 @@ class VerbatimEvent(Event):
         return False
 
 
-class NewEvent(NamedTuple):
+class NewEvent(msgspec.Struct, frozen=True, gc=False):
     """An event to be appended; the log gives it an offset."""
 
     key: str

@@ -107,11 +107,13 @@ class GroupBuilder:
         ids, size = self._ids, self._bytes
         first_ns, last_ns = self._first_ns, self._last_ns
         parts: list[bytes] = []
-        for key, payload, logged_ns, stamp_ns, version, form in islice(events, start, start + room):
-            channel = ids.get((key, version, form)) or self._add_channel(key, version, form)
+        for event in islice(events, start, start + room):
+            which = event.key, event.version, event.format
+            channel = ids.get(which) or self._add_channel(*which)
+            payload, logged_ns = event.payload, event.logged_ns
             length = len(payload)
-            parts.append(encode_message_head(channel, sequence, logged_ns, stamp_ns, length))
-            parts.append(payload)
+            head = encode_message_head(channel, sequence, logged_ns, event.stamp_ns, length)
+            parts += (head, payload)
             sequence += 1
             if logged_ns < first_ns:
                 first_ns = logged_ns

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+import msgspec
+
 from eventsrc.envelope import ENVELOPE_VERSION
 from eventsrc.log import MessageFormat
 from eventsrc.ros.bridge_keys import key_of, type_of_token
@@ -125,7 +127,8 @@ class Bridge:
         self._learn()
         taken = [*self._release(logged_ns, check)] if self._held else []
         waiting = {held.key for held in self._held}
-        for key, payload, _ in messages:
+        for message in messages:
+            key, payload = message.key, message.payload
             if key not in self._topics:  # a key expression that a publisher made up
                 self.unknown_keys += 1
                 continue
@@ -204,4 +207,6 @@ def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]
         yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
     else:
         for message in check([Received(derived.key, derived.payload)]):
-            yield message._replace(sha256="")  # no robot sent it, so none is answered
+            yield msgspec.structs.replace(
+                message, sha256=""
+            )  # no robot sent it, so none is answered

@@ -7,7 +7,9 @@ came.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from typing import Final
+
+import msgspec
 
 from eventsrc.append import NewMap, check_payloads, map_event, rejected_event
 from eventsrc.crops import (
@@ -39,7 +41,7 @@ _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
 """Fewer are checked at a time from this size on, since all that is decoded is held at once."""
 
 
-class CheckedMessage(NamedTuple):
+class CheckedMessage(msgspec.Struct, frozen=True, gc=False):
     """A message, and what the writer thread needs of the envelope in it. A map is already the
     event that it becomes, under its key; from the network nothing else can come under that.
 
@@ -61,14 +63,12 @@ class CheckedMessage(NamedTuple):
 
     def event(self, logged_ns: int) -> NewEvent:
         """The event to append."""
-        key, payload, version, refusal, _, _, stamp_ns, _, form = self
-        if refusal is not None:
-            return rejected_event(key, payload, refusal.reason, logged_ns)
-        if key == MAP_KEY:
-            return map_event(payload, logged_ns)
-        return NewEvent(
-            key, payload, logged_ns, logged_ns if stamp_ns is None else stamp_ns, version, form
-        )
+        if self.refusal is not None:
+            return rejected_event(self.key, self.payload, self.refusal.reason, logged_ns)
+        if self.key == MAP_KEY:
+            return map_event(self.payload, logged_ns)
+        stamp_ns = logged_ns if self.stamp_ns is None else self.stamp_ns
+        return NewEvent(self.key, self.payload, logged_ns, stamp_ns, self.version, self.form)
 
 
 class Batch:
@@ -161,12 +161,14 @@ class Checker:
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
         """Check messages together."""
         checked = check_payloads(
-            [(key, payload) for key, payload, _ in messages],
+            [(message.key, message.payload) for message in messages],
             first=self._writer.next_offset,
             logged_ns=self._writer.now_ns(),
             max_bytes=self._max_payload_bytes,
         )
-        for (key, payload, _), (version, result) in zip(messages, checked, strict=True):
+        for message, known in zip(messages, checked, strict=True):
+            key, payload = message.key, message.payload
+            version, result = known.version, known.result
             if isinstance(result, Rejected):
                 refusal = Refusal.of(payload, result.reason)
                 yield CheckedMessage(key, payload, version, refusal)

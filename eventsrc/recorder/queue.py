@@ -104,16 +104,12 @@ MAX_WAIT_S: Final = 1.0
 """How long a message may wait for room: longer than a sync takes, much less than five seconds."""
 
 
-class BridgedMessage(Received):
+class BridgedMessage(Received, frozen=True, gc=False):
     """A message of ROS that a bridge sent, in CDR."""
 
-    __slots__ = ()
 
-
-class CropMessage(Received):
+class CropMessage(Received, frozen=True, gc=False):
     """The JPEG of a detection, under ``PREFIX/DET_ID`` (`eventsrc.crops`)."""
-
-    __slots__ = ()
 
 
 class MessageQueue:

@@ -175,10 +175,10 @@ class Recorder:
         self._queue.put_all([m for m in messages if not m.key.startswith(ignored)])
 
     def _receive_bridged(self, message: Received) -> None:
-        self._queue.put(BridgedMessage(*message))
+        self._queue.put(BridgedMessage(message.key, message.payload, message.number))
 
     def _receive_crop(self, message: Received) -> None:
-        self._queue.put(CropMessage(*message))
+        self._queue.put(CropMessage(message.key, message.payload, message.number))
 
     def _receive_edit(self, query: Query) -> None:
         fault = fault_of(query)

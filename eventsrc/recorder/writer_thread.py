@@ -25,7 +25,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, cast
 
 from pydantic import ValidationError
 
@@ -293,7 +293,8 @@ class WriterThread:
     def _append_messages(self, messages: list[CheckedMessage], logged_ns: int) -> None:
         events = [message.event(logged_ns) for message in messages]
         # Before appending: if that fails in the middle, what was synced by then still counts.
-        offsets = map(Offset, itertools.count(self._writer.next_offset))
+        first = self._writer.next_offset
+        offsets = cast("Iterator[Offset]", itertools.count(first))  # no call for each event
         self._unsynced.extend(zip(offsets, messages, strict=False))
         self._in_progress = 0
         self._writer.append_all(events)

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+import msgspec
 import zenoh
 
 from eventsrc.errors import TransportError
@@ -38,7 +39,7 @@ class SequenceNumber(NamedTuple):
     value: int
 
 
-class Received(NamedTuple):
+class Received(msgspec.Struct, frozen=True, gc=False):
     """One message, with its publisher's number if it has one.
 
     Zenoh's timestamp is not read: it may be missing, repeated or out of order.
@@ -103,6 +104,7 @@ class Publisher:
     def __init__(self, session: zenoh.Session, key: str) -> None:
         check_key_length(key)
         self.key = key
+        self._not_sent = transport_errors(f"key {key!r}: not sent")
         self.departures = 0
         """How many times the last subscriber has left."""
         with transport_errors(f"key {key!r} cannot be published to"):
@@ -118,7 +120,7 @@ class Publisher:
 
     def put(self, payload: bytes) -> None:
         """Send. Returns when Zenoh has accepted the message; it may not have been received yet."""
-        with transport_errors(f"key {self.key!r}: not sent"):
+        with self._not_sent:
             self._sender.put(payload)
 
     @property

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from eventsrc.errors import MapfoldError, MisuseError, TransportError
 from eventsrc.transport.declarations import CHANNEL_SIZE, _receive_batches
@@ -159,7 +160,7 @@ def test_a_closed_subscription_receives_nothing(connected: Sessions) -> None:
     arrived: queue.SimpleQueue[Received] = queue.SimpleQueue()
     subscriber, publisher = connected(), connected().publisher("tb/detections")
     closed = subscriber.subscribe("tb/*", arrived.put)
-    subscriber.subscribe("tb/detections", lambda message: arrived.put(message._replace(key="open")))
+    subscriber.subscribe("tb/detections", lambda message: arrived.put(replace(message, key="open")))
     closed.close()
     assert publisher.wait_for_subscriber(DEADLINE_S)
     publisher.put(b"x")
