@@ -165,6 +165,7 @@ def test_the_picture_is_there(played: Played) -> None:
     assert picture.stat().st_size > 50_000
 
 
+@pytest.mark.slow
 def test_the_commands_it_ends_with_work_as_printed(played: Played, tmp_path: Path) -> None:
     start = next(i for i, line in enumerate(played.story) if "Go on with it" in line)
     commands = [line.strip() for line in played.story[start + 1 :]]

@@ -77,6 +77,7 @@ def test_the_digest_is_the_logs_own(mapfold: Commands, awkward_log: Path) -> Non
     assert mapfold("state", awkward_log, "--digest").out == digest
 
 
+@pytest.mark.slow
 def test_a_past_state_is_the_state_of_a_shorter_log(mapfold: Commands, awkward_log: Path) -> None:
     payloads = awkward_payloads()
     for count in (0, 1, 5, 17, 20, len(payloads)):

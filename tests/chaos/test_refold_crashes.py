@@ -68,6 +68,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold(
     assert found["new"] >= 1
 
 
+@pytest.mark.slow
 def test_a_tail_killed_at_any_statement_of_a_refold_that_keeps_the_vectors(
     log: Path, one_database: Targets
 ) -> None:
@@ -78,6 +79,7 @@ def test_a_tail_killed_at_any_statement_of_a_refold_that_keeps_the_vectors(
     assert found["steps"] > 80
 
 
+@pytest.mark.slow
 def test_a_tail_killed_between_any_two_statements_while_places_are_named(
     log: Path, two_databases: Targets
 ) -> None:

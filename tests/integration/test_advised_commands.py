@@ -201,6 +201,7 @@ def test_settings_without_a_log_are_advised_with_the_settings(run: Commands) -> 
     assert words == ["replay", "LOG", *OWN]
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_what_db_check_advises_repairs_under_the_same_settings_and_databases(
     run: Commands, one_database: Targets

@@ -43,6 +43,7 @@ def asked(calls: Sequence[Any], workers: int, said: list[str] | None = None) -> 
     return call_all(calls, workers, "asking", "questions", note)
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("workers", mostly_slow([2, 1, 3]))
 def test_results_are_in_the_order_of_the_calls(started: list[Any], workers: int) -> None:
@@ -52,6 +53,7 @@ def test_results_are_in_the_order_of_the_calls(started: list[Any], workers: int)
     assert said == []
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_each_process_calls(started: list[Any]) -> None:
     pids = asked([os.getpid] * COUNT, 2)
@@ -82,6 +84,7 @@ def test_a_killed_process_costs_nothing_but_time(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("workers", [0, 2])
 def test_the_error_of_a_call_is_raised_and_ends_the_processes(

@@ -183,6 +183,7 @@ def test_another_log_has_no_lag(mapfold: Commands, log: Path) -> None:
     assert "the vectors there were made from log" in said.err
 
 
+@pytest.mark.slow
 def test_a_replay_prints_what_it_left_out(mapfold: Commands) -> None:
     first = envelope(0, detections=[detection("cup", [1.0] * 8)])
     others = walk(6, first=1, dim=16, detections=3)
@@ -209,6 +210,7 @@ def test_a_complete_replay_prints_no_left_out_line(mapfold: Commands, log: Path)
     assert "left out" not in mapfold("replay", log).err
 
 
+@pytest.mark.slow
 def test_db_stop_says_whether_anything_ran(own_server: Commands) -> None:
     assert own_server("db", "stop").err == "it was not running\n"
     own_server("db", "start")
@@ -240,6 +242,7 @@ def read_screen(screen: int) -> str:
     return shown.decode()
 
 
+@pytest.mark.slow
 def test_a_tail_that_catches_up_shows_a_bar_on_a_terminal(mapfold: Commands, log: Path) -> None:
     ours, theirs = pty.openpty()
     running = subprocess.Popen(

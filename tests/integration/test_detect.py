@@ -206,6 +206,7 @@ def test_a_stream_on_stdin(stage: Stage, tmp_path: Path) -> None:
     assert stamps == [1777885200.0, 1777885200.5, 1777885201.0]
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_away_costs_nothing(
     stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
 ) -> None:
@@ -269,6 +270,7 @@ def test_a_crop_is_kept_in_a_size_that_a_log_takes() -> None:
     assert len(encode_jpeg(worst)) < MAX_CROP_BYTES
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_a_picture_of_8k(stage: Stage, tmp_path: Path) -> None:
     """33 million pixels are a picture like any other; 100 million are refused."""

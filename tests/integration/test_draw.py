@@ -39,6 +39,7 @@ def test_a_picture_of_any_point_with_other_settings(log: Path, tmp_path: Path) -
     assert "ε 0.75 m, min_samples 8" in part.read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_a_picture_by_evidence_shows_where_objects_stand(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.svg"
     arguments = ("--at", "90", "--set", "fusion=evidence", "--house", "7")

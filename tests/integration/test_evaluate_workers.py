@@ -17,7 +17,7 @@ from tests.commands import Commands
 from tests.integration.test_evaluate_command import save
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
-from tests.thorough import THOROUGH
+from tests.thorough import THOROUGH, rounds
 
 EVIDENCE = Settings(fusion="evidence", places="rooms")
 
@@ -27,9 +27,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs ``a``, ``b`` of a building and ``x`` of another, with truth."""
     found = tmp_path_factory.mktemp("workers")
     building, stranger = Building(31, things=40), Building(32, things=40)
-    save(found, "a", drive(building, "a", 1, 50))
-    save(found, "b", drive(building, "b", 2, 12))
-    save(found, "x", drive(stranger, "x", 3, 12))
+    save(found, "a", drive(building, "a", 1, rounds(50, 30)))
+    save(found, "b", drive(building, "b", 2, rounds(12, 6)))
+    save(found, "x", drive(stranger, "x", 3, rounds(12, 6)))
     return found
 
 
@@ -110,6 +110,7 @@ def _cut(keyframe: Keyframe, dimension: int) -> Keyframe:
     return replace(keyframe, accepted=cut)
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_scores_of_several_maps_are_those_of_one_process(
     folder: Path, used: list[int], capsys: pytest.CaptureFixture[str]

@@ -93,6 +93,7 @@ def test_bisect_counts_objects_of_a_class_as_they_are_called(mapfold: Commands, 
             assert turn[side] == {"object_count('cup')": classes["cup"]}
 
 
+@pytest.mark.slow
 def test_whatif_compares_both_rules_and_names_settings_by_group(
     mapfold: Commands, log: Path
 ) -> None:

@@ -15,6 +15,7 @@ from projections.errors import DatabaseError
 from projections.settings import Settings
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
+from tests.thorough import mostly_slow
 
 SETTINGS = Settings()
 LABELS = "SELECT create_vlabel('semantic_map', 'Robot'), create_elabel('semantic_map', 'SAW')"
@@ -80,7 +81,7 @@ def test_rights_on_an_empty_graph_are_kept(log: Path, one_database: Targets) -> 
         assert "=U/" in str(row.fetchone())
 
 
-@pytest.mark.parametrize("act", [by_replay, by_tail])
+@pytest.mark.parametrize("act", mostly_slow([by_replay, by_tail]))
 @pytest.mark.parametrize(
     "statements",
     [

@@ -35,6 +35,7 @@ def test_a_good_log(run: Commands) -> None:
     assert "nothing to recover" in run("log", "recover", "L").err
 
 
+@pytest.mark.slow
 def test_a_rotten_log(run: Commands) -> None:
     flip(segment(run), 500)
     findings = run("log", "verify", "L", "--json", code=3).json["findings"]

@@ -80,6 +80,7 @@ def test_synced_events_stay(log_path: Path, limit: int, fsync: str) -> None:
     assert [e.payload for e in read_log(log_path)][-1] == b"after"
 
 
+@pytest.mark.slow
 def test_a_failed_seal_loses_nothing(log_path: Path) -> None:
     """Compressed, the segment is larger than the limit: the active file stays and is read."""
     program = """

@@ -65,6 +65,7 @@ def test_rotation_under_load(log_path: Path) -> None:
                 assert (event.offset, event.payload) == (offset, payload_at(offset))
 
 
+@pytest.mark.slow
 def test_a_tail_of_another_process(log_path: Path) -> None:
     with LogWriter(log_path):
         pass  # so that there is a log to follow

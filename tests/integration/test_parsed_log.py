@@ -119,6 +119,7 @@ def test_random_logs_damaged_or_not(tmp_path: Path) -> None:
                 assert gathered(parsed.stretches()) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("kind", mostly_slow(["a byte", "a segment", "no file"]))
 def test_damage_is_named_as_by_one_process(tmp_path: Path, kind: str) -> None:
@@ -138,6 +139,7 @@ def test_damage_is_named_as_by_one_process(tmp_path: Path, kind: str) -> None:
         assert gathered(parsed.stretches()) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("killed", mostly_slow([1, 2]))
 def test_a_killed_process_costs_nothing_but_time(log: Path, killed: int) -> None:
@@ -227,6 +229,7 @@ def test_events_that_no_slot_has_room_for(
     assert 0 < len(here) < 30
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_a_log_that_grows_and_is_sealed_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "log"

@@ -69,6 +69,7 @@ def test_a_preset_is_an_alternative_of_whatif(mapfold: Commands, log: Path) -> N
     assert "places=rooms" in table
 
 
+@pytest.mark.slow
 def test_state_and_replay_warn_and_name_the_preset(log: Path, pg_url: str) -> None:
     mapfold = Commands.in_folder(log.parent, MAPFOLD_DB=pg_url)
     told = (

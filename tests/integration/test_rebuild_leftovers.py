@@ -66,6 +66,7 @@ def test_the_next_rebuild_drops_what_the_server_did_not(
     assert all_rows(one_database) == rows
 
 
+@pytest.mark.slow
 def test_a_rebuild_waits_for_a_drop_only_before_its_swap(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     wait_for_drops(one_database)
@@ -93,6 +94,7 @@ def test_a_foreign_schema_under_our_name_is_refused(
     assert left_over(pg) == {"mapfold_old"}
 
 
+@pytest.mark.slow
 def test_an_error_after_the_swap_says_that_the_new_map_is_in_place(
     log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:

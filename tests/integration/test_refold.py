@@ -349,6 +349,7 @@ def test_status_tells_how_far_a_refold_is(
     assert [(s.condition, s.refold_done) for s in after.sinks] == [("idle", None)] * 2
 
 
+@pytest.mark.slow
 def test_a_projection_under_other_corrections_is_reported_and_refolded(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
 ) -> None:
@@ -483,6 +484,7 @@ def test_a_stopped_refold_leaves_the_old_map(
     assert all_rows(one_database) == fresh_rows(log, third_database)
 
 
+@pytest.mark.slow
 def test_checkpoints_of_an_older_version_are_used(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
 ) -> None:

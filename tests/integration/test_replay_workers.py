@@ -22,7 +22,7 @@ from tests.integration.test_parsed_log import pids
 from tests.logs import append_raw, walk, write_log
 from tests.random_logs import write_random_log
 from tests.rows import all_rows
-from tests.thorough import THOROUGH
+from tests.thorough import THOROUGH, rounds
 
 SETTINGS = Settings(embedding_dim=8)
 EVIDENCE = Settings(embedding_dim=8, fusion="evidence", places="rooms")
@@ -64,7 +64,7 @@ def test_rows_and_reports_are_those_of_one_process(
     tmp_path: Path, two_databases: Targets, settings: Settings
 ) -> None:
     log = write_random_log(tmp_path / "log", 7, 400)
-    for until in (None, 217):
+    for until in (None, 217)[: rounds(2, 1)]:
         alone = rebuild(log, two_databases, settings, until=until, workers=0)  # type: ignore[arg-type]
         rows = all_rows(two_databases)
         assert rows[1]
@@ -79,6 +79,7 @@ def test_rows_and_reports_are_those_of_one_process(
     assert all_rows(two_databases) == tailed
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_errors_are_those_of_one_process(tmp_path: Path, one_database: Targets) -> None:
     log = write_log(tmp_path / "log", walk(150))

@@ -146,6 +146,7 @@ def _near(shown: list[list[float]], expected: list[tuple[float, float]]) -> None
         assert math.isclose(y, to_y, abs_tol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_two_recordings_hold_the_same_data(tmp_path: Path) -> None:
     for name in ("a.rrd", "b.rrd"):

@@ -57,6 +57,7 @@ def question() -> bytes:
 HALVES = [b"", b"P", b"POST /relocalize HTTP/1.1\r\nHost: 127.0.0.1\r\n", question()[:-1]]
 
 
+@pytest.mark.slow
 def test_half_open_connections_do_not_block_others(service: Served) -> None:
     held = []
     try:

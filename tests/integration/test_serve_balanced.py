@@ -89,6 +89,7 @@ def test_both_answer_every_question_alike(servers: tuple[int, int], balancer: in
         assert [asked(balancer, path, body) for _ in range(2)] == [one, one]
 
 
+@pytest.mark.slow
 def test_many_clients_at_once_get_the_answers_of_one_server(
     servers: tuple[int, int], balancer: int
 ) -> None:

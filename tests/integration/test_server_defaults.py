@@ -57,6 +57,7 @@ def as_user(url: str, user: str) -> Targets:
     return Targets(theirs, theirs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loader", mostly_slow(["copy", "insert"]))
 def test_pgvector_in_a_schema_of_its_own(
     log: Path, bare: psycopg.Connection, bare_pg_url: str, loader: LoaderName
@@ -179,6 +180,7 @@ def superuser(owned: str) -> Iterator[psycopg.Connection]:
         yield connection
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("superuser")
 def test_an_owner_who_is_no_superuser(log: Path, owned: str) -> None:
     owner = as_user(owned, OWNER)
@@ -193,6 +195,7 @@ def test_an_owner_who_is_no_superuser(log: Path, owned: str) -> None:
     assert names == [("semantic_map",)]
 
 
+@pytest.mark.slow
 def test_a_writer_cannot_change_the_dimension_and_names_who_can(
     tmp_path: Path, superuser: psycopg.Connection, owned: str
 ) -> None:

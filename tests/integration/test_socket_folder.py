@@ -155,6 +155,7 @@ def test_a_removed_folder_is_made_again_under_the_same_name(
         assert data_served(server).samefile(server.data)
 
 
+@pytest.mark.slow
 def test_before_the_first_start_there_is_no_url(home: Path) -> None:
     server = EmbeddedServer(home)
     assert not server.running
@@ -162,6 +163,7 @@ def test_before_the_first_start_there_is_no_url(home: Path) -> None:
         _ = server.url
 
 
+@pytest.mark.slow
 @needs_root
 def test_another_users_folder_and_server_are_left_alone(home: Path, folders: list[Path]) -> None:
     folder = started_once(home, folders)
@@ -175,6 +177,7 @@ def test_another_users_folder_and_server_are_left_alone(home: Path, folders: lis
         assert heard(other, folder / SOCKET) == []
 
 
+@pytest.mark.slow
 def test_a_link_is_not_followed(home: Path, folders: list[Path], tmp_path: Path) -> None:
     folder = started_once(home, folders)
     victim = tmp_path / "victim"
@@ -213,6 +216,7 @@ def test_the_copy_of_a_home_is_a_server_of_its_own(home: Path, folders: list[Pat
         assert data_served(other).samefile(copy / "pg")
 
 
+@pytest.mark.slow
 @needs_root
 def test_clients_do_not_talk_to_another_users_server(
     short_home: Path, folders: list[Path], tmp_path_factory: pytest.TempPathFactory
@@ -245,6 +249,7 @@ def test_a_server_of_another_data_folder_is_refused(
         (server.data / SOCKET).unlink()
 
 
+@pytest.mark.slow
 @needs_root
 def test_another_users_data_folder_is_refused(short_home: Path) -> None:
     with EmbeddedServer(short_home) as server:
@@ -258,6 +263,7 @@ def test_another_users_data_folder_is_refused(short_home: Path) -> None:
     os.chown(server.data, owner, owner)
 
 
+@pytest.mark.slow
 def test_the_url_names_the_user_of_the_server(short_home: Path) -> None:
     with EmbeddedServer(short_home) as server:
         user = parse_qs(urlsplit(server.url).query)["requirepeer"][0]

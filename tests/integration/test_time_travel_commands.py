@@ -157,6 +157,7 @@ def test_whatif(mapfold: InProcess) -> None:
     assert found["alternatives"][1]["places_part_at"] is None
 
 
+@pytest.mark.slow
 def test_whatif_in_several_processes_prints_the_same(mapfold: InProcess) -> None:
     asked = ("whatif", "log", "--grid", "eps_m=0.5,1", "--grid", "min_samples=2,3", "--json")
     documents = [mapfold(*asked, "--processes", count).json for count in ("1", "3")]

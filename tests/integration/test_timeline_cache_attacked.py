@@ -91,6 +91,7 @@ def test_a_kill_while_writing_leaves_nothing_that_is_used(log: Path, right: str)
     assert notes == []
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_many_processes_at_once(log: Path, right: str) -> None:
     with ThreadPoolExecutor(20) as pool:
@@ -156,6 +157,7 @@ def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: i
         assert cache.stripes(timeline.end)[-1].end == timeline.end
 
 
+@pytest.mark.slow
 def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
     with kept_early(), Timeline(log, RULES) as timeline:
         for first in range(EVENTS, EVENTS + 40, 10):
@@ -191,6 +193,7 @@ def test_damage_in_the_log_behind_the_events_asked_for(tmp_path: Path) -> None:
         assert set(was) <= set(kept(log))
 
 
+@pytest.mark.slow
 def test_histories_are_few_and_small(log: Path) -> None:
     """Four choices of settings are kept: those used last."""
     from projections.history.timeline_cache import MOST_KEPT

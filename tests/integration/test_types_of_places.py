@@ -87,6 +87,7 @@ def test_a_name_overrides_the_type(mapfold: Commands, log: Path) -> None:
     assert place["type_probability"] == 1.0
 
 
+@pytest.mark.slow
 def test_query_where_finds_places_by_type_and_by_name(mapfold: Commands, log: Path) -> None:
     def where(what: str) -> Any:
         return mapfold("query", "where", what, "--log", log, "--json").json
@@ -143,6 +144,7 @@ def view_of(log: Path, settings: Settings) -> Any:
         return fold_log(reader, settings)[1]
 
 
+@pytest.mark.slow
 def test_the_live_map_answers_where_the_kitchen_is(
     mapfold: Commands, log: Path, one_database: Targets
 ) -> None:

@@ -112,6 +112,7 @@ def test_estimates_of_anything_are_finite_and_snapshots_go_on(
     assert snapshot(again.map, again.view, "log") == snapshot(whole.map, whole.view, "log")
 
 
+@pytest.mark.slow
 def test_of_very_many_detections_in_a_picture_the_first_fuse() -> None:
     chance = np.random.default_rng(1)
     boxes = chance.uniform(20, 600, 2000).tolist()

@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -86,6 +87,7 @@ def test_equal_settings_change_nothing(documents: list[dict[str, Any]]) -> None:
     assert same.name == "no change"
 
 
+@pytest.mark.slow
 def test_a_long_chain_of_merges_can_be_pickled(tmp_path: Path) -> None:
     """Each place is absorbed by the one founded before it, the last one first: a pickle that went
     from survivor to survivor would go too deep."""

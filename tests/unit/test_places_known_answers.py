@@ -185,6 +185,7 @@ def test_a_year_in_one_room_leaves_nothing_to_count() -> None:
     assert all(not cell.unlinked for cell in places.core_index._cells.values())
 
 
+@pytest.mark.slow
 @pytest.mark.seconds
 def test_the_envelopes_of_two_rooms_with_a_wall_between_stay_short() -> None:
     """Cells 1.6 m apart stay unlinked forever, so every keyframe queries their reach indexes."""
