@@ -7,7 +7,8 @@ but for a floor that is an integer. So the models of `eventsrc.envelope` alone d
 valid; a property test compares the two over texts that are made to tell them apart.
 """
 
-from typing import Annotated, Final
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, Self
 
 import msgspec
 from msgspec import Meta
@@ -31,8 +32,12 @@ _Sigma = Annotated[float, Meta(ge=0.001, le=1000.0)]
 _Pixels = Annotated[float, Meta(ge=1.0, le=1e6)]
 
 
-class _Known(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+class _Known(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, gc=False):
     """An object of known fields."""
+
+    def model_copy(self, *, update: Mapping[str, Any]) -> Self:
+        """As of a model of pydantic."""
+        return msgspec.structs.replace(self, **update)
 
 
 class PlainDetection(_Known, rename={"class_name": "class"}):
@@ -66,7 +71,7 @@ class PlainEnvelope(_Known):
     run_id: _Text
     keyframe_id: _Int64
     timestamp: Annotated[float, Meta(ge=0.0, le=MAX_TIMESTAMP_S)]
-    detections: Annotated[list[PlainDetection], Meta(max_length=MAX_DETECTIONS)]
+    detections: Annotated[tuple[PlainDetection, ...], Meta(max_length=MAX_DETECTIONS)]
     map_x: _Position | None = None
     map_y: _Position | None = None
     map_yaw: float | None = None

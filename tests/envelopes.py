@@ -4,8 +4,10 @@ import base64
 import json
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import BaseModel
 
 MODEL = "ViT-B-32/laion2b_s34b_b79k"
 
@@ -46,3 +48,14 @@ def envelope(
 def payload(document: Any) -> bytes:
     """The bytes that go over the wire."""
     return json.dumps(document, ensure_ascii=False).encode()
+
+
+def fields_of(whole: object) -> Any:
+    """Names and values, to the last bit, of an envelope and of what is in it, model or not."""
+    if isinstance(whole, tuple):
+        return [fields_of(each) for each in whole]
+    if isinstance(whole, BaseModel):
+        return {name: fields_of(getattr(whole, name)) for name in type(whole).model_fields}
+    if isinstance(whole, msgspec.Struct):
+        return {name: fields_of(getattr(whole, name)) for name in whole.__struct_fields__}
+    return repr(whole)

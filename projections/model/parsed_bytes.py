@@ -1,39 +1,60 @@
 """Parsed events as bytes in memory that two processes share.
 
 First the arrays of the vectors, stretch after stretch: float32 as recorded, then the unit vectors
-in int32. After them everything else in the format of `marshal`, which Python reads several times
-as quickly as a pickle, and which holds each float to the last bit. Both processes are of one
-program and of one Python, so nothing is checked when it is read; a log never has these bytes.
+in int32. After them everything else as MessagePack, which holds each float to the last bit and is
+read straight into `PlainEnvelope`s. Both processes are of one program; a log never has these bytes.
 A unit vector's -0.0 in float64 comes back as 0.0, which changes no product and no sum.
 
 An envelope is read without its embeddings' base64: nothing needs it once they are decoded.
 """
 
-import marshal
 from collections.abc import Iterable, Iterator
 from itertools import accumulate, pairwise
-from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Final, NamedTuple, cast
 
 import msgspec
 import numpy as np
-from pydantic import BaseModel
 
-from eventsrc.envelope import Detection, Envelope, EnvelopeCamera, Offset
+from eventsrc.envelope import DetId, Envelope, Offset
 from eventsrc.ingest import Accepted, Rejected, Vector
 from eventsrc.log import Event
+from eventsrc.occupancy_map import OccupancyMap
+from eventsrc.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope
 from eventsrc.system_events import MAP_KEY
 from projections.exact import Units
 from projections.reducers.folded_ids import content_digest
 
 from .parsing import ParsedEvent, parse_events, parse_map
 
-_Record: TypeAlias = tuple[Any, ...]
-"""Of an event: offset, logged_ns, and what was parsed, see `_record`."""
-_Model = TypeVar("_Model", bound=BaseModel)
+
+class _Event(msgspec.Struct, array_like=True, gc=False):
+    """An event. A valid envelope, with what else `Accepted` has of it but its vectors; the bytes
+    of one on `MAP_KEY`; the reason of a refusal; nothing for one that a fold passes over."""
+
+    offset: Offset
+    logged_ns: int
+    envelope: PlainEnvelope | None = None
+    det_ids: tuple[DetId, ...] = ()
+    digest: bytes = b""
+    map: bytes | None = None
+    refusal: str | None = None
+
+
+class _Stretch(msgspec.Struct, array_like=True, gc=False):
+    """Events; of their vectors the dimensions and squared norms, and where their arrays begin."""
+
+    events: list[_Event]
+    dims: list[int | None]
+    norms: list[int | None]
+    at: int
+
+
+_encode: Final = msgspec.msgpack.Encoder().encode
+_decode: Final = msgspec.msgpack.Decoder(list[_Stretch]).decode
 
 
 class Packed(NamedTuple):
-    """Where the marshalled part is; the arrays are before it."""
+    """Where the part in MessagePack is; the arrays are before it."""
 
     at: int
     length: int
@@ -45,19 +66,20 @@ class NoRoom(Exception):
 
 def pack(stretches: Iterable[list[Event]], memory: memoryview) -> Packed:
     """Parse the events and write them. Raises NoRoom."""
-    documents, at = [], 0
+    packed: list[_Stretch] = []
+    at = 0
     for events in stretches:
-        parsed = parse_events(events, fields_only=True)
+        parsed = parse_events(events)
         units = [unit for each in parsed for unit in each.units]
         vectors = [
             v for each in parsed if isinstance(each.parsed, Accepted) for v in each.parsed.vectors
         ]
         dims = [None if vector is None else len(vector) for vector in vectors]
         norms = [None if unit is None else unit[2] for unit in units]
-        records = [_record(one, event) for one, event in zip(parsed, events, strict=True)]
-        documents.append((records, dims, norms, at))
+        found = [_packed(one, event) for one, event in zip(parsed, events, strict=True)]
+        packed.append(_Stretch(found, dims, norms, at))
         at = _write_arrays(vectors, units, memory, at)
-    document = marshal.dumps(documents)
+    document = _encode(packed)
     if at + len(document) > len(memory):
         raise NoRoom
     memory[at : at + len(document)] = document
@@ -66,15 +88,15 @@ def pack(stretches: Iterable[list[Event]], memory: memoryview) -> Packed:
 
 def unpack(packed: Packed, memory: memoryview) -> Iterator[list[ParsedEvent]]:
     """What `pack` was given, parsed, in its stretches. Nothing refers to the memory afterwards."""
-    documents = marshal.loads(memory[packed.at : packed.at + packed.length])  # noqa: S302 - ours
-    for records, dims, norms, at in documents:
-        vectors, units = _read_arrays(dims, norms, memory, at)
-        first, parsed = 0, []
-        for record in records:
-            event = _parsed(record, first, vectors, units)
-            first += len(event.units)
-            parsed.append(event)
-        yield parsed
+    for stretch in _decode(memory[packed.at : packed.at + packed.length]):
+        vectors, units = _read_arrays(stretch.dims, stretch.norms, memory, stretch.at)
+        first, events = 0, []
+        for event in stretch.events:
+            stop = first + len(event.det_ids)
+            parsed = _unpacked(event, tuple(vectors[first:stop]))
+            events.append(ParsedEvent(event.offset, event.logged_ns, parsed, units[first:stop]))
+            first = stop
+        yield events
 
 
 def _write_arrays(
@@ -115,65 +137,36 @@ def _read_arrays(
     return vectors, units
 
 
-def _record(event: ParsedEvent, read: Event) -> _Record:
-    """Nothing more for an event that a fold passes over, bytes for one on `MAP_KEY`, text for a
-    refusal; for an envelope its fields, det_ids and digest."""
-    parsed = event.parsed
+def _packed(event: ParsedEvent, read: Event) -> _Event:
+    parsed, offset, logged_ns = event.parsed, event.offset, event.logged_ns
     if isinstance(parsed, Accepted):
-        envelope = _fields(parsed.envelope)
-        detections = [_fields(detection) for detection in parsed.envelope.detections]
-        for detection in detections:
-            detection["embedding"] = None
-        envelope["detections"] = detections
-        if parsed.envelope.camera is not None:
-            envelope["camera"] = _fields(parsed.envelope.camera)
-        digest = content_digest(parsed)
-        return event.offset, event.logged_ns, envelope, parsed.det_ids, digest
+        digest, envelope = content_digest(parsed), _plain(parsed.envelope)
+        for detection in envelope.detections:
+            detection.embedding = None
+        return _Event(offset, logged_ns, envelope, parsed.det_ids, digest)
     if read.key == MAP_KEY:
-        return event.offset, event.logged_ns, read.payload
-    if isinstance(parsed, Rejected):
-        return event.offset, event.logged_ns, parsed.reason
-    return event.offset, event.logged_ns
+        return _Event(offset, logged_ns, map=read.payload)
+    refusal = parsed.reason if isinstance(parsed, Rejected) else None
+    return _Event(offset, logged_ns, refusal=refusal)
 
 
-def _parsed(
-    record: _Record, first: int, vectors: list[Vector | None], units: list[Units | None]
-) -> ParsedEvent:
-    """The event of a record; its vectors begin with the number ``first``."""
-    offset, logged_ns = Offset(record[0]), record[1]
-    if len(record) == 2:
-        return ParsedEvent(offset, logged_ns, None, [])
-    if isinstance(record[2], bytes):
-        return ParsedEvent(offset, logged_ns, parse_map(record[2]), [])
-    if isinstance(record[2], str):
-        return ParsedEvent(offset, logged_ns, Rejected(record[2]), [])
-    _, _, fields, det_ids, digest = record
-    fields["detections"] = tuple([_model(Detection, each) for each in fields["detections"]])
-    if fields["camera"] is not None:
-        fields["camera"] = _model(EnvelopeCamera, fields["camera"])
-    stop = first + len(det_ids)
-    own = tuple(vectors[first:stop])
-    accepted = Accepted(_model(Envelope, fields), det_ids, own, digest)
-    return ParsedEvent(offset, logged_ns, accepted, units[first:stop])
+def _unpacked(
+    event: _Event, vectors: tuple[Vector | None, ...]
+) -> Accepted | OccupancyMap | Rejected | None:
+    if event.envelope is not None:
+        return Accepted(cast(Envelope, event.envelope), event.det_ids, vectors, event.digest)
+    if event.map is not None:
+        return parse_map(event.map)
+    return None if event.refusal is None else Rejected(event.refusal)
 
 
-def _fields(model: BaseModel | msgspec.Struct) -> dict[str, Any]:
-    return (
-        msgspec.structs.asdict(model) if isinstance(model, msgspec.Struct) else {**model.__dict__}
-    )
-
-
-_set: Final = object.__setattr__
-_NO_EXTRA: Final[dict[str, Any]] = {}
-_SET: Final = {model: set(model.model_fields) for model in (Envelope, Detection, EnvelopeCamera)}
-
-
-def _model(model: type[_Model], fields: dict[str, Any]) -> _Model:
-    """A model with all its ``fields``, which were validated before: `model_construct`, but four
-    times as fast. Frozen models may share what they have besides; a copy of one copies it."""
-    made = model.__new__(model)
-    _set(made, "__dict__", fields)
-    _set(made, "__pydantic_fields_set__", _SET[model])  # type: ignore[index]
-    _set(made, "__pydantic_extra__", _NO_EXTRA)
-    _set(made, "__pydantic_private__", None)
-    return made
+def _plain(envelope: object) -> PlainEnvelope:
+    """An envelope of `parse_events`, which is a model if it is unusual."""
+    if isinstance(envelope, PlainEnvelope):
+        return envelope
+    assert isinstance(envelope, Envelope)  # noqa: S101
+    fields = dict(envelope.__dict__)
+    if envelope.camera is not None:
+        fields["camera"] = PlainCamera(**envelope.camera.__dict__)
+    fields["detections"] = tuple([PlainDetection(**each.__dict__) for each in envelope.detections])
+    return PlainEnvelope(**fields)

@@ -15,7 +15,7 @@ from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import MAP_KEY
-from eventsrc.upcast import read_envelopes, read_fields
+from eventsrc.upcast import read_fields
 from projections.exact import Units, unit_vectors
 
 READ_AHEAD = 16
@@ -34,15 +34,12 @@ class ParsedEvent(NamedTuple):
     units: list[Units | None]
 
 
-def parse_events(events: Sequence[Event], *, fields_only: bool = False) -> list[ParsedEvent]:
-    """Validate events; for sixteen or so together this is quicker than one by one.
-
-    With ``fields_only`` the envelopes may be those of `eventsrc.upcast.read_fields`.
-    """
+def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
+    """Validate events; for sixteen or so together this is quicker than one by one. The envelopes
+    are those of `eventsrc.upcast.read_fields`."""
     enveloped = [event for event in events if event.is_envelope]
     # No size limit: it applied when the event was recorded.
-    read = read_fields if fields_only else read_envelopes
-    outcomes = read(enveloped, max_bytes=sys.maxsize)
+    outcomes = read_fields(enveloped, max_bytes=sys.maxsize)
     units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
     coming, parsed_events = iter(outcomes), []
     for event in events:

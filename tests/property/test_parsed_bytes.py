@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel
 
 from eventsrc.ingest import Accepted, Rejected
 from eventsrc.log import Event, LogReader
@@ -16,22 +15,11 @@ from eventsrc.occupancy_map import OccupancyMap
 from projections.model.parsed_bytes import NoRoom, pack, unpack
 from projections.model.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from projections.reducers.folded_ids import content_digest
+from tests.envelopes import fields_of
 from tests.random_logs import write_random_log
 from tests.thorough import examples
 
 ROOM = 1 << 20
-
-
-def fields(model: BaseModel) -> dict[str, Any]:
-    """The fields that a model names, those of models in it too; without an embedding's base64."""
-    found = {name: getattr(model, name) for name in type(model).model_fields}
-    found.pop("embedding", None)
-    for name, value in found.items():
-        if isinstance(value, BaseModel):
-            found[name] = fields(value)
-        elif name == "detections":
-            found[name] = [fields(each) for each in value]
-    return found
 
 
 def comparable(event: ParsedEvent) -> Any:
@@ -42,10 +30,13 @@ def comparable(event: ParsedEvent) -> Any:
         if isinstance(parsed, OccupancyMap):
             return offset, logged_ns, parsed.digest(), parsed.cells.tobytes()
         return offset, logged_ns, parsed
+    envelope = fields_of(parsed.envelope)
+    for detection in envelope["detections"]:
+        del detection["embedding"]
     return (
         offset,
         logged_ns,
-        repr(fields(parsed.envelope)),
+        envelope,
         parsed.det_ids,
         content_digest(parsed),
         [v if v is None else (v.dtype.str, v.tobytes()) for v in parsed.vectors],

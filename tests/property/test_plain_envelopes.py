@@ -4,11 +4,9 @@ import json
 import re
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel
 
 from eventsrc.envelope import Detection, Envelope, EnvelopeCamera
 from eventsrc.ingest import (
@@ -22,7 +20,7 @@ from eventsrc.ingest import (
 )
 from eventsrc.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope, read_plain
 from projections.reducers.folded_ids import content_digest
-from tests.envelopes import detection, envelope, payload
+from tests.envelopes import detection, envelope, fields_of, payload
 from tests.thorough import examples
 
 EDGE_TEXTS = r"""
@@ -133,17 +131,6 @@ def test_what_is_read_quickly_is_what_the_models_read(raw: bytes) -> None:
     ]
 
 
-def fields(whole: BaseModel | msgspec.Struct | Any) -> Any:
-    """Names and values, to the last bit, of an envelope and of what is in it."""
-    if isinstance(whole, tuple | list):
-        return [fields(each) for each in whole]
-    if not isinstance(whole, BaseModel | msgspec.Struct):
-        return repr(whole)
-    model = isinstance(whole, BaseModel)
-    names = type(whole).model_fields if model else type(whole).__struct_fields__
-    return {name: fields(getattr(whole, name)) for name in names}
-
-
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(EMBEDDED_PAYLOADS, min_size=1, max_size=3))
 @example([payload(envelope(0, detections=[detection("a", [1.0, 2.0], det_id="x")], floor=2))])
@@ -155,7 +142,7 @@ def test_read_together_they_have_the_fields_and_vectors_of_the_models(raws: list
         return
     for quick, whole in zip(plain, ingest_all(raws), strict=True):
         assert isinstance(whole, Accepted)
-        assert fields(quick.envelope) == fields(whole.envelope)
+        assert fields_of(quick.envelope) == fields_of(whole.envelope)
         assert quick.det_ids == whole.det_ids
         assert [v.tobytes() for v in quick.vectors] == [v.tobytes() for v in whole.vectors]
         assert content_digest(quick) == content_digest(whole)
