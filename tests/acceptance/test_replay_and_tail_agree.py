@@ -9,6 +9,7 @@ from psycopg import sql
 
 from tests.acceptance.awkward_run import awkward_payloads
 from tests.commands import Commands
+from tests.thorough import stride
 
 Rows = dict[str, list[tuple[Any, ...]]]
 
@@ -80,7 +81,7 @@ def test_the_digest_is_the_logs_own(mapfold: Commands, awkward_log: Path) -> Non
 @pytest.mark.slow
 def test_a_past_state_is_the_state_of_a_shorter_log(mapfold: Commands, awkward_log: Path) -> None:
     payloads = awkward_payloads()
-    for count in (0, 1, 5, 17, 20, len(payloads)):
+    for count in (1, 0, 17, 5, 20, len(payloads))[stride(2) - 1 :: stride(2)]:
         short = mapfold.folder / f"short-{count}"
         mapfold("import", short, "-", stdin=b"".join(p + b"\n" for p in payloads[:count]))
         past = mapfold("state", awkward_log, "--at", str(count), "--json").json

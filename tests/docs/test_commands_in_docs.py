@@ -24,7 +24,7 @@ LONG = ("scripts/demo", "mapfold calibrate logs/mine")
 with ``--write`` too."""
 
 
-@pytest.mark.parametrize("name", mostly_slow(DOCUMENTS, 2))
+@pytest.mark.parametrize("name", mostly_slow(DOCUMENTS))
 def test_commands_print_what_the_document_says(name: str) -> None:
     parts = read(ROOT / name)
     if not THOROUGH:

@@ -2,6 +2,7 @@
 
 import doctest
 import json
+import os
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -16,7 +17,8 @@ from projections import api
 from projections.api import Map, Timeline, fold, open_log, relocalize
 from projections.errors import QuestionError, SettingsError
 from projections.history import NoSuchThing
-from tests.commands import Commands
+from tests import prefork
+from tests.commands import TIMEOUT_S, Commands
 from tests.envelopes import detection, envelope
 from tests.logs import write_log
 
@@ -61,9 +63,12 @@ def test_python_m_mapfold_is_the_program(tmp_path: Path) -> None:
         check=True,
     )
     assert json.loads(said.stdout)["events"] == 445
-    helped = subprocess.run(
-        [sys.executable, "-m", "mapfold", "state"], cwd=tmp_path, capture_output=True, check=False
-    )
+
+
+def test_python_m_mapfold_names_itself_mapfold(tmp_path: Path) -> None:
+    program = "import runpy; runpy.run_module('mapfold', run_name='__main__', alter_sys=True)"
+    argv = ["-c", "state"]
+    helped = prefork.run(program, argv, env=os.environ, cwd=tmp_path, timeout=TIMEOUT_S)
     assert helped.returncode == 2
     assert b"mapfold state" in helped.stderr
 

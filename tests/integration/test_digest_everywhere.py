@@ -103,7 +103,7 @@ def test_one_digest_on_every_kernel_thread_count_and_hash_seed(
     payloads = _synthetic_run() if run == "synthetic" else shared_run(run)
     lines = tmp_path / "run.jsonl"
     lines.write_bytes(b"\n".join(payloads))
-    chosen = PLACES[:: stride(3)]
+    chosen = PLACES[:: stride(5)]
     results = {place: _fold_in(*place, lines, *rules) for place in chosen}
     assert len({digest for digest, _ in results.values()}) == 1, results
     assert len({product for _, product in results.values()}) > 1, "all kernels are one here"

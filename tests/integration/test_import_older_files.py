@@ -10,6 +10,7 @@ from eventsrc.log.format import list_segments
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY, read_log
+from tests.thorough import mostly_slow
 
 HOUR = 3600
 DRIVES = {"new": 20 * HOUR, "mid": 10 * HOUR, "old": HOUR}
@@ -27,7 +28,7 @@ def lines(name: str, *, received: bool, count: int = 4) -> bytes:
     return b"\n".join(map(payload, made))
 
 
-@pytest.fixture(params=[False, True], ids=["stamped", "received"])
+@pytest.fixture(params=mostly_slow([False, True]), ids=["stamped", "received"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Commands:
     for name in DRIVES:
         (tmp_path / f"{name}.jsonl").write_bytes(lines(name, received=request.param))

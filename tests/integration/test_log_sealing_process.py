@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -16,6 +15,7 @@ from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal
 from eventsrc.log.seal_process import ProcessGone, SealingProcess
+from tests import prefork
 from tests.fixtures_log import KEY, read_log
 
 ROOT = Path(__file__).parents[2]
@@ -31,15 +31,9 @@ def killed_writer(path: Path, events: int = 5) -> SegmentPlan:
         "for n in range(int(sys.argv[2])): writer.append('k', b'%d' % n)\n"
         "print(writer.log_id, flush=True); os.kill(os.getpid(), 9)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(path), str(events)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=TIMEOUT_S,
-    )
-    return SegmentPlan(path, done.stdout.strip(), Offset(0), NO_PREVIOUS, Offset(events))
+    argv = ["-c", str(path), str(events)]
+    done = prefork.run(program, argv, env=os.environ, cwd=ROOT, timeout=TIMEOUT_S)
+    return SegmentPlan(path, done.stdout.decode().strip(), Offset(0), NO_PREVIOUS, Offset(events))
 
 
 def test_it_writes_the_bytes_that_the_writer_would_write(tmp_path: Path) -> None:

@@ -27,6 +27,10 @@ from eventsrc.system_events import REJECTED_KEY
 from eventsrc.transport.session import Received, Router, Session, ZenohOptions
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+from tests.thorough import rounds
+
+KEYFRAMES = rounds(6_000, 2_500)
+
 
 Sessions = Callable[[], Session]
 Start = Callable[..., Program]
@@ -484,7 +488,7 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
     tmp_path: Path,
 ) -> None:
     """Three recorders are killed under load; each time the log must hold what was acked by then."""
-    sent = [payload(envelope(k, note="x" * 1_000)) for k in range(6_000)]
+    sent = [payload(envelope(k, note="x" * 1_000)) for k in range(KEYFRAMES)]
     keyframes = {payload_sha256(message): k for k, message in enumerate(sent)}
     acked: set[int] = set()
     progress = threading.Condition()
@@ -520,7 +524,7 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
     thread.join()
     assert published.is_set()
     assert robot.flush(DEADLINE_S)
-    assert _keyframes(tmp_path / "log") == set(range(6_000))
+    assert _keyframes(tmp_path / "log") == set(range(KEYFRAMES))
 
 
 def _keyframes(log: Path) -> set[int]:

@@ -23,6 +23,8 @@ from tests.thorough import THOROUGH, mostly_slow, rounds
 SETTINGS = Settings()
 WAIT_S = 60.0
 REBUILDS = rounds(6, 2)
+HALF = rounds(150, 60)
+"""Keyframes of the smaller map, without its bridge of 20."""
 PAUSE_S = 0.0 if THOROUGH else 0.002
 """Between two questions of a reader, so that a rebuild is not slowed down most of all."""
 
@@ -75,10 +77,10 @@ def single_answer(connection: psycopg.Connection, query: str) -> str:
 def test_readers_see_one_map_or_the_other_and_never_an_error(
     tmp_path: Path, one_database: Targets, pg: psycopg.Connection, prepare: bool
 ) -> None:
-    log = write_log(tmp_path / "log", walk(150, rooms=2) + list(bridge()) + walk(150, first=150))
+    log = write_log(tmp_path / "log", walk(HALF, rooms=2) + list(bridge()) + walk(HALF, first=HALF))
     queries = (COUNT_PATHS, COUNT_LABELS, COUNT_VECTORS)
     allowed: dict[str, set[str]] = {query: set() for query in queries}
-    for until in (170, None):
+    for until in (HALF + 20, None):
         rebuild(log, one_database, SETTINGS, until=until)
         for query in queries:
             allowed[query].add(single_answer(pg, query))
@@ -92,7 +94,7 @@ def test_readers_see_one_map_or_the_other_and_never_an_error(
         for reader in readers:
             assert reader.first.wait(WAIT_S)
         for n in range(REBUILDS):
-            rebuild(log, one_database, SETTINGS, until=170 if n % 2 == 0 else None)
+            rebuild(log, one_database, SETTINGS, until=HALF + 20 if n % 2 == 0 else None)
     finally:
         for reader in readers:
             reader.stop.set()

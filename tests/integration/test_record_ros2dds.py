@@ -59,6 +59,7 @@ from tests.ros_messages import (
     detection,
     detections,
 )
+from tests.thorough import every_other
 
 Sessions = Callable[[], Session]
 
@@ -581,7 +582,8 @@ def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:
     said = run("record", "L", "--ros2dds", "--topic", "/a b", code=2)
     assert "is no topic of ROS 2" in said.err
     (tmp_path / "labels").write_text("cup\n\nchair\n")
-    for wrong in (["--run-id", "a\nb"], ["--max-gap", "nan"], ["--labels", "no"], ["--pose", "*"]):
+    refused = [["--run-id", "a\nb"], ["--max-gap", "nan"], ["--labels", "no"], ["--pose", "*"]]
+    for wrong in every_other(refused):
         assert run("record", "L", "--ros2dds", *wrong, code=2).err.count("\n") == 1
     assert not (tmp_path / "L").exists()
     labels, several = tmp_path / "labels", ["/left/detections", "/right/detections"]

@@ -33,7 +33,7 @@ from tests.commands import Commands
 from tests.commands_in_logs import append_command, command
 from tests.crops import Encoder, add_crop, drive, jpeg, write
 from tests.rows import all_rows
-from tests.thorough import examples
+from tests.thorough import mostly_slow, rounds
 
 A, B = Encoder("A", 6), Encoder("B", 9)
 IN_B = Settings(embedding_model="B")
@@ -62,7 +62,7 @@ def end_of(log: Path) -> int:
 
 
 @pytest.mark.parametrize("fusion", ["page", "evidence"])
-@settings(max_examples=examples(60), deadline=None)
+@settings(max_examples=rounds(60, 3), deadline=None)
 @given(seed=st.integers(0, 10**6), batch=st.integers(1, 70), until=st.floats(0.1, 1.0))
 def test_the_map_is_that_of_a_log_recorded_in_the_space(
     fusion: str, seed: int, batch: int, until: float, tmp_path_factory: pytest.TempPathFactory
@@ -130,7 +130,7 @@ reembed(Path(sys.argv[1]), Dies("B", 9), batch=5, issued_by="ann")
 
 
 @pytest.mark.seconds
-@pytest.mark.parametrize("calls", [0, 3])
+@pytest.mark.parametrize("calls", mostly_slow([3, 0]))
 def test_a_run_that_was_killed_is_continued(tmp_path: Path, calls: int) -> None:
     made = drive(3)
     log, whole = write(tmp_path / "log", made, A), write(tmp_path / "whole", made, A)

@@ -70,6 +70,8 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
             assert {m.run_id for row in live.matches for m in row} == {"run-a", "run-c"}
             asked += 1
         assert asked > 5
+        nothing = reader.candidates(())
+        assert (nothing.matches, dict(nothing.places)) == ((), {})
 
 
 def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disabled(
@@ -98,18 +100,19 @@ def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disable
         assert plans() == (kept, made + 3)
 
 
-def test_a_question_without_crops_has_no_candidates(targets: Targets) -> None:
-    with CandidateReader(targets) as reader:
-        found = reader.candidates(())
-    assert (found.matches, dict(found.places)) == ((), {})
-
-
-def test_the_library_call_answers(targets: Targets, view: MapView) -> None:
+def test_the_library_call_answers_and_refuses_another_embedding_space(
+    targets: Targets, view: MapView
+) -> None:
     index = ExactIndex(view)
     for crops in questions():
         live, exact = relocalize(targets, crops), rank(crops, index.search(crops))
         assert [p.place_id for p in live.places] == [p.place_id for p in exact.places]
         assert live.confidence == pytest.approx(exact.confidence, abs=0.02)
+    with pytest.raises(QuestionError, match="dimensions"):
+        relocalize(targets, read_crops([detection("cup", [1.0, 0.0, 0.0])]))
+    other = detection("cup", [1.0] * 8, embedding_model="another/model")
+    with pytest.raises(QuestionError, match="another/model"):
+        relocalize(targets, read_crops([other]))
 
 
 @pytest.mark.slow
@@ -128,14 +131,6 @@ def test_a_graph_by_evidence_goes_with_vectors_of_the_other_rule(
     rebuild(log, two_databases, SETTINGS, only="graph")
     with CandidateReader(two_databases) as reader:
         assert found(reader.candidates(crops, 200)) == found(theirs)
-
-
-def test_another_embedding_space_is_refused(targets: Targets) -> None:
-    with pytest.raises(QuestionError, match="dimensions"):
-        relocalize(targets, read_crops([detection("cup", [1.0, 0.0, 0.0])]))
-    other = detection("cup", [1.0] * 8, embedding_model="another/model")
-    with pytest.raises(QuestionError, match="another/model"):
-        relocalize(targets, read_crops([other]))
 
 
 @pytest.mark.parametrize("targets", ["two_databases", "one_database"][: rounds(2, 1)])

@@ -1,7 +1,7 @@
 """`mapfold serve` on real parts: a router, a database, clients that ask at the same time."""
 
 import json
-import signal
+import os
 import subprocess
 import sys
 import threading
@@ -31,9 +31,12 @@ from projections.serve.guard import Guard
 from projections.serve.http import create_app
 from projections.serve.listening import bind, serving
 from projections.settings import Settings
+from tests.commands import Commands
 from tests.envelopes import detection
 from tests.logs import WEIRD, walk, write_log
+from tests.ready_program import ReadyProgram
 from tests.servers import kill_postgres, server_to_kill
+from tests.thorough import rounds
 
 DEADLINE_S = 30.0
 OTHER_SPACE = json.dumps([detection("x", [1.0, 2.0])]).encode()
@@ -215,7 +218,7 @@ class TestZenoh:
         wrong: list[object] = []
 
         def client(session: Session, number: int) -> None:
-            for _ in range(5):
+            for _ in range(rounds(5, 2)):
                 good, answer = ask(session, "mapfold/relocalize", question(number))
                 if not good or answer != expected[number]:
                     wrong.append(answer)
@@ -431,29 +434,19 @@ class TestHttp:
             assert again == port
 
 
-def test_the_command_serves_until_sigterm(endpoint: str, targets: Targets) -> None:
-    program = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "projections.cli", "serve"),
-            *("--connect", endpoint, "--db", targets.graph_url),
-        ],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def test_the_command_serves_until_sigterm(endpoint: str, targets: Targets, tmp_path: Path) -> None:
+    read, write = os.pipe()
+    mapfold = Commands.in_folder(tmp_path)
+    started = mapfold.start("serve", "--connect", endpoint, "--db", targets.graph_url, stderr=write)
+    os.close(write)
+    program = ReadyProgram(started, read, DEADLINE_S, DEADLINE_S)
     try:
-        assert program.stderr is not None
-        while "Ctrl-C" not in (line := program.stderr.readline()):
-            assert line, "the service ended early"
         with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
             assert ask(session, "mapfold/relocalize", question())[0]
-        program.send_signal(signal.SIGTERM)
-        assert program.wait(DEADLINE_S) == 0
-        assert "service ended" in program.stderr.read()
     finally:
-        program.kill()
-        program.wait()
-        if program.stderr is not None:
-            program.stderr.close()
+        code = program.end()
+    assert code == 0
+    assert "service ended" in program.text
 
 
 class TestKilledServer:

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
+from eventsrc.errors import MisuseError
 from projections.database import rebuild
 from projections.database.connection import Targets
-from projections.serve.guard import read_origin
+from projections.serve.guard import read_origin, read_token
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.fixtures_tls import Certificate
@@ -148,13 +149,20 @@ class TestMisuse:
             ("0123456789abcdéf", "one line of printable ASCII without spaces"),
         ],
     )
-    def test_a_malformed_token_is_refused(self, mapfold: Commands, content: str, said: str) -> None:
-        file = mapfold.folder / "wrong"
+    def test_a_malformed_token_is_refused(self, tmp_path: Path, content: str, said: str) -> None:
+        file = tmp_path / "wrong"
         file.write_text(content)
-        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--token-file", file)
-        err = mapfold(*args, code=2).err
-        assert said in err
-        assert not content.strip() or content.strip() not in err
+        with pytest.raises(MisuseError) as refused:
+            read_token(file, {}, print)
+        assert said in str(refused.value)
+        assert not content.strip() or content.strip() not in str(refused.value)
+
+    def test_a_token_of_the_command_line_is_looked_at(self, mapfold: Commands) -> None:
+        (mapfold.folder / "wrong").write_text("short")
+        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--token-file", "wrong")
+        said = mapfold(*args, code=2).err
+        assert "the token has 5 characters" in said
+        assert "short" not in said
 
     def test_an_empty_token_in_the_environment(self, tmp_path: Path) -> None:
         mapfold = Commands.in_folder(tmp_path, MAPFOLD_TOKEN="")
@@ -223,11 +231,16 @@ class TestMisuse:
             "https://map example",
         ],
     )
-    def test_what_is_no_origin_is_refused(self, mapfold: Commands, origin: str) -> None:
-        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--cors", origin)
+    def test_what_is_no_origin_is_refused(self, origin: str) -> None:
+        with pytest.raises(MisuseError, match=r"\* is not taken") as refused:
+            read_origin(origin)
+        wrong = f"--cors {origin}: write an origin as a browser sends it"
+        assert str(refused.value).startswith(wrong)
+
+    def test_an_origin_of_the_command_line_is_looked_at(self, mapfold: Commands) -> None:
+        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--cors", "*")
         said = mapfold(*args, code=2).err
-        assert said.startswith(f"mapfold: --cors {origin}: write an origin as a browser sends it")
-        assert "* is not taken" in said
+        assert said.startswith("mapfold: --cors *: write an origin as a browser sends it")
 
 
 @pytest.mark.parametrize(

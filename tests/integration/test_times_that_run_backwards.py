@@ -11,6 +11,7 @@ from projections.database.connection import Targets
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
+from tests.thorough import mostly_slow
 
 THEN = "2026-03-24T13:00:02Z"
 """The second keyframe of the run that was imported last; three of a later time lie before it."""
@@ -29,25 +30,28 @@ def mapfold(tmp_path: Path) -> Commands:
     return Commands.in_folder(tmp_path)
 
 
+ASKED: list[tuple[str, ...]] = [
+    ("state", "log", "--at", THEN),
+    ("diff", "log", THEN),
+    ("bisect", "log", "place_count > 0", "--to", THEN),
+    ("relocalize", "question.json", "--log", "log", "--as-of", THEN),
+    ("query", "contents", "run-b_p0", "--log", "log", "--at", THEN),
+    ("draw", "log", "--at", THEN, "--out", "map.svg"),
+    ("merges", "log", "--at", THEN),
+    ("why", "log", "run-b_p0", "--at", THEN),
+    ("diff", "log", "0", THEN),
+    ("bisect", "log", "place_count > 0", "--from", THEN),
+    ("whatif", "log", "--set", "eps_m=1", "--at", THEN),
+    ("evaluate", "--map", "log", "--at", THEN),
+    ("query", "holding", "cup", "--from", "run-b_p0", "--log", "log", "--at", THEN),
+    ("query", "path", "run-b_p0", "run-b_p0", "--log", "log", "--at", THEN),
+]
+
+
 @pytest.mark.parametrize(
     "args",
-    [
-        ("state", "log", "--at", THEN),
-        ("draw", "log", "--at", THEN, "--out", "map.svg"),
-        ("merges", "log", "--at", THEN),
-        ("why", "log", "run-b_p0", "--at", THEN),
-        ("diff", "log", "0", THEN),
-        ("diff", "log", THEN),
-        ("bisect", "log", "place_count > 0", "--to", THEN),
-        ("bisect", "log", "place_count > 0", "--from", THEN),
-        ("whatif", "log", "--set", "eps_m=1", "--at", THEN),
-        ("evaluate", "--map", "log", "--at", THEN),
-        ("relocalize", "question.json", "--log", "log", "--as-of", THEN),
-        ("query", "contents", "run-b_p0", "--log", "log", "--at", THEN),
-        ("query", "holding", "cup", "--from", "run-b_p0", "--log", "log", "--at", THEN),
-        ("query", "path", "run-b_p0", "run-b_p0", "--log", "log", "--at", THEN),
-    ],
-    ids=lambda args: " ".join(args[:2]),
+    mostly_slow([(args,) for args in ASKED], 5),
+    ids=[" ".join(args[:2]) for args in ASKED],
 )
 def test_stamps_that_run_backwards_are_reported_on_stderr(
     mapfold: Commands, args: tuple[str, ...]

@@ -49,7 +49,7 @@ def run(mapfold: Commands, command: str, *more: str) -> str:
 
 def moments(end: int) -> list[int]:
     chosen = random.Random(19)
-    return sorted({0, 1, end, *(chosen.randrange(end) for _ in range(rounds(200, 4)))})
+    return sorted({0, 1, end, *(chosen.randrange(end) for _ in range(rounds(200, 2)))})
 
 
 def check_digests_and_arrays(mapfold: Commands, server: UiServer, log: Path, *sets: str) -> None:

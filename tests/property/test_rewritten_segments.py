@@ -16,7 +16,7 @@ from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log
 from tests.rewriting import plainly_read, rewrite
-from tests.thorough import stride
+from tests.thorough import mostly_slow, stride
 
 EACH = 20
 COUNT = 3
@@ -117,7 +117,7 @@ def test_every_event_the_mcap_reader_reads_is_kept(log: Path, seed: int) -> None
     assert lost <= {which * EACH + n for n in dropped}
 
 
-@pytest.mark.parametrize("profile", ["mapfold", ""])
+@pytest.mark.parametrize("profile", mostly_slow(["mapfold", ""]))
 def test_without_metadata_the_error_names_import_which_works(log: Path, profile: str) -> None:
     """As `mcap filter` leaves it out. Nothing tells which offsets the messages had."""
     run = Commands.in_folder(log.parent)
