@@ -6,6 +6,8 @@
   configuration file says otherwise.
 * Shared memory is always off. Payloads over 3 kB would travel through it and can vanish with the
   process that owns the segment.
+* A client receives into buffers of 4 MiB that it uses again, unless a configuration file says
+  otherwise.
 * Publishers are reliable and block. Zenoh's default drops messages silently when a queue is full.
 * Subscribers are plain. Advanced ones drop a message with an earlier timestamp than one before it.
 * A session is a context manager and is always closed. Every failure to open, declare or send is a

@@ -90,3 +90,20 @@ def test_a_message_bound_of_a_file_is_used(
 ) -> None:
     config = _configured(tmp_path, text, "client", largest=largest)
     assert json.loads(config.get_json("transport/link/rx/max_message_size")) == size
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "size"),
+    [
+        ("{}", "client", 2**22),
+        ("{}", "peer", 65_535),
+        ("{}", "router", 65_535),
+        ("{transport: {link: {rx: {buffer_size: 70000}}}}", "client", 70_000),
+    ],
+)
+def test_a_client_uses_its_receive_buffers_again_unless_the_file_says_otherwise(
+    text: str, mode: Mode, size: int
+) -> None:
+    config = zenoh.Config.from_json5(text)
+    configure(config, zenoh.Config(), ZenohOptions(), mode)
+    assert json.loads(config.get_json("transport/link/rx/buffer_size")) == size
