@@ -12,6 +12,8 @@ import pytest
 from tests import prefork
 from tests.commands import Commands
 
+pytestmark = pytest.mark.seconds  # which the process that forks takes to start
+
 WAIT_S = 60.0
 ENDS = {
     "at its end": "import os; os.getpid()",
@@ -32,7 +34,6 @@ ENDS = {
 
 
 @pytest.mark.parametrize("code", ENDS.values(), ids=ENDS)
-@pytest.mark.seconds
 def test_it_ends_and_says_what_a_new_process_does(code: str, tmp_path: Path) -> None:
     env, argv, stdin = {**os.environ, "ASKED": "ä\udcff"}, ["-c", "a b", "☕"], b"given"
     new = subprocess.run(
@@ -63,7 +64,6 @@ def test_one_that_runs_is_polled_waited_for_and_killed(tmp_path: Path) -> None:
         prefork.run(code, ["-c"], env=os.environ, cwd=tmp_path, timeout=0.01)
 
 
-@pytest.mark.seconds
 def test_the_mapfold_of_scripts(tmp_path: Path) -> None:
     path = f"{prefork.folder_with_mapfold()}{os.pathsep}{os.environ['PATH']}"
     (tmp_path / "in.jsonl").write_text("no JSON\n")
