@@ -4,6 +4,7 @@ import io
 import random
 import struct
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import lz4.frame
@@ -47,6 +48,7 @@ def zeros(compress: Callable[[bytes], bytes], flush: Callable[[], bytes]) -> byt
     return b"".join(compress(block) for _ in range(GIB // len(block))) + flush()
 
 
+@cache
 def zstd_bomb(named: bool) -> bytes:
     """``named``: the frame says how large its content is."""
     squeeze = zstandard.ZstdCompressor().compressobj(size=GIB if named else -1)

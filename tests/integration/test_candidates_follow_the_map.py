@@ -34,7 +34,7 @@ def targets(request: pytest.FixtureRequest) -> Targets:
     return found
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def documents() -> list[dict[str, Any]]:
     return flickering_house("a", 200)
 

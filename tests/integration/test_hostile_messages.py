@@ -19,6 +19,7 @@ from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from eventsrc.transport.session import Received, Session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S
+from tests.thorough import rounds
 
 Sessions = Callable[[], Session]
 LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
@@ -138,12 +139,12 @@ def test_a_lone_surrogate_in_a_key_is_escaped(tmp_path: Path) -> None:
 
 def test_thousands_of_keys_go_into_several_segments(tmp_path: Path) -> None:
     """MCAP counts channels in 16 bits, and a segment repeats all their names at its end."""
-    most, keys = 4_096, [f"robot/{number}" for number in range(10_000)]
+    most, keys = 4_096, [f"robot/{number}" for number in range(rounds(10_000, 5_000))]
     with LogWriter(tmp_path / "log") as writer:
         for key in keys:
             writer.append(key, b"{}")
     with LogReader(tmp_path / "log") as reader:
         assert [event.key for event in reader.read()] == keys
         counts = [len(reader.open_segment(entry).channels) for entry in reader.segments]  # type: ignore[union-attr]
-    assert len(counts) == 3
+    assert len(counts) == rounds(3, 2)
     assert max(counts) < most + 256

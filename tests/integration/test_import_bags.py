@@ -21,6 +21,7 @@ from tests.commands import Commands
 from tests.fixtures_log import read_log
 from tests.ros_bags import RUN, Drive, Raw, write_bag
 from tests.ros_messages import SECOND, START, flat
+from tests.thorough import every_other
 
 DRIVE = Drive(40)
 
@@ -483,14 +484,15 @@ def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(run: Comm
     said = run("import", "log", "empty", code=3)
     assert "note: nothing to import: no topic is of type" in said.err
     write_bag(run.folder / "drive", Drive(2).messages())
-    for options, told in (
+    wrong = [
         (["--detections", "/x"], "--detections /x"),
         (["--topic", "/detections"], "--topic does not choose what is used of a bag"),
         (["--max-gap", "0"], "--max-gap 0"),
         (["--max-gap", "nan"], "--max-gap nan"),
         (["--run-id", ""], "--run-id"),
         (["--labels", "none.txt"], "--labels none.txt: No such file"),
-    ):
+    ]
+    for options, told in every_other(wrong):
         assert told in run("import", "log", "drive", *options, code=2).err
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from projections.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
-from tests.commands import PROGRAM, TIMEOUT_S, Commands
+from tests.commands import TIMEOUT_S, Commands
 from tests.docs.console import ROOT
 from tests.fixtures_timetravel import write_damaged_log, write_log
 from tests.logs import walk
@@ -36,9 +37,14 @@ if "--multiprocessing-fork" in sys.orig_argv:
 """
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("written") / "log", walk(500))
+
+
 @pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    write_log(tmp_path / "log", walk(500))
+def mapfold(tmp_path: Path, written: Path) -> Commands:
+    shutil.copytree(written, tmp_path / "log")
     return Commands.in_folder(tmp_path)
 
 
@@ -145,17 +151,12 @@ def test_stdout_on_a_full_disk_is_a_failure(
 
 
 def test_stderr_on_a_full_disk_changes_nothing(mapfold: Commands) -> None:
-    with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
-            [str(PROGRAM), "log", "verify", "log", "--json"],
-            cwd=mapfold.folder,
-            env=mapfold.env,
-            stdout=subprocess.PIPE,
-            stderr=full,
-            check=False,
-        )
-    assert done.returncode == 0
-    assert b'"findings": []' in done.stdout
+    with Path("/dev/full").open("wb") as full, tempfile.TemporaryFile() as stdout:
+        streams = {"stdout": stdout.fileno(), "stderr": full.fileno()}
+        process = mapfold.start("log", "verify", "log", "--json", **streams)
+        assert process.wait(TIMEOUT_S) == 0
+        stdout.seek(0)
+        assert b'"findings": []' in stdout.read()
 
 
 def test_numbers_of_closed_streams_are_not_reused(mapfold: Commands) -> None:

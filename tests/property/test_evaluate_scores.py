@@ -19,11 +19,12 @@ LABELS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=40)
 SCORES = st.lists(st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]), max_size=15)
 
 
+@pytest.mark.slow  # importing scikit-learn takes a second
 @given(LABELS)
 def test_agreement_is_sklearns(pairs: list[tuple[int, int]]) -> None:
     classes, clusters = [a for a, _ in pairs], [b for _, b in pairs]
     ours = agreement(classes, clusters)
-    from sklearn import metrics  # takes a second to import
+    from sklearn import metrics
 
     h, c, v = metrics.homogeneity_completeness_v_measure(classes, clusters)
     assert (ours.homogeneity, ours.completeness) == pytest.approx((h, c), abs=1e-9)
@@ -31,6 +32,14 @@ def test_agreement_is_sklearns(pairs: list[tuple[int, int]]) -> None:
     if pairs:
         rand = metrics.adjusted_rand_score(classes, clusters)
         assert ours.adjusted_rand == pytest.approx(rand, abs=1e-9)
+
+
+def test_agreement_of_a_place_that_was_split() -> None:
+    """Two rooms, of which one is mapped as two places."""
+    found = agreement([0, 0, 0, 0, 1, 1, 1, 1], [0, 0, 1, 1, 2, 2, 2, 2])
+    assert (found.homogeneity, found.completeness) == pytest.approx((1.0, 2 / 3))
+    assert found.v_measure == pytest.approx(0.8)
+    assert found.adjusted_rand == pytest.approx(16 / 23)
 
 
 @given(LABELS, st.randoms())

@@ -26,12 +26,12 @@ from projections.settings import Settings
 from tests.commands_in_logs import forget_keyframes, undo
 from tests.envelopes import envelope
 from tests.fixtures_corrections import anchor, corrected_walks, write_mixed_log
-from tests.thorough import examples
+from tests.thorough import rounds
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 Items = list[dict[str, Any] | Command]
 slow = settings(
-    deadline=None, max_examples=examples(100), suppress_health_check=[HealthCheck.too_slow]
+    deadline=None, max_examples=rounds(100, 4), suppress_health_check=[HealthCheck.too_slow]
 )
 
 
@@ -129,7 +129,7 @@ def test_counts_of_a_difference_are_of_both_maps_when_one_leaves_nothing_out() -
         assert opened.diff(6, 7).document()["counts"]["forgotten"] == [0, 2]
 
 
-@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=rounds(60, 4), suppress_health_check=[HealthCheck.too_slow])
 @given(corrected_walks(most=20), st.sampled_from(["kitchen", "hall"]), st.data())
 def test_a_name_is_found_by_the_fold_that_has_it_first(
     items: Items, name: str, data: st.DataObject
@@ -173,7 +173,7 @@ def groups(view: MapView) -> tuple[set[Any], set[Any]]:
     )
 
 
-@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=rounds(60, 4), suppress_health_check=[HealthCheck.too_slow])
 @given(corrected_walks(most=20), st.data())
 def test_whatif_without_a_command_equals_a_fold_without_it(
     items: Items, data: st.DataObject

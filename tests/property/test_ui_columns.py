@@ -24,7 +24,7 @@ from projections.ui.log_map import LogMap
 from projections.ui.opened import Opened
 from tests.fixtures_corrections import corrected_walks, write_mixed_log
 from tests.logs import write_log
-from tests.thorough import examples
+from tests.thorough import rounds
 from tests.ui_client import ReplayedMap, as_float32, read_arrays, replay
 from tests.unit.test_moved_things import ROOM, run
 
@@ -32,7 +32,7 @@ PAGE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 EVIDENCE = PAGE.with_assignments(["fusion=evidence"])
 Items = list[dict[str, Any] | Command]
 slow = settings(
-    deadline=None, max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow]
+    deadline=None, max_examples=rounds(150, 6), suppress_health_check=[HealthCheck.too_slow]
 )
 
 

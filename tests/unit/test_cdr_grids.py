@@ -16,7 +16,7 @@ from eventsrc.grid_messages import is_grid_message, read_grid_message
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from tests.envelopes import payload
 from tests.maps import cdr_message, drawn_map, grid_message
-from tests.thorough import examples
+from tests.thorough import examples, rounds
 
 # Made by rosbags 0.11.9, `serialize_cdr` of ROS 2 Humble's types: 3 × 2 cells of 0.05 m from
 # (1.5, -2.25) turned by -0.7 rad, in the frame "map"; one cell of 0.1 m in a frame without name; a
@@ -76,7 +76,7 @@ def test_the_encoder_of_the_tests_makes_the_bytes_of_rosbags() -> None:
         assert read_grid_message(again, "k").digest() == made.digest()
 
 
-@settings(max_examples=examples(100), deadline=None)
+@settings(max_examples=rounds(100, 5), deadline=None)
 @given(
     st.integers(1, 20),
     st.integers(1, 20),
