@@ -77,15 +77,22 @@ class DriveGrid:
             near = [self.clearest(spot, Rect.around(*spot, 3.0, 3.0), 1.5) for spot in spots]
         except MapfoldError:
             return False
-        wanted = {self._cell(spot) for spot in near}
-        reached = {self._cell(near[0])}
-        frontier = list(reached)
-        while frontier and not wanted <= reached:
-            for neighbour, _ in self._neighbours(frontier.pop()):
-                if neighbour not in reached:
-                    reached.add(neighbour)
+        unreached = {
+            (i, j)
+            for j, row in enumerate(self._clearance)
+            for i, space in enumerate(row)
+            if space >= CLEARANCE_M
+        }
+        frontier = [self._cell(near[0])]
+        unreached -= {*frontier}
+        while frontier:
+            i, j = frontier.pop()
+            for di, dj, _ in (*_STEPS, *_DIAGONALS):
+                neighbour = (i + di, j + dj)
+                if neighbour in unreached:
+                    unreached.remove(neighbour)
                     frontier.append(neighbour)
-        return wanted <= reached
+        return unreached.isdisjoint(self._cell(spot) for spot in near)
 
     def route(self, start: Point, goal: Point) -> list[Point]:
         """Waypoints from ``start`` to ``goal``, both included, joined by clear straight lines.
