@@ -46,20 +46,19 @@ def asked(calls: Sequence[Any], workers: int, said: list[str] | None = None) -> 
 @pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("workers", mostly_slow([2, 1, 3]))
-def test_results_are_in_the_order_of_the_calls(started: list[Any], workers: int) -> None:
+def test_results_are_in_the_order_of_the_calls_that_each_process_makes(
+    started: list[Any], workers: int
+) -> None:
     said: list[str] = []
-    assert asked(POWERS, workers, said) == RESULTS
+    calls = [call for power in POWERS for call in (power, os.getpid)]
+    results = asked(calls, workers, said)
+    assert results[::2] == RESULTS
+    assert set(results[1::2]) == {os.getpid(), *(each._process.pid for each in started)}
     assert len(started) == workers
     assert said == []
 
 
 @pytest.mark.slow
-@pytest.mark.seconds
-def test_each_process_calls(started: list[Any]) -> None:
-    pids = asked([os.getpid] * COUNT, 2)
-    assert set(pids) == {os.getpid(), *(process._process.pid for process in started)}
-
-
 @pytest.mark.seconds
 @pytest.mark.parametrize(("killed", "after"), mostly_slow([(1, 20), (2, 1), (2, 50), (1, 0)]))
 def test_a_killed_process_costs_nothing_but_time(
@@ -86,7 +85,7 @@ def test_a_killed_process_costs_nothing_but_time(
 
 @pytest.mark.slow
 @pytest.mark.seconds
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_error_of_a_call_is_raised_and_ends_the_processes(
     started: list[Any], workers: int
 ) -> None:

@@ -59,7 +59,7 @@ def runs(mapfold: Commands) -> list[str]:
     for flag, name, run in (
         ("--map", "a", drive(building, "a", 1, 200)),
         ("--query", "b", drive(building, "b", 2, 80)),
-        ("--query", "x", drive(stranger, "x", 3, 80)),
+        ("--query", "x", drive(stranger, "x", 3, rounds(80, 40))),
     ):
         log, truth = save(mapfold.folder, name, run)
         arguments += [flag, str(log), "--truth", str(truth)]

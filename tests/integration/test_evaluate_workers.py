@@ -17,7 +17,7 @@ from tests.commands import Commands
 from tests.integration.test_evaluate_command import save
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
-from tests.thorough import THOROUGH, rounds
+from tests.thorough import THOROUGH, mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence", places="rooms")
 
@@ -110,18 +110,18 @@ def _cut(keyframe: Keyframe, dimension: int) -> Keyframe:
     return replace(keyframe, accepted=cut)
 
 
-@pytest.mark.slow
 @pytest.mark.seconds
+@pytest.mark.parametrize(("self_", "many"), mostly_slow([(False, 1), (True, 2)]))
 def test_scores_of_several_maps_are_those_of_one_process(
-    folder: Path, used: list[int], capsys: pytest.CaptureFixture[str]
+    folder: Path, used: list[int], capsys: pytest.CaptureFixture[str], self_: bool, many: int
 ) -> None:
     found = []
-    for workers in (0, 2):
+    for workers in (0, many):
         command(
             [folder / "a", folder / "x"],
             [folder / "b"],
             [folder / f"{name}.truth.jsonl.gz" for name in "abx"],
-            self_=True,
+            self_=self_,
             workers=workers,
             json_=True,
         )

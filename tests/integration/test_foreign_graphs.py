@@ -51,8 +51,10 @@ def make(pg: psycopg.Connection, *statements: str) -> None:
 
 
 @pytest.mark.seconds
-@pytest.mark.parametrize("act", [by_replay, by_tail])
-@pytest.mark.parametrize("labels", [(), (LABELS,)], ids=["bare", "with labels"])
+@pytest.mark.parametrize(
+    ("labels", "act"),
+    mostly_slow([((LABELS,), by_replay), ((), by_tail), ((LABELS,), by_tail), ((), by_replay)], 2),
+)
 def test_an_empty_graph_is_adopted(
     log: Path,
     rows: object,

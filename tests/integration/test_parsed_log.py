@@ -135,7 +135,7 @@ def test_damage_is_named_as_by_one_process(tmp_path: Path, kind: str) -> None:
     expected = one_process(path)
     assert expected[0]
     assert expected[1] is not None
-    with parsing(path, 2) as parsed:
+    with parsing(path, rounds(2, 1)) as parsed:
         assert gathered(parsed.stretches()) == expected
 
 
@@ -240,7 +240,7 @@ def test_a_log_that_grows_and_is_sealed_meanwhile(tmp_path: Path) -> None:
                 writer.sync()
         writer.sync()
         expected = one_process(path)
-        with parsing(path, 2) as parsed:
+        with parsing(path, rounds(2, 1)) as parsed:
             found = parsed.stretches()
             first = [comparable(each) for each in next(found)]
             for k in range(100, 200):

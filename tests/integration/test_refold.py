@@ -54,7 +54,7 @@ def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", documents)
 
 
-@pytest.fixture(params=["two_databases", "one_database"][: rounds(2, 1)])
+@pytest.fixture(params=["one_database", "two_databases"][: rounds(2, 1)])
 def targets(request: pytest.FixtureRequest) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
     return found

@@ -211,7 +211,8 @@ def test_what_cannot_be_recorded_is_said(
 ) -> None:
     (mapfold.folder / "file").touch()
     (mapfold.folder / "folder").mkdir()
-    assert says in mapfold("export", SAMPLE, *options, code=2).err
+    log = write_log(mapfold.folder / "log", [envelope(0), envelope(1)])
+    assert says in mapfold("export", log, *options, code=2).err
     assert not list(mapfold.folder.glob("*.partial"))
 
 

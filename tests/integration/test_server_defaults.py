@@ -92,16 +92,15 @@ def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Co
     "setting",
     mostly_slow(
         [
-            "client_encoding = 'LATIN1'",
             "extra_float_digits = 0",
+            "client_encoding = 'LATIN1'",
             "search_path = ''",
             "default_transaction_isolation = 'serializable'",
             "datestyle = 'German'",
             "array_nulls = off",
             "timezone = 'Asia/Kathmandu'",
             "standard_conforming_strings = off",
-        ],
-        2,
+        ]
     ),
 )
 def test_output_formats_of_the_server_change_no_value(

@@ -94,12 +94,13 @@ def test_a_kill_while_writing_leaves_nothing_that_is_used(log: Path, right: str)
 @pytest.mark.slow
 @pytest.mark.seconds
 def test_many_processes_at_once(log: Path, right: str) -> None:
-    with ThreadPoolExecutor(20) as pool:
+    count = rounds(20, 10)
+    with ThreadPoolExecutor(count) as pool:
         for _ in range(rounds(3, 1)):
-            done = list(pool.map(lambda _: run(log, "plain"), range(20)))
+            done = list(pool.map(lambda _: run(log, "plain"), range(count)))
             assert [(each.returncode, each.stderr, each.stdout.decode()) for each in done] == [
                 (0, b"", right)
-            ] * 20
+            ] * count
             files = [path.name.replace(".", "-").split("-") for path in kept(log)]
             parts = sorted((int(f[1]), int(f[2])) for f in files if f[-1] == "npz")
             (fold,) = (int(f[1]) for f in files if f[-1] == "fold")
@@ -160,7 +161,7 @@ def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: i
 @pytest.mark.slow
 def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
     with kept_early(), Timeline(log, RULES) as timeline:
-        for first in range(EVENTS, EVENTS + 40, 10):
+        for first in range(EVENTS, EVENTS + rounds(40, 20), 10):
             view = timeline.at(EVENTS // 2)
             write_log(log, drive(first, first + 10))
             timeline.refresh()
