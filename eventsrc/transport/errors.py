@@ -53,7 +53,7 @@ class transport_errors:  # noqa: N801 (used as a function is)
     """Turn what Zenoh raises into a TransportError that begins with ``place``.
 
     The message names a panic as such: the session may be unusable afterwards. May be entered again
-    and again; a generator would take 1.5 µs more for each message sent.
+    and again; a generator would take 1 µs more for each message sent.
     """
 
     def __init__(self, place: str) -> None:
