@@ -206,25 +206,25 @@ def test_an_older_envelope_keeps_its_version_and_verbatim_messages_are_passed_ov
     assert "passed over: /tf: 1 message, cdr tf2_msgs/msg/TFMessage, without the schema's" in said
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"logged_ns": -1},
-        {"logged_ns": 2**63},
-        {"stamp_ns": 1.5},
-        {"stamp_ns": True},
-        {"key": ""},
-        {"key": None},
-        {"payload": None, "payload_base64": "no base64"},
-    ],
-)
-def test_a_line_of_log_cat_with_a_wrong_field_is_rejected_whole(
-    run: Commands, damage: dict[str, Any]
-) -> None:
+DAMAGES: list[dict[str, Any]] = [
+    {"logged_ns": -1},
+    {"logged_ns": 2**63},
+    {"stamp_ns": 1.5},
+    {"stamp_ns": True},
+    {"key": ""},
+    {"key": None},
+    {"payload": None, "payload_base64": "no base64"},
+]
+
+
+def test_a_line_of_log_cat_with_a_wrong_field_is_rejected_whole(run: Commands) -> None:
     line = {"offset": 0, "logged_ns": 1, "stamp_ns": 2, "key": "k", "payload": envelope(1)}
+    lines = [payload({**line, **damage}) for damage in DAMAGES]
     run("import", "L", "-", stdin=payload(line))
-    run("import", "L", "-", stdin=payload({**line, **damage}), code=3)
+    run("import", "L", "-", stdin=lines[0], code=3)
     assert keys_of(run) == ["k", REJECTED_KEY]
+    run("import", "L", "-", stdin=b"\n".join(lines[1:]), code=3)
+    assert keys_of(run) == ["k", *[REJECTED_KEY] * len(DAMAGES)]
 
 
 def test_an_envelope_with_fields_of_that_name_is_an_envelope(run: Commands) -> None:

@@ -12,7 +12,7 @@ from projections.calibrate.sightings import sightings_of
 from projections.evidence import EvidenceConstants
 from projections.settings import Camera
 from tests.known_worlds import CAMERA, Known, rows_of
-from tests.thorough import mostly_slow
+from tests.thorough import mostly_slow, rounds
 
 PRIOR = EvidenceConstants()
 WORLDS = {
@@ -190,7 +190,7 @@ def test_the_numbers_of_things_do_not_matter() -> None:
 
 
 def test_a_wrong_field_of_view_is_noticed() -> None:
-    known = Known(bearing_rad=0.02, pose_m=0.03, side_by="heading", looks=30)
+    known = Known(bearing_rad=0.02, pose_m=0.03, side_by="heading", looks=rounds(30, 15))
     rows = rows_of(known)
     assert read(sightings_of(rows), PRIOR, PRIOR).camera == ()
     for hfov, sign in ((100.0, 1.0), (62.0, -1.0)):

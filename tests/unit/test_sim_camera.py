@@ -23,6 +23,7 @@ from eventsrc.sim.pictures import (
     write_pictures,
 )
 from eventsrc.sim.tour import TruePose, drive, plan_tour
+from tests.thorough import mostly_slow
 
 STEP_M = 0.004
 
@@ -107,7 +108,7 @@ def test_it_sees_what_the_simulated_detector_sees(house: House, poses: list[True
     assert hidden <= 0.15 * seen
 
 
-@pytest.mark.parametrize("seed", [7, 12])
+@pytest.mark.parametrize("seed", mostly_slow([7, 12]))
 def test_colours_differ_and_those_of_a_class_by_hue(seed: int) -> None:
     house = build_house(seed)
     colours = thing_colours(house)
