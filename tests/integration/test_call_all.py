@@ -46,14 +46,15 @@ def asked(calls: Sequence[Any], workers: int, said: list[str] | None = None) -> 
 @pytest.mark.slow
 @pytest.mark.seconds
 @pytest.mark.parametrize("workers", mostly_slow([2, 1, 3]))
-def test_results_are_in_the_order_of_the_calls_that_each_process_makes(
+def test_results_are_in_the_order_of_the_calls_whichever_process_makes_them(
     started: list[Any], workers: int
 ) -> None:
     said: list[str] = []
     calls = [call for power in POWERS for call in (power, os.getpid)]
     results = asked(calls, workers, said)
     assert results[::2] == RESULTS
-    assert set(results[1::2]) == {os.getpid(), *(each._process.pid for each in started)}
+    # Each has answered a call before (see ``started``); on a busy machine one may get no further.
+    assert set(results[1::2]) <= {os.getpid(), *(each._process.pid for each in started)}
     assert len(started) == workers
     assert said == []
 
