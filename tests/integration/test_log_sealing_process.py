@@ -13,7 +13,7 @@ from eventsrc.errors import LogDamaged
 from eventsrc.log import ALWAYS, LogWriter, seal_worker, verify_log
 from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.mcap_records import MARK_BYTES
-from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal
+from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal, write_sealed
 from eventsrc.log.seal_process import ProcessGone, SealingProcess
 from tests import prefork
 from tests.fixtures_log import KEY, read_log
@@ -50,33 +50,19 @@ def test_it_writes_the_bytes_that_the_writer_would_write(tmp_path: Path) -> None
     assert {p.name for p in plan.log.iterdir()} == {"lock", sealed.name, active.name}
 
 
-def is_cached(path: Path) -> bool:
-    """Whether the first bytes of a file are in the system's page cache."""
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        return os.preadv(fd, [bytearray(1)], 0, os.RWF_NOWAIT) == 1
-    except BlockingIOError:
-        return False
-    finally:
-        os.close(fd)
-
-
-@pytest.mark.skipif(not hasattr(os, "RWF_NOWAIT"), reason="only Linux tells what is cached")
-def test_what_it_has_sealed_leaves_the_page_cache(tmp_path: Path) -> None:
-    plan = killed_writer(tmp_path / "log", events=400)  # more than a page is sealed of them
-    active = tmp_path / "log" / f"{FIRST_SEGMENT}.mcap.active"
-    assert is_cached(active)
-    process = SealingProcess()
-    process.seal(plan)
-    process.close()
-    sealed = tmp_path / "log" / f"{FIRST_SEGMENT}.mcap"
-    assert sealed.stat().st_size > os.sysconf("SC_PAGE_SIZE")
-    fd = os.open(active, os.O_RDWR)
-    os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
-    os.close(fd)
-    if is_cached(active):
-        pytest.skip("this file system keeps files in memory")
-    assert not is_cached(sealed)
+@pytest.mark.skipif(not hasattr(os, "posix_fadvise"), reason="no such call on this system")
+@pytest.mark.parametrize("cached", [True, False])
+def test_what_is_sealed_leaves_the_page_cache_unless_it_is_to_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, cached: bool
+) -> None:
+    advised: list[tuple[int, int, int]] = []
+    monkeypatch.setattr(os, "posix_fadvise", lambda _, *advice: advised.append(advice))
+    plan = killed_writer(tmp_path / "log")
+    file = ActiveFile(tmp_path / "log" / f"{FIRST_SEGMENT}.mcap.active", Offset(0))
+    sealed = tmp_path / "sealed"
+    write_sealed(plan, (file.read_chunk(chunk) for chunk in file.chunks), sealed, cached=cached)
+    size = sealed.stat().st_size
+    assert advised == ([] if cached else [(0, size, os.POSIX_FADV_DONTNEED)])
 
 
 def test_it_starts_where_the_module_path_has_entries_that_python_passes_over(
