@@ -12,33 +12,9 @@ from typing import Any, ClassVar
 
 from eventsrc.crc import crc32
 from eventsrc.envelope import FIRST_OFFSET, Offset
+from projections import deltas
 from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.deltas import (
-    Delta,
-    EventSkipped,
-    KeyframeAdded,
-    KeyframePlaced,
-    MapGiven,
-    MergeRefused,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectMoved,
-    ObjectOrdinal,
-    ObjectRelocated,
-    ObjectSeen,
-    ObjectsMerged,
-    ObservationAdded,
-    PlaceChanged,
-    PlaceFormed,
-    PlaceNamed,
-    PlaceOrdinal,
-    PlacesLinked,
-    PlacesMerged,
-    RunSeen,
-    SkipKind,
-)
+from projections.deltas import Delta, ObjectOrdinal, PlaceOrdinal, SkipKind
 from projections.place_types import PlaceType, place_type
 from projections.reducers.current_map import map_in_force
 from projections.reducers.survivors import ObjectSurvivors, PlaceSurvivors
@@ -94,17 +70,17 @@ class MapView:
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
         self.contents = PlaceContents()
-        self.maps: dict[str | None, MapGiven] = {}
+        self.maps: dict[str | None, deltas.MapGiven] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
     def apply(self, delta: Delta) -> None:
         """Apply one delta."""
         self._APPLIERS[type(delta)](self, delta)
 
-    def apply_event(self, offset: Offset, deltas: Iterable[Delta]) -> None:
+    def apply_event(self, offset: Offset, changes: Iterable[Delta]) -> None:
         """Apply all deltas of the event at ``offset`` and advance past it."""
         appliers = self._APPLIERS
-        for delta in deltas:
+        for delta in changes:
             appliers[type(delta)](self, delta)
         self.next_offset = Offset(offset + 1)
 
@@ -133,11 +109,11 @@ class MapView:
         return next((k.floor for k in self.keyframes if k.pose is not None), None)
 
     @property
-    def map(self) -> MapGiven | None:
+    def map(self) -> deltas.MapGiven | None:
         """The occupancy map in force on the first floor."""
         return map_in_force(self.maps, self.first_floor, is_first=True) if self.maps else None
 
-    def maps_in_force(self) -> dict[str | None, MapGiven]:
+    def maps_in_force(self) -> dict[str | None, deltas.MapGiven]:
         """The occupancy map of each floor that has one, ordered by offset."""
         found = dict(self.maps)
         if None in self.maps:
@@ -165,13 +141,13 @@ class MapView:
         """(a, b, shared_transitions), ascending."""
         return [(a, b, n) for (a, b), n in sorted(self.adjacency.items())]
 
-    def _run_seen(self, delta: RunSeen) -> None:
+    def _run_seen(self, delta: deltas.RunSeen) -> None:
         if delta.run == len(self.runs):
             self.runs.append(RunRecord(delta.run, delta.run_id, delta.started_at))
         else:
             self.runs[delta.run].started_at = delta.started_at
 
-    def _keyframe_added(self, delta: KeyframeAdded) -> None:
+    def _keyframe_added(self, delta: deltas.KeyframeAdded) -> None:
         if delta.keyframe < len(self.keyframes):
             return
         self.runs[delta.run].keyframe_count += 1
@@ -191,7 +167,7 @@ class MapView:
         if delta.floor is not None:
             self.floors.setdefault(delta.floor, len(self.floors))
 
-    def _observation_added(self, delta: ObservationAdded) -> None:
+    def _observation_added(self, delta: deltas.ObservationAdded) -> None:
         if delta.observation < len(self.observations):
             return
         keyframe = self.keyframes[delta.keyframe]
@@ -214,18 +190,18 @@ class MapView:
             )
         )
 
-    def _event_skipped(self, delta: EventSkipped) -> None:
+    def _event_skipped(self, delta: deltas.EventSkipped) -> None:
         if delta.offset >= self.next_offset:
             self.skipped[delta.kind] = self.skipped.get(delta.kind, 0) + 1
 
-    def _place_formed(self, delta: PlaceFormed) -> None:
+    def _place_formed(self, delta: deltas.PlaceFormed) -> None:
         if delta.place < len(self.all_places):
             return
         place = PlaceRecord(delta.place, delta.place_id, delta.founder, delta.offset)
         self.all_places.append(place)
         self.places[delta.place] = place
 
-    def _places_merged(self, delta: PlacesMerged) -> None:
+    def _places_merged(self, delta: deltas.PlacesMerged) -> None:
         survivor = self.all_places[delta.survivor]
         for ordinal in delta.absorbed:
             absorbed = self.places.pop(ordinal, None)
@@ -239,32 +215,32 @@ class MapView:
             absorbed.unordered_members = []
             self.survivors.merge(delta.survivor, (ordinal,))
 
-    def _keyframe_placed(self, delta: KeyframePlaced) -> None:
+    def _keyframe_placed(self, delta: deltas.KeyframePlaced) -> None:
         keyframe = self.keyframes[delta.keyframe]
         if keyframe.joined is None:
             keyframe.joined = delta.place
             self.all_places[delta.place].unordered_members.append(delta.keyframe)
 
-    def _place_changed(self, delta: PlaceChanged) -> None:
+    def _place_changed(self, delta: deltas.PlaceChanged) -> None:
         place = self.all_places[delta.place]
         place.keyframe_count = delta.keyframe_count
         place.sum_x_um = delta.sum_x_um
         place.sum_y_um = delta.sum_y_um
 
-    def _place_named(self, delta: PlaceNamed) -> None:
+    def _place_named(self, delta: deltas.PlaceNamed) -> None:
         place = self.all_places[delta.place]
         place.name, place.name_offset = delta.name, delta.command
 
-    def _merge_refused(self, delta: MergeRefused) -> None:
+    def _merge_refused(self, delta: deltas.MergeRefused) -> None:
         """The places stay as they are."""
 
-    def _object_found(self, delta: ObjectFound) -> None:
+    def _object_found(self, delta: deltas.ObjectFound) -> None:
         if delta.object == len(self.all_objects):
             found = ObjectRecord(delta.object, delta.object_id, delta.class_name)
             self.all_objects.append(found)
             self.objects[delta.object] = found
 
-    def _object_seen(self, delta: ObjectSeen) -> None:
+    def _object_seen(self, delta: deltas.ObjectSeen) -> None:
         found = self.all_objects[delta.object]
         observation = self.observations[delta.observation]
         if observation.object is None:
@@ -280,7 +256,7 @@ class MapView:
         if not is_counted:
             self.contents.update(found)
 
-    def _objects_merged(self, delta: ObjectsMerged) -> None:
+    def _objects_merged(self, delta: deltas.ObjectsMerged) -> None:
         survivor = self.all_objects[delta.survivor]
         absorbed = self.objects.pop(delta.absorbed, None)
         if absorbed is not None:
@@ -299,7 +275,7 @@ class MapView:
         survivor.last_seen = delta.last_seen
         self.contents.update(survivor)
 
-    def _object_estimated(self, delta: ObjectEstimated) -> None:
+    def _object_estimated(self, delta: deltas.ObjectEstimated) -> None:
         self.all_objects[delta.object].estimate = Estimate(
             delta.x_um,
             delta.y_um,
@@ -309,17 +285,17 @@ class MapView:
             delta.spots,
         )
 
-    def _object_classified(self, delta: ObjectClassified) -> None:
+    def _object_classified(self, delta: deltas.ObjectClassified) -> None:
         found = self.all_objects[delta.object]
         found.class_name = delta.class_name
         self.contents.update(found)
 
-    def _object_missing(self, delta: ObjectMissing) -> None:
+    def _object_missing(self, delta: deltas.ObjectMissing) -> None:
         found = self.all_objects[delta.object]
         found.misses = delta.misses
         found.missing_in = delta.run if delta.missing else None
 
-    def _object_relocated(self, delta: ObjectRelocated) -> None:
+    def _object_relocated(self, delta: deltas.ObjectRelocated) -> None:
         found = self.all_objects[delta.object]
         found.misses, found.missing_in = 0, None
         moved = Relocation(
@@ -333,43 +309,43 @@ class MapView:
         if moved not in found.relocations:
             found.relocations.append(moved)
 
-    def _object_moved(self, delta: ObjectMoved) -> None:
+    def _object_moved(self, delta: deltas.ObjectMoved) -> None:
         found = self.all_objects[delta.object]
         found.place = delta.place
         self.contents.update(found)
 
-    def _places_linked(self, delta: PlacesLinked) -> None:
+    def _places_linked(self, delta: deltas.PlacesLinked) -> None:
         if delta.shared_transitions:
             self.adjacency[delta.a, delta.b] = delta.shared_transitions
         else:
             self.adjacency.pop((delta.a, delta.b), None)
 
-    def _map_given(self, delta: MapGiven) -> None:
+    def _map_given(self, delta: deltas.MapGiven) -> None:
         self.maps[delta.map.floor] = delta
 
     # Functions of the class, not bound methods: a view that refers to itself would stay in memory,
     # once it is no longer used, until Python looks for cycles.
     _APPLIERS: ClassVar[dict[type, Callable[["MapView", Any], None]]] = {
-        RunSeen: _run_seen,
-        KeyframeAdded: _keyframe_added,
-        ObservationAdded: _observation_added,
-        EventSkipped: _event_skipped,
-        PlaceFormed: _place_formed,
-        PlacesMerged: _places_merged,
-        MergeRefused: _merge_refused,
-        KeyframePlaced: _keyframe_placed,
-        PlaceChanged: _place_changed,
-        PlaceNamed: _place_named,
-        ObjectFound: _object_found,
-        ObjectSeen: _object_seen,
-        ObjectsMerged: _objects_merged,
-        ObjectEstimated: _object_estimated,
-        ObjectClassified: _object_classified,
-        ObjectMissing: _object_missing,
-        ObjectRelocated: _object_relocated,
-        ObjectMoved: _object_moved,
-        PlacesLinked: _places_linked,
-        MapGiven: _map_given,
+        deltas.RunSeen: _run_seen,
+        deltas.KeyframeAdded: _keyframe_added,
+        deltas.ObservationAdded: _observation_added,
+        deltas.EventSkipped: _event_skipped,
+        deltas.PlaceFormed: _place_formed,
+        deltas.PlacesMerged: _places_merged,
+        deltas.MergeRefused: _merge_refused,
+        deltas.KeyframePlaced: _keyframe_placed,
+        deltas.PlaceChanged: _place_changed,
+        deltas.PlaceNamed: _place_named,
+        deltas.ObjectFound: _object_found,
+        deltas.ObjectSeen: _object_seen,
+        deltas.ObjectsMerged: _objects_merged,
+        deltas.ObjectEstimated: _object_estimated,
+        deltas.ObjectClassified: _object_classified,
+        deltas.ObjectMissing: _object_missing,
+        deltas.ObjectRelocated: _object_relocated,
+        deltas.ObjectMoved: _object_moved,
+        deltas.PlacesLinked: _places_linked,
+        deltas.MapGiven: _map_given,
     }
 
     def counts(self) -> dict[str, int]:
