@@ -10,6 +10,7 @@ from PIL import Image
 from eventsrc.errors import MisuseError
 from eventsrc.importers.map_yaml import MAX_YAML_BYTES, read_map_yaml
 from tests.maps import cells, write_map_yaml
+from tests.thorough import rounds
 
 DRAWING = """
     #####
@@ -133,7 +134,7 @@ def test_what_is_wrong_is_named_in_one_line(
         (b"image: \x07", "no YAML: "),
         (b"resolution: .nan\nimage: a\norigin: [0,0,0]", "resolution: Input should be a finite"),
         (b"resolution: " + b"9" * 5000, "no YAML: "),
-        (b"[" * 2_000, "no YAML: "),
+        (b"[" * rounds(20_000, 2_000), "no YAML: "),
         (b"x" * (MAX_YAML_BYTES + 1), "larger than 65,536 bytes; is this the right file?"),
         (b"!!python/object/apply:os.system ['true']", "no YAML: could not determine"),
     ],
