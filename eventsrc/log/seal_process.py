@@ -8,7 +8,7 @@ segment, cannot send its answer, deletes its file and ends. So no process of a d
 log that the next writer holds.
 
 What is synced of a sealed segment leaves the page cache. A long recording would otherwise fill the
-memory with segments that nobody reads soon, and new memory is slower to write to than memory just
+memory with segments that are not read soon, and new memory is slower to write to than memory just
 used: in a virtual machine each event took 3 to 7 µs more.
 
 One JSON document a line: a plan goes in, ``{"sha256": …, "temporary": …}`` or an error comes out.

@@ -207,6 +207,5 @@ def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]
         yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
     else:
         for message in check([Received(derived.key, derived.payload)]):
-            yield msgspec.structs.replace(
-                message, sha256=""
-            )  # no robot sent it, so none is answered
+            # no robot sent it, so none is answered
+            yield msgspec.structs.replace(message, sha256="")
