@@ -4,7 +4,7 @@ A transform is the pose of a child frame in its parent: x, y, z in metres and a 
 Between two samples of a link the position is interpolated linearly and the rotation by slerp, as
 tf2 does; beyond the first and last sample there is nothing. Samples may come in any order. Unlike
 tf2, two samples farther apart than ``max_gap_ns`` are not interpolated, and memory is bounded by a
-number of samples, not by time, so that one stamp in the far future forgets nothing.
+number of samples, not by time, so that one stamp in the far future removes no samples.
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 from eventsrc.envelope import MAX_POSITION_M
 
 MAX_SAMPLES: Final = 200_000
-"""Samples that a buffer keeps. When there are more, every link forgets its older half."""
+"""Samples that a buffer keeps. When there are more, the older half of each link is deleted."""
 MAX_FRAMES: Final = 2_000
 _MAX_DEPTH: Final = 100
 """Links from a frame up to the root; more is a circle."""
@@ -203,7 +203,7 @@ def _merged(links: list[_Link]) -> list[_Link]:
 
 class TransformBuffer:
     """Links by child frame. A static link stands for all times and is not replaced by a moving
-    one; a child that gets another parent forgets what it had under the first."""
+    one; when a child gets another parent, its samples under the first are deleted."""
 
     def __init__(self, max_gap_ns: int, max_samples: int = MAX_SAMPLES) -> None:
         self._max_gap_ns = max_gap_ns

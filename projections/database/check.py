@@ -5,7 +5,7 @@ writing. Both sides stream in the order of their ids and are merged: only the ma
 memory. Properties are compared as values with their types, not as text: the server orders keys
 and writes floats in its own way.
 
-Foreign tables are labels, tables and rows without a label that somebody else has made in the
+Foreign tables are labels, tables and rows without a label that another program has made in the
 graph's schema: ``CREATE (n:Door)`` makes a label, which is a table; rows without a label are in the
 tables that all labels inherit from. A rebuild replaces the graph and so drops them.
 """

@@ -76,7 +76,7 @@ def adopt_if_empty(connection: Connection, graph: str) -> None:
         return  # its place is taken until the next replay
     parents = sql.SQL(", ").join(sql.Identifier(graph, parent) for parent in PARENTS)
     connection.execute(run["lock"].format(tables=parents))
-    if not _is_empty(connection, graph):  # somebody has written to it meanwhile
+    if not _is_empty(connection, graph):  # written to meanwhile
         return
     _use_age(connection)
     connection.execute(run["mark"].format(graph=sql.Identifier(graph)))

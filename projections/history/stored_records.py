@@ -1,7 +1,7 @@
 """Records of a map as of an offset, made from the columns of a history.
 
-The members of a place and the observations of an Object are most of them: they are made when
-somebody asks for them.
+The members of a place and the observations of an Object are most of them: they are made on
+first access.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """The map at any offset, made from the columns of a history without folding.
 
 Counts, places and objects are computed from whole columns. Keyframes and observations are made one
-by one when somebody asks for them, and all of them before the view is changed.
+by one on first access, and all of them before the view is changed.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -67,7 +67,7 @@ class StoredView(MapView):
         self.floors = {name: number for number, name in enumerate(floors_of(moment))}
         for given in history.maps[: moment.count("map")] if moment.count("map") else ():
             self.maps[given.map.floor] = given
-        # Made when somebody asks for them: they are most of a map.
+        # Made on first access: they are most of a map.
         del self.keyframes, self.observations
         self.advance(end)
 

@@ -3,7 +3,7 @@
 For each choice of settings and commands in force there are parts, ``KEY-START-END.npz``, of which
 each has the history of the events from START to before END, and the fold at the last END,
 ``KEY-END.fold``, from which it is folded on. ``KEY-END.VERSION.digest`` has the digest of the map
-after END events, of the moments that somebody asked for last. Files appear whole (written beside,
+after END events, of the moments asked for last. Files appear whole (written beside,
 then renamed) and are never changed, so any number of processes may read and write: the same log
 gives the same files.
 

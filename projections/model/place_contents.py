@@ -2,7 +2,7 @@
 
 An Object counts for the place that it is located in, by its class; one that was observed once is
 counted apart (`projections.place_types.ONCE`). ``touched`` are the places whose counts have changed
-since somebody emptied it.
+since it was emptied last.
 """
 
 from collections.abc import Mapping

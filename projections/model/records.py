@@ -75,7 +75,7 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
     ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
-    name of the floor that the pose is on, where the log tells it.
+    name of the floor that the pose is on, where the log states it.
     """
 
     ordinal: KeyframeOrdinal

@@ -164,7 +164,7 @@ class Adjacency:
         return linked
 
     def dump(self) -> State:
-        """Everything, for a snapshot: the same for equal states, whichever way they came about."""
+        """Everything, for a snapshot: the same for equal states, however they were reached."""
         columns = {run: placed.columns() for run, placed in sorted(self.placed.items())}
         edges = [[a, b, n] for a, row in self.edges.items() for b, n in row.items() if a < b]
         return {

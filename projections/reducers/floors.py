@@ -1,6 +1,6 @@
 """Floors: which one a pose is on, and how reducers that know only x and y keep them apart.
 
-An envelope names its floor (``floor``), or its height ``map_z`` tells it: floor n is nearest to
+An envelope names its floor (``floor``), or its height ``map_z`` gives it: floor n is nearest to
 n × ``floor_height_m``, a height half-way belongs to the upper one. So 2.8 m is floor "1" at 3 m a
 floor, and the same floor as that of an envelope with ``"floor": 1``. Poses without either are on a
 floor of their own, which has no name.

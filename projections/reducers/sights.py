@@ -10,7 +10,7 @@ position in the direction across it, and the bearing error is at least that of t
 
 The box's height and its centre's height above the horizon, where the border cuts it neither at top
 nor at bottom, tell about the distance once they are compared (`spots`). A measured depth or
-position of the detection tells it directly.
+position of the detection gives it directly.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Connection pools to the live databases, which survive a restart of the server.
 
 A lost connection is noticed when it is used. Then the server is restarted if it is the embedded
-one, else waited for, and the question is asked once more on a new connection; so a restart of the
+one, else waited for, and the question is repeated on a new connection; so a restart of the
 database costs no answer. After ``OUTAGE_TIMEOUT_S`` of an outage questions fail at once.
 """
 

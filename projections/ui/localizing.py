@@ -138,7 +138,7 @@ def _match(match: Match, candidates: Candidates) -> dict[str, Any]:
 def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The crops of a mapped keyframe as a question, and its pose in the map, the ``truth``.
 
-    ``ask_at`` is a W at which the map knows nothing of the keyframe's run, or not of the keyframe.
+    ``ask_at`` is a W at which the map lacks the keyframe's run, or the keyframe.
     """
     moment = Moment.of(shown, query)
     history = moment.known.history

@@ -58,7 +58,7 @@ class LogMap:
             progress=progress,
             reader=self.reader,
             histories=histories,
-            cache=opened.cache and not sets,  # what somebody tries out is not kept
+            cache=opened.cache and not sets,  # a trial of settings is not kept
         )
         self.log_events = LogEvents()
         self.log_id = self.reader.log_id
