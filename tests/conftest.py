@@ -13,6 +13,8 @@ from tests.thorough import examples
 settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
 settings.load_profile("mapfold")
 
+MANY_FILES = 300
+
 pytest_plugins = [
     "tests.fixtures_postgres",
     "tests.fixtures_log",
@@ -45,6 +47,13 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
         gc.set_threshold(20_000, 20, 20)
         gc.enable()
+
+
+def pytest_runtest_logfinish() -> None:
+    """Close the files and sockets that only cycles of unused objects hold, before `select` and
+    processes with a limit of 1,024 have too many of them."""
+    if sum(1 for _ in Path("/dev/fd").iterdir()) > MANY_FILES:
+        gc.collect()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

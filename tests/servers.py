@@ -103,12 +103,16 @@ def kill_postgres(server: EmbeddedServer) -> None:
     Each notices by itself, some later than others, and serves its client until then.
     """
     with psycopg.connect(server.url, autocommit=True) as witness, contextlib.ExitStack() as stack:
-        sessions = []
+        waiting, sessions = select.poll(), set()
         for (pid,) in witness.execute("SELECT pid FROM pg_stat_activity").fetchall():
-            sessions.append(os.pidfd_open(pid))
-            stack.callback(os.close, sessions[-1])
+            session = os.pidfd_open(pid)
+            stack.callback(os.close, session)
+            waiting.register(session, select.POLLIN)
+            sessions.add(session)
         os.kill(int((server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
         while sessions:
-            ended, _, _ = select.select(sessions, [], [], WAIT_S)
+            ended = waiting.poll(WAIT_S * 1000)
             assert ended, "a session outlives its server"
-            sessions = [session for session in sessions if session not in ended]
+            for session, _ in ended:
+                waiting.unregister(session)
+                sessions.remove(session)
