@@ -4,6 +4,7 @@ import http.client
 import json
 import os
 import re
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -83,12 +84,18 @@ class UiServer(ReadyProgram):
 
     @contextmanager
     def live(self) -> Iterator[Iterator[dict[str, Any]]]:
-        """The events of ``/api/live``, as they come."""
+        """The events of ``/api/live``, as they come. While the server refuses, the request is
+        repeated: a stream that was closed is counted until the server notices it."""
+        deadline = time.monotonic() + WAIT_S
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT_S)
         try:
-            connection.request("GET", "/api/live")
-            got = connection.getresponse()
-            assert got.status == 200
+            while True:
+                connection.request("GET", "/api/live")
+                got = connection.getresponse()
+                if got.status != 503 or time.monotonic() > deadline:
+                    break
+                got.read()
+            assert got.status == 200, got.read()
             assert got.getheader("content-type", "").startswith("text/event-stream")
             yield (
                 json.loads(line.removeprefix(b"data: "))
