@@ -1,7 +1,8 @@
-"""Processor time of running processes, from /proc."""
+"""Processor time of running processes and of the machine, from /proc."""
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 _TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -30,3 +31,26 @@ def family_cpu_seconds(pid: int) -> float:
         elif int(fields[1]) == pid:
             total += sum(map(int, fields[11:13]))
     return total / _TICKS
+
+
+class UnusedCpu(NamedTuple):
+    """Processor time that no program got, in seconds summed over all processors: idle, idle while
+    a program waited for the disk, and taken by the host of a virtual machine ("steal")."""
+
+    idle: float
+    disk: float
+    host: float
+
+    def since(self, before: "UnusedCpu") -> "UnusedCpu":
+        """The difference to an earlier reading."""
+        return UnusedCpu(*(b - a for a, b in zip(before, self, strict=True)))
+
+
+def unused_cpu() -> UnusedCpu | None:
+    """The machine's unused processor time since its start; None where there is no /proc/stat."""
+    try:
+        first = Path("/proc/stat").read_text().splitlines()[0]
+    except FileNotFoundError:
+        return None
+    ticks = list(map(int, first.split()[1:]))
+    return UnusedCpu(ticks[3] / _TICKS, ticks[4] / _TICKS, ticks[7] / _TICKS)

@@ -66,6 +66,9 @@ def say_recording(what: str, done: Recording, wanted: str) -> None:
     each = done.cpu_us
     parts = ", ".join(f"{name} {each[name]:.1f}" for name in each)
     say(f"  processor µs for each event: {parts}", f"{sum(each.values()):.1f} µs", "")
+    if (unused := done.unused) is not None:
+        parts = f"idle {unused.idle:.0%}, idle while waiting for the disk {unused.disk:.0%}"
+        say(f"  processors: {parts}, taken by the host", f"{unused.host:.0%}", "")
     say("  one-minute load of the machine", f"{os.getloadavg()[0]:.1f}", "")
 
 

@@ -16,7 +16,7 @@ from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log_info import log_info
 from eventsrc.recorder import Recorder
 from eventsrc.transport.session import ZenohOptions, open_session
-from tests.cpu_time import cpu_seconds
+from tests.cpu_time import UnusedCpu, cpu_seconds, unused_cpu
 
 from .payloads import KEY
 from .plain import PlainFile
@@ -79,7 +79,7 @@ class Recording:
     """``per_s`` is events a second from the logging of the first to that of the last. ``unsealed``
     segments were left at the end, and sealing them took ``sealing_s`` seconds more. ``cpu_us`` is
     processor time for each event, by process: unlike the rate it hardly depends on what else the
-    machine does."""
+    machine does. ``unused`` is the part of all processors' time that no program got meanwhile."""
 
     published: int
     recorded: int
@@ -87,6 +87,7 @@ class Recording:
     unsealed: int
     sealing_s: float
     cpu_us: Mapping[str, float]
+    unused: UnusedCpu | None
 
     @property
     def lost(self) -> int:
@@ -129,6 +130,7 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
             open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session,
         ):
             recorder = Recorder(session, writer, [KEY])
+            unused_before, start = unused_cpu(), time.perf_counter()
             before = {"recorder": cpu_seconds(os.getpid()), "router": cpu_seconds(router.pid)}
             with program(PUBLISHER, endpoint, str(rate), str(seconds)) as publisher:
                 until = _Until(publisher, seconds)
@@ -141,13 +143,22 @@ def record(log: Path, fsync: FsyncPolicy, rate: float, seconds: float) -> Record
                     "router": cpu_seconds(router.pid) - before["router"],
                     "publisher": cpu_seconds(publisher.pid),
                 }
+            unused = _unused_part(unused_before, time.perf_counter() - start)
             unsealed = len(list(log.glob("*.active"))) - 1
             begun, ended = time.perf_counter(), _ended_cpu_s()
         used["sealing"] = _ended_cpu_s() - ended  # all ended processes: only the sealer is new
     sealing_s = time.perf_counter() - begun
     per_s = _logged_per_s(log)
     cpu_us = {name: s * 1e6 / max(1, report.recorded) for name, s in used.items()}
-    return Recording(until.published, report.recorded, per_s, unsealed, sealing_s, cpu_us)
+    return Recording(until.published, report.recorded, per_s, unsealed, sealing_s, cpu_us, unused)
+
+
+def _unused_part(before: UnusedCpu | None, seconds: float) -> UnusedCpu | None:
+    after = unused_cpu()
+    if before is None or after is None:
+        return None
+    total = seconds * (os.cpu_count() or 1)
+    return UnusedCpu(*(s / total for s in after.since(before)))
 
 
 def _ended_cpu_s() -> float:
