@@ -99,7 +99,7 @@ class RepeatFilter:
 
 
 MAX_TOP: Final = 100
-_OPTIONS: Final = ("top", "method", "session")
+OPTIONS: Final = ("top", "method", "session")
 _DIGITS: Final = re.compile(r"[0-9]{1,9}", re.ASCII)
 DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
@@ -147,7 +147,7 @@ class Answerer:
             raise QuestionError(
                 f"the question has {len(payload)} bytes, more than {self.max_bytes}"
             )
-        refuse_unknown(options, _OPTIONS)
+        refuse_unknown(options, OPTIONS)
         with self._parsing:
             asked = _read(payload, options)
         question = asked.question

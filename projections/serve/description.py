@@ -8,12 +8,13 @@ is a file too, because inline scripts are not allowed.
 
 import base64
 import struct
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from typing import Any, Final, get_args
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.responses import Response
 
 from projections.relocalize import Method, question_schema
@@ -184,26 +185,29 @@ _START: Final = (
 )
 
 
-def add_docs(app: FastAPI) -> None:
-    """Add the page and its files to ``app``, outside its description."""
+def add_docs(app: FastAPI, dependencies: Sequence[Any]) -> None:
+    """Add the page and its files to ``app``, outside its description, with ``dependencies``."""
+    router = APIRouter(include_in_schema=False, dependencies=dependencies)
 
-    @app.get("/docs", include_in_schema=False)
+    @router.get("/docs")
     async def docs() -> Response:
         if find_spec("fastapi_offline") is None:
             return Response(_MISSING, media_type="text/plain")
         return Response(_PAGE, media_type="text/html", headers={"Content-Security-Policy": _POLICY})
 
-    @app.get("/docs/start.js", include_in_schema=False)
+    @router.get("/docs/start.js")
     async def start() -> Response:
         return Response(_START, media_type="text/javascript")
 
-    @app.get("/docs/swagger-ui-bundle.js", include_in_schema=False)
+    @router.get("/docs/swagger-ui-bundle.js")
     async def script() -> Response:
         return _file("swagger-ui-bundle.js", "text/javascript")
 
-    @app.get("/docs/swagger-ui.css", include_in_schema=False)
+    @router.get("/docs/swagger-ui.css")
     async def style() -> Response:
         return _file("swagger-ui.css", "text/css")
+
+    app.include_router(router)
 
 
 def _file(name: str, media_type: str) -> Response:

@@ -7,10 +7,10 @@ threads of the `FairQueue` answer them, because database access is synchronous.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Annotated, Any, Final
 
-from fastapi import FastAPI, Path, Query, Request, Security
+from fastapi import Depends, FastAPI, Path, Query, Request, Security
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from fastapi.security import HTTPBearer
@@ -23,20 +23,21 @@ from eventsrc.metrics import METRICS_TYPE
 from projections.errors import QuestionError
 from projections.relocalize import Method, describe_value
 
-from .answering import MAX_TOP, Answerer, TooMuchError, encode, refusal
+from .answering import MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals
 from .fair_queue import FairQueue
 from .metrics import ServiceMetrics
 from .models import Answer, Health, Objects, Places, StateQuery
 from .sessions import MAX_NAME
-from .states import State
+from .states import State, refuse_unknown
 
 _DRAIN_FACTOR: Final = 8
 _RETRY_AFTER: Final = {"Retry-After": "1"}
 _ABOUT: Final = """Answers come from the map as it is in the databases when they are asked.
 
-Every refusal is `{"error": {"kind", "message"}}`. HEAD is answered like GET, without the body.
+Every refusal is `{"error": {"kind", "message"}}`. HEAD is answered like GET, without the body. A
+parameter that a path does not have, that is empty or that is given twice is refused with 400.
 """
 
 
@@ -56,13 +57,14 @@ def create_app(
         description=_ABOUT,
         docs_url=None,  # FastAPI's pages load scripts from other servers
         redoc_url=None,
+        openapi_url=None,  # its path would take any parameter; added below
         redirect_slashes=False,
         generate_unique_id_function=lambda route: route.name,
         dependencies=_security(secured),
     )
     _add_error_handlers(app)
     app.add_middleware(HeadLikeGet)
-    add_docs(app)
+    add_docs(app, [only()])
 
     async def answered(request: Request, what: str, work: Callable[[], Any]) -> Response:
         peer = "" if request.client is None else peer_of(request.client.host)
@@ -78,6 +80,7 @@ def create_app(
         openapi_extra=QUESTION,
         response_model=Answer,
         responses=refusals(asking=True, sending=True),
+        dependencies=[only(*OPTIONS)],
     )
     async def relocalize(
         request: Request,
@@ -97,8 +100,6 @@ def create_app(
         payload = await read_body(request, answerer.max_bytes)
         given = {"top": top, "method": method, "session": session}
         options = {name: str(value) for name, value in given.items() if value is not None}
-        unknown = {n: value for n, value in request.query_params.items() if n not in given}
-        options |= unknown  # refused by name
         return await answered(request, "relocalize", lambda: answerer.relocalize(payload, options))
 
     @app.get(
@@ -108,6 +109,7 @@ def create_app(
         " again with `next` of the answer as `cursor` until it is null.",
         response_model=Places | Objects,
         responses=refusals(asking=True),
+        dependencies=[only(*StateQuery.model_fields)],
     )
     async def state(
         request: Request,
@@ -123,6 +125,7 @@ def create_app(
         summary="200 while questions can be answered, else 503",
         response_model=Health,
         responses=refusals(asking=True),
+        dependencies=[only()],
     )
     async def health(request: Request) -> Response:
         return await answered(request, "health", answerer.health)
@@ -132,12 +135,39 @@ def create_app(
         summary="Numbers for Prometheus",
         response_class=Response,
         responses=METRICS | refusals(),
+        dependencies=[only()],
     )
     async def metrics_text() -> Response:
         return Response(counted.text(), media_type=METRICS_TYPE)
 
+    add_openapi(app, only())
     _complete_description(app)
     return app
+
+
+def only(*names: str, repeated: Collection[str] = ()) -> Any:
+    """A dependency of a path that refuses query parameters other than ``names``, empty ones, and
+    those given twice that are not in ``repeated``."""
+
+    async def check(request: Request) -> None:
+        query = request.query_params
+        refuse_unknown(query, names)
+        for name in query:
+            values = query.getlist(name)
+            if "" in values:
+                raise QuestionError(f"{name} is empty; give a value, or leave {name} out")
+            if len(values) > 1 and name not in repeated:
+                raise QuestionError(f"{name} is given {len(values)} times; give it once")
+
+    return Depends(check)
+
+
+def add_openapi(app: FastAPI, parameters: Any) -> None:
+    """Add ``/openapi.json``, with the dependency ``parameters`` of `only`."""
+
+    @app.get("/openapi.json", include_in_schema=False, dependencies=[parameters])
+    async def openapi() -> JSONResponse:
+        return JSONResponse(app.openapi())
 
 
 def _complete_description(app: FastAPI) -> None:

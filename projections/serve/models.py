@@ -7,7 +7,7 @@ Later versions may add keys.
 
 from typing import Annotated, Literal, NotRequired
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from .states import CURSOR, DEFAULT_PAGE, DEFAULT_RADIUS_M, MAX_METRES, MAX_PAGE
@@ -181,9 +181,7 @@ class Refusal(TypedDict):
 
 
 class StateQuery(BaseModel):
-    """What is asked of a state; other parameters are kept, so that `states` refuses them."""
-
-    model_config = ConfigDict(extra="allow")
+    """What is asked of a state."""
 
     x: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
         None, description="Metres in the map's frame; only with y."

@@ -46,13 +46,11 @@ _STATES: Final = {
 
 
 def refuse_unknown(options: Iterable[str], names: Sequence[str]) -> None:
-    """Raise QuestionError for an option that is none of ``names``, a misspelt one for example.
-    Names with an underscore in front are Zenoh's own."""
+    """Raise QuestionError for an option that is none of ``names``, a misspelt one for example."""
     for name in options:
-        if name not in names and not name.startswith("_"):
-            raise QuestionError(
-                f"no parameter called {describe_value(name)}; there are {', '.join(names)}"
-            )
+        if name not in names:
+            known = ", ".join(names) or "none"
+            raise QuestionError(f"no parameter called {describe_value(name)}; there are {known}")
 
 
 def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], dict[str, Any]]:

@@ -65,10 +65,11 @@ class ZenohService:
         answered.add_done_callback(lambda future: _reply(query, future))
 
     def _document(self, query: Query) -> tuple[str, dict[str, Any]]:
+        # Names with an underscore in front are Zenoh's own.
+        options = {n: value for n, value in query.parameters.items() if not n.startswith("_")}
         if query.key == RELOCALIZE:
-            return RELOCALIZE, self._answerer.relocalize(query.payload, query.parameters)
-        what = query.key.removeprefix(f"{STATE}/")
-        return query.key, self._answerer.state(what, query.parameters)
+            return RELOCALIZE, self._answerer.relocalize(query.payload, options)
+        return query.key, self._answerer.state(query.key.removeprefix(f"{STATE}/"), options)
 
     def __enter__(self) -> Self:
         return self

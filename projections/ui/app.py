@@ -24,11 +24,18 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import MapfoldError
 from eventsrc.text import visible
 from projections.serve.answering import TooMuchError
-from projections.serve.http import read_body
+from projections.serve.http import add_openapi, only, read_body
 
 from .answers import digest_answer, history_answer, walls_answer
 from .binary import encoded
-from .comparisons import bisect_answer, conditions_answer, diff_answer, merges_answer, whatif_answer
+from .comparisons import (
+    WHATIF_OPTIONS,
+    bisect_answer,
+    conditions_answer,
+    diff_answer,
+    merges_answer,
+    whatif_answer,
+)
 from .edits import MOST_BYTES as MOST_EDIT_BYTES
 from .edits import Editor, corrections_answer, read_edit
 from .live import MOST_STREAMS, LiveWatch
@@ -75,22 +82,39 @@ def _static(content: bytes, media_type: str) -> StaticFile:
     return StaticFile(content, media_type, f'"{hashlib.sha256(content).hexdigest()[:16]}"')
 
 
+_SETTINGS: Final = ("set", "eps_m", "min_samples")
+_AT_W: Final = ("at", "known_at", *_SETTINGS)
 _BINARY = "application/octet-stream"
 _MAX_SHOWN = 200
+
+
+def _only(*names: str) -> Any:
+    """`only`, with the token of the printed link, which `TokenGate` takes on every path."""
+    return only(*names, "token", repeated=("set", *WHATIF_OPTIONS))
 
 
 def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = None) -> FastAPI:
     """The ASGI application. The caller closes the service and the watch. `TokenGate` guards what
     the ``editor`` may do."""
-    app = FastAPI(title="mapfold ui", docs_url=None, redoc_url=None, redirect_slashes=False)
+    app = FastAPI(
+        title="mapfold ui", openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False
+    )
     _add_error_handlers(app)
     files = static_files()
 
-    @app.get("/api/log", summary="The log, its runs and settings, and what is wrong with it")
+    @app.get(
+        "/api/log",
+        summary="The log, its runs and settings, and what is wrong with it",
+        dependencies=[_only()],
+    )
     async def log() -> Response:
         return _json(service.log_document())
 
-    @app.get("/api/history", summary="Everything that happened to the map, as binary arrays")
+    @app.get(
+        "/api/history",
+        summary="Everything that happened to the map, as binary arrays",
+        dependencies=[_only("from", "known_at", *_SETTINGS)],
+    )
     async def history(request: Request) -> Response:
         query = request.query_params
 
@@ -100,10 +124,13 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         content = await _answer(service, request, work)
         return Response(content, media_type=_BINARY)
 
-    def answers(path: str, summary: str, answer: Callable[..., dict[str, Any]]) -> None:
-        """Add a question about the map that is answered with a document."""
+    def answers(
+        path: str, summary: str, answer: Callable[..., dict[str, Any]], *names: str
+    ) -> None:
+        """Add a question about the map that is answered with a document, and the ``names`` of its
+        parameters."""
 
-        @app.get(f"/api/{path}", summary=summary, name=path)
+        @app.get(f"/api/{path}", summary=summary, name=path, dependencies=[_only(*names)])
         async def answered(request: Request) -> Response:
             query = request.query_params
 
@@ -115,22 +142,55 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             content = await _answer(service, request, work)
             return Response(content, media_type="application/json")
 
-    answers("digest", "The digest of the map at W, and the types of its places", digest_answer)
-    answers("walls", "The walls of an occupancy map of the log", walls_answer)
-    answers("why", "Why a place, object or keyframe is what it is; why places merged", why_answer)
-    answers("merges", "Every merge of places up to W", merges_answer)
-    answers("diff", "What changed from one moment to another", diff_answer)
-    answers("bisect", "The event that made a condition true", bisect_answer)
-    answers("conditions", "The functions of a condition, its fault", conditions_answer)
+    answers(
+        "digest", "The digest of the map at W, and the types of its places", digest_answer, *_AT_W
+    )
+    answers("walls", "The walls of an occupancy map of the log", walls_answer, "number")
+    answers(
+        "why",
+        "Why a place, object or keyframe is what it is; why places merged",
+        why_answer,
+        "what",
+        "other",
+        *_AT_W,
+    )
+    answers("merges", "Every merge of places up to W", merges_answer, *_AT_W)
+    answers(
+        "diff",
+        "What changed from one moment to another",
+        diff_answer,
+        "from",
+        "to",
+        "known_at",
+        *_SETTINGS,
+    )
+    answers(
+        "bisect",
+        "The event that made a condition true",
+        bisect_answer,
+        "condition",
+        "from",
+        "to",
+        "scan",
+        "known_at",
+        *_SETTINGS,
+    )
+    answers("conditions", "The functions of a condition, its fault", conditions_answer, "text")
     answers("corrections", "The commands of the log, and what is undone", corrections_answer)
-    answers("search", "Things that are called so", search_answer)
-    answers("keyframe", "A keyframe and its detections", keyframe_answer)
+    answers("search", "Things that are called so", search_answer, "q", "kind", *_AT_W)
+    answers(
+        "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W
+    )
 
     async def apart(request: Request, work: Callable[[Offset, GoOn], bytes]) -> Response:
         content = await _awaited(request, functools.partial(service.ask_apart, work))
         return Response(content, media_type="application/json")
 
-    @app.get("/api/whatif", summary="The map under other settings, or without a command")
+    @app.get(
+        "/api/whatif",
+        summary="The map under other settings, or without a command",
+        dependencies=[_only(*WHATIF_OPTIONS, *_AT_W)],
+    )
     async def whatif(request: Request) -> Response:
         query = request.query_params
 
@@ -139,9 +199,20 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
 
         return await apart(request, work)
 
-    answers("question", "A mapped keyframe's crops as a question", question_answer)
+    answers(
+        "question",
+        "A mapped keyframe's crops as a question",
+        question_answer,
+        "number",
+        "keyframe",
+        *_AT_W,
+    )
 
-    @app.post("/api/relocalize", summary="Where a robot is that sees some crops, by the map at W")
+    @app.post(
+        "/api/relocalize",
+        summary="Where a robot is that sees some crops, by the map at W",
+        dependencies=[_only("top", "at", *_SETTINGS)],
+    )
     async def relocalize(request: Request) -> Response:
         query, payload = request.query_params, await read_body(request, MOST_BYTES)
 
@@ -152,7 +223,11 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
 
     if editor is not None:
 
-        @app.post(EDIT_PATH, summary="Give a command, or see what it would change")
+        @app.post(
+            EDIT_PATH,
+            summary="Give a command, or see what it would change",
+            dependencies=[_only()],
+        )
         async def edit(request: Request) -> Response:
             asked = read_edit(await read_body(request, MOST_EDIT_BYTES))
 
@@ -168,7 +243,11 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
                 await asyncio.wrap_future(service.refresh())
             return _json(document | {"through": service.log_document()["through"]})
 
-    @app.get("/api/live", summary="Server-sent events: what is new in the log")
+    @app.get(
+        "/api/live",
+        summary="Server-sent events: what is new in the log",
+        dependencies=[_only()],
+    )
     async def live() -> Response:
         if watch.is_full:
             raise TooMuchError(
@@ -176,10 +255,13 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             )
         return StreamingResponse(watch.stream(), media_type="text/event-stream")
 
-    @app.get("/docs", include_in_schema=False)
+    add_openapi(app, _only())
+
+    @app.get("/docs", include_in_schema=False, dependencies=[_only()])
     async def docs() -> Response:
         return Response(_docs_page(app.openapi()), media_type="text/html")
 
+    # Parameters of the page's address are for its script.
     @app.get("/{path:path}", include_in_schema=False)
     async def static(request: Request) -> Response:
         found = files.get(request.scope["path"])

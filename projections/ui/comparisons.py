@@ -108,7 +108,7 @@ def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     }
 
 
-_OPTIONS = ("try", "grid", "without")
+WHATIF_OPTIONS: Final = ("try", "grid", "without")
 
 
 def whatif_answer(
@@ -118,7 +118,7 @@ def whatif_answer(
     of ``mapfold whatif``. ``seconds`` is the time of all folds; each alternative has its own."""
     started = perf_counter()
     sets = assignments_of(query)
-    tries, grids, without = (query.getlist(name) for name in _OPTIONS)
+    tries, grids, without = (query.getlist(name) for name in WHATIF_OPTIONS)
     with PrefixReader(opened.log, through, go_on) as reader:
         end = resolve(reader, text_of(query, "at", "end"))
         known_at = resolve(reader, text_of(query, "known_at", str(end)))
@@ -130,7 +130,9 @@ def whatif_answer(
     if not trials:
         raise MisuseError("nothing to try; give set, try, grid or without")
     found = what_if(opened.log, base, trials, end, truth=opened.truth, progress=lambda *_: go_on())
-    words = [w for name in _OPTIONS for text in query.getlist(name) for w in (f"--{name}", text)]
+    words = [
+        w for name in WHATIF_OPTIONS for text in query.getlist(name) for w in (f"--{name}", text)
+    ]
     words += [word for text in sets for word in ("--set", text)]
     words += [*opened.base_words(), "--at", str(end)]
     if known_at != end:

@@ -186,6 +186,13 @@ class TestZenoh:
             assert answer["error"]["message"], selector
 
     @pytest.mark.usefixtures("service")
+    def test_parameters_of_zenoh_are_passed_over(self, connected: Callable[[], Session]) -> None:
+        session = connected()
+        assert ask(session, "mapfold/state/places?_time=[..]") == ask(
+            session, "mapfold/state/places"
+        )
+
+    @pytest.mark.usefixtures("service")
     def test_state_near_a_pose(self, connected: Callable[[], Session], pools: Pools) -> None:
         session = connected()
         good, found = ask(session, "mapfold/state/places?x=0;y=0;radius=1000")

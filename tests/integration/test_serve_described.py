@@ -310,6 +310,53 @@ def test_head_and_options_on_every_path(service: Service) -> None:
             assert fields["allow"] == ("POST" if path == "/relocalize" else "GET, HEAD")
 
 
+TAKEN = {
+    "/relocalize": "top, method, session",
+    "/state/places": "x, y, radius, limit, cursor",
+    "/state/objects": "x, y, radius, limit, cursor",
+}
+DOCS = ("/openapi.json", "/docs", "/docs/start.js", "/docs/swagger-ui-bundle.js")
+
+
+@pytest.mark.parametrize("path", [*PATHS, *DOCS, "/docs/swagger-ui.css"])
+def test_unknown_parameters_are_refused_on_every_path(
+    service: Service, described: Any, path: str
+) -> None:
+    body = b"{}" if path == "/relocalize" else None
+    unknown = f"no parameter called '{{}}'; there are {TAKEN.get(path, 'none')}"
+    for query, message in (
+        ("tpo=3", unknown.format("tpo")),
+        ("_time=1", unknown.format("_time")),
+        ("=", unknown.format("")),
+        ("a=1&a=2", unknown.format("a")),
+    ):
+        code, fields, content = service.get(f"{path}?{query}", body)
+        refused = {"kind": "bad_question", "message": message}
+        assert (code, json.loads(content)["error"]) == (400, refused)
+        if path in PATHS:
+            _check_refusal(described, path, code, fields, content)
+    assert service.get(f"{path}?tpo=3", body, method="HEAD")[2] == b""
+    assert service.get(f"{path}/?tpo=3", body)[0] == 404
+    assert service.get(f"{path}?tpo=3", method="DELETE")[0] == 405
+
+
+@pytest.mark.parametrize(
+    ("path", "names"), [(path, names.split(", ")) for path, names in TAKEN.items()]
+)
+def test_empty_and_repeated_parameters_are_refused(
+    service: Service, described: Any, path: str, names: list[str]
+) -> None:
+    body = b"{}" if path == "/relocalize" else None
+    for name in names:
+        for query, message in (
+            (f"{name}=", f"{name} is empty; give a value, or leave {name} out"),
+            (f"{name}=1&{name}=1", f"{name} is given 2 times; give it once"),
+        ):
+            code, fields, content = service.get(f"{path}?{query}", body)
+            assert (code, json.loads(content)["error"]["message"]) == (400, message)
+            _check_refusal(described, path, code, fields, content)
+
+
 PREFLIGHT = {"method": "OPTIONS", "Access-Control-Request-Method": "POST"}
 
 

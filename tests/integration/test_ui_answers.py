@@ -239,6 +239,38 @@ def test_a_wrong_question_gets_a_sentence(
     assert said in got.error[2]
 
 
+def test_unknown_empty_and_repeated_parameters_are_refused_on_every_path(server: UiServer) -> None:
+    operations = json.loads(server.ask("/openapi.json").body)["paths"]
+    paths = [(path, method) for path, methods in operations.items() for method in methods]
+    assert len(paths) > 14
+    for path, method in (*paths, ("/openapi.json", "get"), ("/docs", "get")):
+        body = b"{}" if method == "post" else None
+        status, kind, said = server.ask(f"{path}?mistake=1", method=method.upper(), body=body).error
+        assert (status, kind) == (400, "bad_question"), path
+        assert said.startswith("no parameter called 'mistake'; there are "), path
+        for name in said.removesuffix(", token").partition("there are ")[2].split(", "):
+            got = server.ask(f"{path}?{name}=", method=method.upper(), body=body)
+            assert got.error == (
+                400,
+                "bad_question",
+                f"{name} is empty; give a value, or leave {name} out",
+            )
+    repeated = server.ask("/api/digest?at=1&at=2").error
+    assert repeated == (400, "bad_question", "at is given 2 times; give it once")
+    assert server.ask("/api/digest?at=9&set=eps_m=2&set=min_samples=2").status == 200
+
+
+@pytest.mark.parametrize("path", ["/api/log", "/api/log/", "/api/why", "/docs", "/", "/nothing"])
+def test_a_wrong_method_or_path_is_refused_with_json(server: UiServer, path: str) -> None:
+    for method in ("HEAD", "DELETE", "OPTIONS"):
+        got = server.ask(path, method=method)
+        assert got.status in (404, 405)
+        if method != "HEAD":
+            assert got.error[1] == "bad_question"
+    if path == "/api/log/":
+        assert server.ask(path).error[:2] == (404, "bad_question")
+
+
 def test_the_schema_names_every_question(server: UiServer) -> None:
     paths = json.loads(server.ask("/openapi.json").body)["paths"]
     page = (ROOT / "docs" / "ui.md").read_text("utf-8")

@@ -139,6 +139,12 @@ class TestEdits:
         got = editing.ask("/api/edit", method="POST", body=b"{}", headers=headers)
         assert got.error[:2] == (403, "refused")
 
+    def test_an_edit_takes_no_parameters(self, editing: UiServer) -> None:
+        bearer = {"Authorization": f"Bearer {editing.token}"}
+        got = editing.ask("/api/edit?dry_run=0", method="POST", body=b"{}", headers=bearer)
+        said = "no parameter called 'dry_run'; there are token"
+        assert got.error == (400, "bad_question", said)
+
     def test_reading_needs_no_token(self, editing: UiServer) -> None:
         assert editing.api("log")["edits_allowed"] is True
         assert len(str(editing.token)) >= 32
