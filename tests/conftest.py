@@ -18,6 +18,7 @@ MANY_FILES = 300
 pytest_plugins = [
     "tests.fixtures_postgres",
     "tests.fixtures_log",
+    "tests.fixtures_serve",
     "tests.fixtures_tls",
     "tests.fixtures_zenoh",
 ]

@@ -21,7 +21,7 @@ from projections.serve.http import create_app
 from projections.serve.listening import bind, serving
 from projections.serve.metrics import ServiceMetrics
 from projections.serve.states import DEFAULT_PAGE, MAX_PAGE
-from tests.described_maps import RUN, build
+from tests.described_maps import RUN
 from tests.docs.console import ROOT
 
 PAGE = (ROOT / "docs" / "clients.md").read_text("utf-8")
@@ -29,14 +29,8 @@ PLACE = f"{RUN}_p0"
 
 
 @pytest.fixture(scope="module")
-def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
-    build(tmp_path_factory.mktemp("described"), module_database)
-    return module_database
-
-
-@pytest.fixture(scope="module")
-def answerer(targets: Targets) -> Iterator[Answerer]:
-    with Pools(targets, 2) as pools:
+def answerer(described_map: Targets) -> Iterator[Answerer]:
+    with Pools(described_map, 2) as pools:
         yield Answerer(pools, per_second=10_000.0)
 
 

@@ -29,13 +29,6 @@ HALF_OPEN = 400
 MEBIBYTE = 1024 * 1024
 
 
-@pytest.fixture(scope="module")
-def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
-    log = write_log(tmp_path_factory.mktemp("map") / "log", walk(60, seed=3))
-    rebuild(log, module_database, Settings())
-    return module_database
-
-
 @pytest.fixture
 def pg_server_folder(pg_server: EmbeddedServer) -> str:
     """What a message to others must not hold."""
@@ -43,8 +36,8 @@ def pg_server_folder(pg_server: EmbeddedServer) -> str:
 
 
 @pytest.fixture
-def service(targets: Targets) -> Iterator[Served]:
-    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", targets.graph_url)
+def service(walked_map: Targets) -> Iterator[Served]:
+    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", walked_map.graph_url)
     with served(*args, open_files=OPEN_FILES) as service:
         yield service
 
@@ -144,9 +137,9 @@ class TestOverZenoh:
     """The same bounds for questions that come over Zenoh."""
 
     @pytest.fixture
-    def asking(self, connected: Callable[[], Session], targets: Targets) -> Iterator[Session]:
+    def asking(self, connected: Callable[[], Session], walked_map: Targets) -> Iterator[Session]:
         with (
-            Pools(targets, 2) as pools,
+            Pools(walked_map, 2) as pools,
             FairQueue(2, max_wait_s=DEADLINE_S) as queue,
             ZenohService(connected(), Answerer(pools, per_second=10_000.0), queue),
         ):
@@ -180,9 +173,9 @@ class TestOverZenoh:
 
 @pytest.mark.slow
 def test_zenoh_drops_a_far_too_long_question(
-    targets: Targets, endpoint: str, connected: Callable[[], Session]
+    walked_map: Targets, endpoint: str, connected: Callable[[], Session]
 ) -> None:
-    args = ("--connect", endpoint, "--http", "127.0.0.1:0", "--db", targets.graph_url)
+    args = ("--connect", endpoint, "--http", "127.0.0.1:0", "--db", walked_map.graph_url)
     with served(*args) as service:
         asking, before = connected(), service.peak_bytes
         asking.get_replies("mapfold/relocalize", bytes(300 * MEBIBYTE), timeout_s=5.0)
@@ -224,8 +217,8 @@ QUESTIONS = st.one_of(
 
 
 @pytest.fixture
-def answerer(targets: Targets) -> Iterator[Answerer]:
-    with Pools(targets, 1) as pools:
+def answerer(walked_map: Targets) -> Iterator[Answerer]:
+    with Pools(walked_map, 1) as pools:
         pools.on_graph(lambda _: None)  # connected: it uses `random`, which is Hypothesis's
         yield Answerer(pools, per_second=1e9)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from projections.database.connection import Targets
-from tests.described_maps import MODEL, build
+from tests.described_maps import MODEL
 from tests.http_attacks import served
 
 pytestmark = pytest.mark.slow
@@ -19,12 +19,7 @@ pytestmark = pytest.mark.slow
 TOKEN = "0123456789abcdef-not-a-secret"
 PROGRAM = Path(sys.executable).with_name("schemathesis")
 OPERATIONS = 4
-
-
-@pytest.fixture(scope="module")
-def targets(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Targets:
-    build(tmp_path_factory.mktemp("described"), module_database)
-    return module_database
+ARGS = ("--no-zenoh", "--http", "127.0.0.1:0", "--rate", "100000")
 
 
 def found(port: int, folder: Path, *options: str) -> str:
@@ -55,17 +50,15 @@ def found(port: int, folder: Path, *options: str) -> str:
 
 
 @pytest.mark.timeout(900)
-def test_all_checks_of_all_phases(targets: Targets, tmp_path: Path) -> None:
-    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", targets.graph_url, "--rate", "100000")
-    with served(*args) as service:
+def test_all_checks_of_all_phases(described_map: Targets, tmp_path: Path) -> None:
+    with served(*ARGS, "--db", described_map.graph_url) as service:
         said = found(service.port, tmp_path, "--seed", "1", "-n", "150")
     for phase in ("Examples", "Coverage", "Fuzzing"):
         assert f"✅ {phase}" in said
 
 
 @pytest.mark.timeout(900)
-def test_with_a_token(targets: Targets, tmp_path: Path) -> None:
-    args = ("--no-zenoh", "--http", "127.0.0.1:0", "--db", targets.graph_url, "--rate", "100000")
-    with served(*args, MAPFOLD_TOKEN=TOKEN) as service:
+def test_with_a_token(described_map: Targets, tmp_path: Path) -> None:
+    with served(*ARGS, "--db", described_map.graph_url, MAPFOLD_TOKEN=TOKEN) as service:
         bearer = f"Authorization: Bearer {TOKEN}"
         found(service.port, tmp_path, "--seed", "3", "-n", "20", "-H", bearer)
