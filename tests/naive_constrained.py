@@ -2,10 +2,19 @@
 
 from collections.abc import Callable, Hashable, Iterable
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 Pairs = Iterable[tuple[Hashable, Hashable]]
+
+
+def group_of(anchor: Hashable, joined: Pairs) -> set[Any]:
+    """All anchors that are one with this one by command, itself included."""
+    found = {anchor}
+    while more := {x for pair in joined if found & set(pair) for x in pair} - found:
+        found |= more
+    return found
 
 
 class NaiveConstrainedPlaces:
@@ -33,8 +42,8 @@ class NaiveConstrainedPlaces:
         self.enemies = {
             frozenset((one, other))
             for a, b in apart
-            for one in self.group(a)
-            for other in self.group(b)
+            for one in group_of(a, self.joined)
+            for other in group_of(b, self.joined)
         }
         self.labels: list[int | None] = []
         self.cores: set[int] = set()
@@ -43,13 +52,6 @@ class NaiveConstrainedPlaces:
         self.inside: list[set[Hashable]] = []  # of each place, its anchors
         self.refused: set[tuple[int, int]] = set()
         self.had_effect = False
-
-    def group(self, anchor: Hashable) -> set[Hashable]:
-        """All anchors that are joined with one, itself included."""
-        found = {anchor}
-        while more := {x for pair in self.joined if found & set(pair) for x in pair} - found:
-            found |= more
-        return found
 
     def conflict(self, one: set[Hashable], other: set[Hashable]) -> bool:
         """Whether two sets of anchors may not come together."""
@@ -161,7 +163,9 @@ class NaiveConstrainedPlaces:
     def _join(self, anchor: int) -> None:
         for other in range(len(self.founders)):
             place = self.labels[anchor]
-            if other == place or not self.inside[other] & self.group(self.name_of(anchor)):
+            if other == place or not self.inside[other] & group_of(
+                self.name_of(anchor), self.joined
+            ):
                 continue
             if self.conflict(self.inside[place], self.inside[other]):
                 self.refused.add((min(place, other), max(place, other)))

@@ -5,6 +5,8 @@ from collections.abc import Hashable
 from fractions import Fraction
 from itertools import combinations
 
+from tests.naive_constrained import group_of
+
 Anchored = tuple[int, int]
 
 
@@ -147,24 +149,17 @@ class NaiveRooms:
         named = {p for pair in (*self.joined, *self.apart) for p in pair}
         return [p for p, label in enumerate(self.labels) if label == place and p in named]
 
-    def _group(self, point: int) -> set[int]:
-        """The points that are one with this one by command."""
-        group = {point}
-        while more := {p for pair in self.joined if group & set(pair) for p in pair} - group:
-            group |= more
-        return group
-
     def _conflict(self, some: list[int], others: list[int]) -> bool:
         return any(
-            (a in self._group(p) and b in self._group(q))
-            or (b in self._group(p) and a in self._group(q))
+            (a in group_of(p, self.joined) and b in group_of(q, self.joined))
+            or (b in group_of(p, self.joined) and a in group_of(q, self.joined))
             for p in some
             for q in others
             for a, b in self.apart
         )
 
     def _obey_joins(self, point: int, drives: list[list[int]]) -> None:
-        group = self._group(point) - {point}
+        group = group_of(point, self.joined) - {point}
         while True:
             own = self.labels[point]
             others = sorted({self.labels[p] for p in group if p < point} - {own})

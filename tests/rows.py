@@ -4,13 +4,15 @@
 but the label numbering that docs/projections.md promises.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import psycopg
 from psycopg import sql
 
 from projections.database.connection import Targets
+from projections.database.memory_sink import MemoryTables
 from projections.exact import Q40
 from projections.model.view import MapView
 from projections.place_types import place_type
@@ -42,6 +44,23 @@ def graph_rows(url: str) -> dict[str, list[tuple[str, ...]]]:
             ).fetchall()
             for label in ORDER
         }
+
+
+def parsed(rows: Mapping[str, Sequence[tuple[str, ...]]]) -> dict[str, list[tuple[Any, ...]]]:
+    """`graph_rows` as `expected_graph` writes them: properties as dictionaries."""
+    return {
+        label: [(*row[:-1], json.loads(row[-1])) for row in found] for label, found in rows.items()
+    }
+
+
+def memory_rows(tables: MemoryTables) -> dict[str, list[tuple[Any, ...]]]:
+    """All rows of a graph in memory, as `expected_graph` writes them."""
+    return parsed(
+        {
+            label: [(*map(str, row[:-1]), row[-1]) for _, row in sorted(found.items())]
+            for label, found in tables.graph.items()
+        }
+    )
 
 
 def vector_rows(url: str) -> list[tuple[Any, ...]]:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import psycopg
 import pytest
@@ -20,7 +19,7 @@ from projections.settings import Settings
 from tests.drops import wait_for_drops
 from tests.envelopes import detection, envelope
 from tests.logs import WEIRD, append_raw, bridge, walk, write_log
-from tests.rows import all_rows, expected_graph, graph_rows, vector_rows
+from tests.rows import all_rows, expected_graph, graph_rows, parsed, vector_rows
 from tests.thorough import mostly_slow
 
 SETTINGS = Settings()
@@ -38,12 +37,6 @@ def log(tmp_path: Path) -> Path:
 def view_of(log: Path, until: int | None = None, settings: Settings = SETTINGS) -> MapView:
     with LogReader(log) as reader:
         return fold_log(reader, settings, until)[1]
-
-
-def parsed(rows: dict[str, list[tuple[str, ...]]]) -> dict[str, list[tuple[Any, ...]]]:
-    return {
-        label: [(*row[:-1], json.loads(row[-1])) for row in found] for label, found in rows.items()
-    }
 
 
 @pytest.mark.parametrize("loader", LOADERS)

@@ -39,7 +39,7 @@ from tests.commands_in_logs import (
     undo,
 )
 from tests.logs import append_raw, bridge, walk, write_log
-from tests.rows import all_rows, expected_graph, graph_rows
+from tests.rows import all_rows, expected_graph, graph_rows, parsed
 from tests.thorough import rounds
 
 SETTINGS = Settings()
@@ -69,12 +69,6 @@ def fresh_rows(log: Path, targets: Targets, **options: Any) -> Any:
     found = all_rows(targets)
     assert parsed(found[0]) == expected_graph(view)
     return found
-
-
-def parsed(graph: Any) -> dict[str, list[tuple[Any, ...]]]:
-    return {
-        label: [(*row[:-1], json.loads(row[-1])) for row in rows] for label, rows in graph.items()
-    }
 
 
 def digests(targets: Targets) -> set[str | None]:

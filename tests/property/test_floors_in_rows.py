@@ -1,6 +1,5 @@
 """Rows of the graph of a building with floors: what the view says, in batches and rebuilt."""
 
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -9,25 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
-from projections.database.memory_sink import MemoryTables
 from projections.model.fold import fold_log
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.live_rows import followed_and_rebuilt
 from tests.logs import write_log
 from tests.property.test_floors import buildings, drive
-from tests.rows import ORDER, expected_graph
-
-
-def parsed(tables: MemoryTables) -> dict[str, list[tuple[Any, ...]]]:
-    """The rows as `expected_graph` writes them."""
-    return {
-        label: [
-            (*map(str, row[:-1]), json.loads(row[-1]))
-            for _, row in sorted(tables.graph[label].items())  # type: ignore[index]
-        ]
-        for label in ORDER
-    }
+from tests.rows import expected_graph, memory_rows
 
 
 @given(building=buildings(), size=st.integers(1, 9))
@@ -42,14 +29,14 @@ def test_batches_and_a_rebuild_have_the_rows_of_the_view(
         with LogReader(log) as reader:
             view = fold_log(reader, settings)[1]
     assert live.graph == fresh.graph
-    assert parsed(live) == expected_graph(view)
+    assert memory_rows(live) == expected_graph(view)
 
 
 def graph_of(tmp_path: Path, *floors: dict[str, Any]) -> tuple[MapView, Any]:
     log = write_log(tmp_path / "log", drive(*floors))
     with LogReader(log) as reader:
         view = fold_log(reader, Settings())[1]
-    return view, parsed(followed_and_rebuilt(log, Settings(), 4)[0])
+    return view, memory_rows(followed_and_rebuilt(log, Settings(), 4)[0])
 
 
 def test_places_are_part_of_their_floor_and_floors_of_the_building(tmp_path: Path) -> None:

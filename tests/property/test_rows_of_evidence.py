@@ -3,7 +3,6 @@ rebuild give what the deltas say."""
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -18,6 +17,7 @@ from projections.model.changes import ChangeTracker
 from projections.model.records import Estimate
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.rows import memory_rows
 from tests.thorough import examples, stride
 from tests.told_objects import STEPS, Step, Story, random_steps, told_rows, without_sigma
 
@@ -64,16 +64,11 @@ def rebuilt(
     return tracker.view, tables, dict(rows)
 
 
-def parsed(tables: MemoryTables, label: Any) -> list[tuple[Any, ...]]:
-    rows = [row for _, row in sorted(tables.graph[label].items())]
-    return [(*map(str, row[:-1]), json.loads(row[-1])) for row in rows]
-
-
 def check_rows(tables: MemoryTables, events: Events) -> None:
-    told = told_rows(events)
+    told, rows = told_rows(events), memory_rows(tables)
     for label in ("OBSERVES", "LOCATED_IN"):
-        assert parsed(tables, label) == told[label]
-    found, sigmas = without_sigma(parsed(tables, "Object"))
+        assert rows[label] == told[label]
+    found, sigmas = without_sigma(rows["Object"])
     expected, expected_sigmas = without_sigma(told["Object"])
     assert found == expected
     assert sigmas == pytest.approx(expected_sigmas, rel=1e-12)
