@@ -1,20 +1,15 @@
 """A short attack on the real commands; `scripts/test_slow` has one of three minutes."""
 
-import subprocess
-import sys
+import resource
 
-from tests.docs.console import ROOT
+from tests.attack.__main__ import main
 from tests.thorough import rounds
-
-
-def _attack(*arguments: str) -> None:
-    """Run it in a process of its own; fails with its table."""
-    command = [sys.executable, "-m", "tests.attack", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    print(done.stdout)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_short_attack_on_a_log() -> None:
     attacks = ("damage", "kills")[: rounds(2, 1)]
-    _attack("--seed", "1", "--round", "1", "--only", *attacks)
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        assert main(["--seed", "1", "--round", "1", "--only", *attacks]) == 0
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limit)

@@ -57,9 +57,9 @@ def runs(mapfold: Commands) -> list[str]:
     building, stranger = Building(31, things=40), Building(32, things=40)
     arguments = []
     for flag, name, run in (
-        ("--map", "a", drive(building, "a", 1, 200)),
-        ("--query", "b", drive(building, "b", 2, 80)),
-        ("--query", "x", drive(stranger, "x", 3, rounds(80, 40))),
+        ("--map", "a", drive(building, "a", 1, rounds(200, 60))),
+        ("--query", "b", drive(building, "b", 2, 80)[-rounds(80, 30) :]),
+        ("--query", "x", drive(stranger, "x", 3, 80)[-rounds(80, 20) :]),
     ):
         log, truth = save(mapfold.folder, name, run)
         arguments += [flag, str(log), "--truth", str(truth)]
