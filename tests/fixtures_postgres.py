@@ -17,6 +17,7 @@ from projections.database.connection import Targets, connect, ensure_extension
 from projections.database.embedded import EmbeddedServer
 from tests.killed_runs import hold_run, remove_killed_runs
 from tests.servers import CARELESS, MEMORY_DISK, RUN_HOME
+from tests.thorough import mostly_slow
 
 _TEMPLATE = "mapfold_test_template"
 _numbers = count()
@@ -151,6 +152,13 @@ def two_databases(pg_server: EmbeddedServer, _template: str, pg_url: str) -> Ite
     name = _fresh_database(pg_server, _template)
     yield Targets(pg_url, pg_server.url_of(name))
     _drop_database(pg_server, name)
+
+
+@pytest.fixture(params=mostly_slow(["two_databases", "one_database"]))
+def targets(request: pytest.FixtureRequest) -> Targets:
+    """Graph and vectors in two fresh databases, and again in one."""
+    found: Targets = request.getfixturevalue(request.param)
+    return found
 
 
 @pytest.fixture

@@ -28,12 +28,6 @@ def settings_of(corrections: Any) -> Settings:
     return corrections.settings or Settings()
 
 
-@pytest.fixture(params=["two_databases", "one_database"][: rounds(2, 1)])
-def targets(request: pytest.FixtureRequest) -> Targets:
-    found: Targets = request.getfixturevalue(request.param)
-    return found
-
-
 @pytest.fixture(scope="module")
 def documents() -> list[dict[str, Any]]:
     return flickering_house("a", 200)

@@ -47,11 +47,11 @@ def view_of(log: Path, settings: Settings) -> MapView:
         return fold_log(reader, settings)[1]
 
 
-@pytest.fixture(params=["two_databases", "one_database"][: rounds(2, 1)])
-def targets(request: pytest.FixtureRequest, log: Path, rule: Settings) -> Targets:
-    found: Targets = request.getfixturevalue(request.param)
-    rebuild(log, found, rule)
-    return found
+@pytest.fixture
+def targets(targets: Targets, log: Path, rule: Settings) -> Targets:
+    """With the map of the log."""
+    rebuild(log, targets, rule)
+    return targets
 
 
 def questions() -> Iterator[tuple[Crop, ...]]:

@@ -37,7 +37,7 @@ from tests.candidates import assert_equal
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
 from tests.simulated import simulated
-from tests.thorough import mostly_slow, rounds
+from tests.thorough import rounds
 
 WAIT_S = 60.0
 SEED = 7
@@ -96,12 +96,6 @@ class _Services:
         ((good, over_zenoh),) = replies
         assert good
         return [over_http, json.loads(over_zenoh)]
-
-
-@pytest.fixture(params=mostly_slow(["two_databases", "one_database"]))
-def targets(request: pytest.FixtureRequest) -> Targets:
-    found: Targets = request.getfixturevalue(request.param)
-    return found
 
 
 @pytest.fixture
