@@ -101,10 +101,9 @@ def ui(
     with LogReader(log) as reader:  # errors of log and options come before anything is served
         shown_first = _moment(None if at is None else point(reader, at), select)
     try:
-        from projections.serve.guard import Guard
+        from projections.serve.guard import Guard, SafeHeaders
         from projections.serve.listening import bind, is_loopback, serving
-        from projections.ui.app import create_app
-        from projections.ui.headers import SafeHeaders
+        from projections.ui.app import HEADERS, create_app
         from projections.ui.token_gate import TokenGate
     except ModuleNotFoundError as error:
         raise MisuseError(
@@ -138,7 +137,7 @@ def ui(
         editor = _editor(service, connect, zenoh_config) if allow_edits else None
         app = create_app(service, watch, editor)
         gate = TokenGate(app, token, everything=not local)
-        guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))))
+        guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))), HEADERS)
         bound = stack.enter_context(serving(guarded, listener, tell=say))
         # Before the server, which waits for its streams and answers to end.
         stack.callback(watch.close)

@@ -1,27 +1,31 @@
 """The maps of one log under other settings or without a command, compared with the base's map."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from array import array
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope import DetId, Offset
 from projections.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.errors import SettingsError
 from projections.model.command_text import command_document, command_name
 from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.settings import Settings, assignment_texts
 
-from .aligned import aligned
+from .history import NEVER
 from .known import Progress
 from .names import NoSuchThing
-from .parallel import FoldResult, Rules, fold_all
+from .parallel import NO_NUMBER, FoldResult, Rules, fold_all
 
 if TYPE_CHECKING:
     from projections.evaluate.truth import Truth
 
 MOST_ALTERNATIVES = 200
+
+_K = TypeVar("_K", bound=Hashable)
+_V = TypeVar("_V")
 
 
 def alternatives(
@@ -198,7 +202,7 @@ def what_if(
 
 
 def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
-    base, other = aligned(base, other)
+    base, other = _aligned(base, other)
     posed = sorted({*base.posed, *other.posed})
     return Alternative(
         name=trial.name,
@@ -216,6 +220,56 @@ def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
         },
         without=trial.without,
     )
+
+
+def _aligned(first: FoldResult, second: FoldResult) -> tuple[FoldResult, FoldResult]:
+    """Both with the keyframes and observations of either, in the order of the log.
+
+    Under other settings a log has the same ones; corrections leave some out. A keyframe is known by
+    its event, an observation by its event and det_id. One that a fold leaves out is in no place, or
+    of no object, there.
+    """
+    if (
+        first.keyframe_offsets == second.keyframe_offsets
+        and first.observation_offsets == second.observation_offsets
+        and first.det_ids == second.det_ids
+    ):
+        return first, second
+    keyframes = sorted({*first.keyframe_offsets, *second.keyframe_offsets})
+    observations = sorted({*_observations(first), *_observations(second)})
+    return _with(first, keyframes, observations), _with(second, keyframes, observations)
+
+
+def _observations(result: FoldResult) -> list[tuple[int, DetId]]:
+    return list(zip(result.observation_offsets, result.det_ids, strict=True))
+
+
+def _with(
+    result: FoldResult, keyframes: list[int], observations: list[tuple[int, DetId]]
+) -> FoldResult:
+    """The result with these keyframes and observations, among them all of its own."""
+    own = {offset: ordinal for ordinal, offset in enumerate(result.keyframe_offsets)}
+    posed = {result.keyframe_offsets[ordinal] for ordinal in result.posed}
+    seen = {key: ordinal for ordinal, key in enumerate(_observations(result))}
+    return replace(
+        result,
+        places=tuple(_values(keyframes, own, result.places, None)),
+        posed=array("q", (i for i, offset in enumerate(keyframes) if offset in posed)),
+        keyframe_offsets=array("q", keyframes),
+        placed_offsets=array("q", _values(keyframes, own, result.placed_offsets, int(NEVER))),
+        placed_in=array("q", _values(keyframes, own, result.placed_in, NO_NUMBER)),
+        objects=tuple(_values(observations, seen, result.objects, None)),
+        fused_into=array("q", _values(observations, seen, result.fused_into, NO_NUMBER)),
+        observation_offsets=array("q", (offset for offset, _ in observations)),
+        det_ids=tuple(det_id for _, det_id in observations),
+    )
+
+
+def _values(
+    keys: Sequence[_K], ordinals: Mapping[_K, int], values: Sequence[_V], missing: _V
+) -> list[_V]:
+    """The value of each key, ``missing`` for one that has none."""
+    return [missing if (at := ordinals.get(key)) is None else values[at] for key in keys]
 
 
 def _places_part_at(first: FoldResult, second: FoldResult) -> Offset | None:
