@@ -59,3 +59,8 @@ def fields_of(whole: object) -> Any:
     if isinstance(whole, msgspec.Struct):
         return {name: fields_of(getattr(whole, name)) for name in whole.__struct_fields__}
     return repr(whole)
+
+
+def keyframe_payloads(*keyframe_ids: int, **fields: object) -> list[bytes]:
+    """An envelope for each id."""
+    return [payload(envelope(k, **fields)) for k in keyframe_ids]

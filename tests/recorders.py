@@ -1,10 +1,17 @@
 """A recorder at work beside a test."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
 
+from eventsrc.gap_history import ledger_of
+from eventsrc.gaps import DEFAULT_SETTLE_NS
+from eventsrc.log import LogReader, LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.transport.session import Session
+from tests.fixtures_log import KEY
 from tests.fixtures_zenoh import DEADLINE_S
 
 
@@ -32,3 +39,23 @@ class Running:
         self._stop.set()
         self._thread.shutdown()
         return self._done.result()
+
+
+@contextmanager
+def recording(
+    session: Session,
+    log: Path,
+    keys: Sequence[str] = (KEY,),
+    queue_size: int = 1_000,
+    settle_ns: int = DEFAULT_SETTLE_NS,
+) -> Iterator[Running]:
+    """Record in a ``with`` block."""
+    with LogWriter(log) as writer:
+        with LogReader(log) as reader:
+            ledger = ledger_of(reader, settle_ns=settle_ns)
+        running = Running(Recorder(session, writer, keys, queue_size=queue_size, ledger=ledger))
+        try:
+            yield running
+        finally:
+            running._stop.set()
+            running._thread.shutdown()

@@ -19,10 +19,9 @@ from projections.model.view import MapView
 from projections.settings import Settings
 from tests.commands_in_logs import append_command, command
 from tests.envelopes import detection, envelope
-from tests.integration.test_refold import parsed
 from tests.live_rows import followed_and_rebuilt
 from tests.logs import walk, write_log
-from tests.rows import all_rows, expected_graph
+from tests.rows import all_rows, expected_graph, parsed
 
 SETTINGS = Settings()
 

@@ -9,24 +9,20 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
-from eventsrc.log import LogReader, LogWriter
+from eventsrc.log import LogWriter
 from eventsrc.robot.acks import (
     Ack,
-    Refusal,
-    Refusals,
     Sent,
     ack_key,
     payload_sha256,
-    refusal_key,
     sent_key,
 )
 from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.robot.sender import Sender
-from eventsrc.system_events import REJECTED_KEY
 from eventsrc.transport.session import Received, Router, Session, ZenohOptions
 from tests.envelopes import envelope, payload
+from tests.fixtures_log import KEY
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+from tests.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
 from tests.thorough import rounds
 
 KEYFRAMES = rounds(6_000, 2_500)
@@ -34,24 +30,11 @@ KEYFRAMES = rounds(6_000, 2_500)
 
 Sessions = Callable[[], Session]
 Start = Callable[..., Program]
-KEY = "tb/detections"
-
-
-def _ack(*payloads: bytes, key: str = KEY) -> bytes:
-    digests = tuple(map(payload_sha256, payloads))
-    return Ack(run_id="run-a", key=key, log_id="log", sha256=digests).encode()
-
-
-def _stored(log: Path) -> list[bytes]:
-    with LogReader(log) as reader:
-        return [event.payload for event in reader.read(keys={KEY})]
 
 
 @pytest.fixture
 def robot(endpoint: str, tmp_path: Path) -> Iterator[EnvelopePublisher]:
-    with EnvelopePublisher(
-        ZenohOptions(connect=(endpoint,)), tmp_path / "spool", resend_after_s=0.2
-    ) as publisher:
+    with robot_at(endpoint, tmp_path) as publisher:
         yield publisher
 
 
@@ -74,7 +57,7 @@ def test_what_is_acknowledged_is_in_the_log(
         robot.publish(message)
     assert robot.flush(DEADLINE_S)
     assert robot.unacknowledged == 0
-    assert _stored(tmp_path / "log") == sent
+    assert stored_payloads(tmp_path / "log") == sent
 
 
 def test_a_dictionary_is_published_as_json(
@@ -83,7 +66,7 @@ def test_a_dictionary_is_published_as_json(
     recorder()
     robot.publish(envelope(1, run_id="Küche 🤖"))
     assert robot.flush(DEADLINE_S)
-    assert _stored(tmp_path / "log") == [payload(envelope(1, run_id="Küche 🤖"))]
+    assert stored_payloads(tmp_path / "log") == [payload(envelope(1, run_id="Küche 🤖"))]
 
 
 def test_it_starts_without_a_router_and_sends_when_there_is_one(
@@ -98,7 +81,7 @@ def test_it_starts_without_a_router_and_sends_when_there_is_one(
         with Router(ZenohOptions(listen=(endpoint,))):
             start("record", str(tmp_path / "log"), "--connect", endpoint)
             assert robot.flush(DEADLINE_S)
-    assert _stored(tmp_path / "log") == [payload(envelope(k)) for k in range(10)]
+    assert stored_payloads(tmp_path / "log") == [payload(envelope(k)) for k in range(10)]
 
 
 def test_envelopes_spooled_by_an_earlier_process_are_sent(
@@ -112,7 +95,7 @@ def test_envelopes_spooled_by_an_earlier_process_are_sent(
     recorder()
     with EnvelopePublisher(options, tmp_path / "spool") as robot:
         assert robot.flush(DEADLINE_S)
-    assert _stored(tmp_path / "log") == [payload(envelope(1))]
+    assert stored_payloads(tmp_path / "log") == [payload(envelope(1))]
 
 
 def test_it_sends_again_until_a_recorder_answers(
@@ -129,7 +112,7 @@ def test_it_sends_again_until_a_recorder_answers(
     assert robot.unacknowledged == 1
     recorder()
     assert robot.flush(DEADLINE_S)
-    assert set(_stored(tmp_path / "log")) == {payload(envelope(1))}
+    assert set(stored_payloads(tmp_path / "log")) == {payload(envelope(1))}
 
 
 def test_at_most_a_window_is_in_transit(endpoint: str, connected: Sessions, tmp_path: Path) -> None:
@@ -153,7 +136,7 @@ def test_at_most_a_window_is_in_transit(endpoint: str, connected: Sessions, tmp_
             robot.publish(envelope(k))
         assert again.wait(DEADLINE_S)
         assert seen[:11] == [*range(10), 0]
-        viewer.send(ack_key("run-a"), _ack(*(payload(envelope(k)) for k in range(5))))
+        viewer.send(ack_key("run-a"), encoded_ack(*(payload(envelope(k)) for k in range(5))))
         assert more.wait(DEADLINE_S)
         assert max(seen) <= 14
 
@@ -169,7 +152,7 @@ def test_lost_envelopes_do_not_fill_the_window(
     def acknowledge(message: Received) -> None:
         seen.append(json.loads(message.payload)["keyframe_id"])
         if seen[-1] >= 9 or seen.count(8) > 1:
-            viewer.send(ack_key("run-a"), _ack(message.payload))
+            viewer.send(ack_key("run-a"), encoded_ack(message.payload))
         if seen.count(8) > 1:
             again.set()
 
@@ -200,7 +183,7 @@ def test_two_robots_get_their_own_acks(
             other.publish(envelope(k + 1_000, run_id="run-b"))
         assert one.flush(DEADLINE_S)
         assert other.flush(DEADLINE_S)
-    assert _keyframes(tmp_path / "log") == {*range(20), *range(1_000, 1_020)}
+    assert keyframe_ids(tmp_path / "log") == {*range(20), *range(1_000, 1_020)}
 
 
 def test_a_run_id_used_by_two_robots_acknowledges_to_each_its_own(
@@ -228,7 +211,7 @@ def test_a_run_id_used_by_two_robots_acknowledges_to_each_its_own(
         assert one.flush(DEADLINE_S)
         assert arrived.acquire(timeout=DEADLINE_S), "sent again after that"
         assert other.unacknowledged == 21
-    assert _keyframes(tmp_path / "log") == set(range(100))
+    assert keyframe_ids(tmp_path / "log") == set(range(100))
 
 
 def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path) -> None:
@@ -252,7 +235,7 @@ def test_a_router_that_comes_and_goes_loses_nothing(start: Start, tmp_path: Path
     with robot, Router(ZenohOptions(listen=(endpoint,))):
         assert robot.flush(DEADLINE_S)
         assert recorder.end(signal.SIGINT) in (0, 3)
-    assert _keyframes(log) == set(range(1_500))
+    assert keyframe_ids(log) == set(range(1_500))
 
 
 @pytest.mark.slow
@@ -276,116 +259,8 @@ def test_a_recorder_stopped_until_its_router_disconnects_it_loses_nothing(
     program.process.send_signal(signal.SIGCONT)
     assert robot.flush(2 * DEADLINE_S)
     assert program.end(signal.SIGINT) in (0, 3)
-    assert _keyframes(tmp_path / "log") == set(range(3_000))
+    assert keyframe_ids(tmp_path / "log") == set(range(3_000))
     assert "0 keyframes missing" in program.lines[-1]
-
-
-def test_nonsense_on_the_ack_key_acknowledges_nothing(
-    endpoint: str, connected: Sessions, tmp_path: Path
-) -> None:
-    """The pauses between resends double: five are 31 times the first."""
-    arrived = threading.Semaphore(0)
-    viewer = connected()
-    viewer.subscribe(KEY, lambda _: arrived.release())
-    viewer.confirm()
-    mine, others = payload(envelope(1)), payload(envelope(1, note="another robot's"))
-    older = b'{"run_id":"run-a","log_id":"log","stretches":[[0,9]]}'
-    options = ZenohOptions(connect=(endpoint,))
-    with EnvelopePublisher(options, tmp_path / "spool", resend_after_s=0.05) as robot:
-        robot.publish(envelope(1))
-        assert arrived.acquire(timeout=DEADLINE_S)
-        for wrong in (b"{}", _ack(others), _ack(mine, key="tb/other"), older):
-            viewer.send(ack_key("run-a"), wrong)
-            assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
-        assert arrived.acquire(timeout=DEADLINE_S)
-        assert robot.unacknowledged == 1
-        viewer.send(ack_key("run-a"), _ack(others, mine))
-        assert robot.flush(DEADLINE_S)
-
-
-@pytest.mark.parametrize(
-    "bad", [b"no json", {"run_id": "run-a"}, envelope(1, timestamp=float("nan")), {"run_id": {1}}]
-)
-def test_an_invalid_envelope_is_refused_on_publishing(
-    robot: EnvelopePublisher, bad: object
-) -> None:
-    with pytest.raises(InvalidEnvelope, match="envelope not published: "):
-        robot.publish(bad)  # type: ignore[arg-type]
-    assert robot.unacknowledged == 0
-
-
-def test_refused_envelopes_block_nothing(start: Start, endpoint: str, tmp_path: Path) -> None:
-    """More envelopes are refused than may be under way, before and between good ones."""
-    log = tmp_path / "log"
-    recorder = start("record", str(log), "--connect", endpoint, "--max-payload", "1000")
-    recorder.wait_for("recording")
-    options = ZenohOptions(connect=(endpoint,))
-    too_large = {*range(12), 20}
-    with EnvelopePublisher(options, tmp_path / "spool", window=8, resend_after_s=0.2) as robot:
-        for k in range(25):
-            robot.publish(envelope(k, note="x" * (1_000 if k in too_large else 10)))
-        assert not robot.flush(DEADLINE_S), "not everything was acknowledged"
-        assert robot.unacknowledged == 0
-        assert robot.refused_count == len(too_large)
-        refused = robot.refused()
-        assert {one.keyframe_id for one in refused} == too_large
-        assert {one.run_id for one in refused} == {"run-a"}
-        assert all("over the limit of 1000" in one.reason for one in refused)
-    assert recorder.end(signal.SIGINT) == 3
-    assert _keyframes(log) == set(range(25)) - too_large
-    with LogReader(log) as reader:
-        assert len(list(reader.read(keys={REJECTED_KEY}))) == len(too_large), "each sent once"
-        assert {one.log_id for one in refused} == {reader.log_id}
-
-
-def test_refused_envelopes_are_kept_and_can_be_sent_again(
-    start: Start, endpoint: str, tmp_path: Path
-) -> None:
-    options = ZenohOptions(connect=(endpoint,))
-    log = str(tmp_path / "log")
-    strict = start("record", log, "--connect", endpoint, "--max-payload", "10")
-    strict.wait_for("recording")
-    with EnvelopePublisher(options, tmp_path / "spool") as robot:
-        robot.publish(envelope(1))
-        assert not robot.flush(DEADLINE_S)
-    assert strict.end(signal.SIGINT) == 3
-    start("record", log, "--connect", endpoint).wait_for("recording")
-    with EnvelopePublisher(options, tmp_path / "spool") as robot:
-        assert not robot.flush(DEADLINE_S), "it is still known in the next process"
-        assert robot.retry_refused() == 1
-        assert robot.flush(DEADLINE_S)
-        assert robot.refused() == []
-    assert _stored(tmp_path / "log") == [payload(envelope(1))]
-
-
-def test_refusals_apply_only_to_the_same_bytes_under_the_same_key(
-    robot: EnvelopePublisher, connected: Sessions
-) -> None:
-    """Nonsense, other bytes of the same size, and another robot's key change nothing."""
-    arrived = threading.Semaphore(0)
-    viewer = connected()
-    viewer.subscribe(KEY, lambda _: arrived.release())
-    viewer.confirm()
-    mine, others = payload(envelope(1)), payload(envelope(2))
-    assert len(mine) == len(others)
-    robot.publish(mine)
-    assert arrived.acquire(timeout=DEADLINE_S)
-
-    def refuse(key: str, message: bytes) -> None:
-        said = Refusals(log_id="log", refused=(Refusal.of(message, "too blue"),))
-        viewer.send(refusal_key(key), said.encode())
-
-    viewer.send(refusal_key(KEY), b"{}")
-    refuse(KEY, others)
-    refuse("tb/other", mine)
-    assert arrived.acquire(timeout=DEADLINE_S), "it is sent again"
-    assert arrived.acquire(timeout=DEADLINE_S)
-    assert (robot.unacknowledged, robot.refused_count) == (1, 0)
-    refuse(KEY, mine)
-    assert not robot.flush(DEADLINE_S)
-    assert [one.reason for one in robot.refused()] == ["too blue"]
-    assert robot.discard_refused() == 1
-    assert robot.flush(DEADLINE_S)
 
 
 def test_an_ack_after_the_recorder_has_unsubscribed_is_applied(
@@ -405,7 +280,7 @@ def test_an_ack_after_the_recorder_has_unsubscribed_is_applied(
     watch = viewer.publisher(KEY)
     while watch.has_subscriber:
         viewer.confirm()
-    recorder.send(ack_key("run-a"), _ack(*(payload(envelope(k)) for k in range(10))))
+    recorder.send(ack_key("run-a"), encoded_ack(*(payload(envelope(k)) for k in range(10))))
     assert robot.flush(DEADLINE_S)
 
 
@@ -429,56 +304,6 @@ def test_progress_is_published_and_once_more_at_the_end(
     awaited = {Sent(run_id="run-a", last=7), Sent(run_id="run-b", last=1)}
     while awaited:
         awaited.discard(told.get(timeout=DEADLINE_S))
-
-
-def test_a_reserved_key_is_misuse(tmp_path: Path) -> None:
-    with pytest.raises(MisuseError, match="every recorder refuses envelopes under mapfold/"):
-        EnvelopePublisher(ZenohOptions(), tmp_path / "spool", "mapfold/detections")
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_publish_raises_when_the_sending_thread_has_died(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def die(_: Sender) -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(Sender, "_connect_and_send", die)
-    with EnvelopePublisher(ZenohOptions(), tmp_path / "spool") as robot:
-        robot._thread.join(DEADLINE_S)
-        with pytest.raises(TransportError, match="the sending thread has died"):
-            robot.publish(payload(envelope(1)))
-        with pytest.raises(TransportError, match="the sending thread has died"):
-            robot.flush(DEADLINE_S)
-
-
-@pytest.mark.parametrize("key", ["", "tb//detections", "/tb", "tb/*"])
-def test_an_invalid_key_is_misuse(tmp_path: Path, key: str) -> None:
-    """Else it would be tried forever, and only the spool would grow."""
-    with pytest.raises(MisuseError, match="nothing can be published under it"):
-        EnvelopePublisher(ZenohOptions(), tmp_path / "spool", key)
-
-
-def test_publish_raises_when_the_spool_is_full(endpoint: str, tmp_path: Path) -> None:
-    message = payload(envelope(1))
-    options = ZenohOptions(connect=(endpoint,))
-    with EnvelopePublisher(options, tmp_path / "spool", max_spool_bytes=len(message)) as robot:
-        robot.publish(message)
-        with pytest.raises(SpoolFull):
-            robot.publish(payload(envelope(2)))
-        assert robot.unacknowledged == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (ZenohOptions(connect=("localhost",)), "has no protocol"),
-        (ZenohOptions(config_file=Path("no-file")), "no such Zenoh configuration"),
-    ],
-)
-def test_invalid_options_are_misuse(tmp_path: Path, options: ZenohOptions, complaint: str) -> None:
-    with pytest.raises(MisuseError, match=complaint):
-        EnvelopePublisher(options, tmp_path / "spool")
 
 
 def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest(
@@ -519,13 +344,9 @@ def test_kill_9_loses_nothing_that_was_acknowledged_and_resending_fills_the_rest
             promised = set(acked)
         with LogWriter(tmp_path / "log"):
             pass  # what a restart does: recover the torn end
-        assert promised <= _keyframes(tmp_path / "log")
+        assert promised <= keyframe_ids(tmp_path / "log")
     recorder()
     thread.join()
     assert published.is_set()
     assert robot.flush(DEADLINE_S)
-    assert _keyframes(tmp_path / "log") == set(range(KEYFRAMES))
-
-
-def _keyframes(log: Path) -> set[int]:
-    return {json.loads(p)["keyframe_id"] for p in _stored(log)}
+    assert keyframe_ids(tmp_path / "log") == set(range(KEYFRAMES))

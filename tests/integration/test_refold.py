@@ -4,29 +4,23 @@ import json
 import re
 import shlex
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import psycopg
 import pytest
 
-from eventsrc import commands
 from eventsrc.commands import Command, UseSettings
 from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
 from projections.cli.db import _sink_line
-from projections.database import TailProgress, TailReport, rebuild, tail
+from projections.database import rebuild, tail
 from projections.database.check import check
 from projections.database.connection import Targets
-from projections.database.statements import statements
 from projections.database.status import SinkStatus, projection_status
-from projections.errors import DatabaseError, FoldError, ImpossibleCommand, ProjectionMismatch
+from projections.errors import ProjectionMismatch
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.commands_in_logs import (
@@ -38,36 +32,20 @@ from tests.commands_in_logs import (
     name_place,
     undo,
 )
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.rows import all_rows, expected_graph, graph_rows, parsed
+from tests.logs import walk, write_log
+from tests.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
+from tests.rows import all_rows, graph_rows, parsed
 from tests.thorough import rounds
-
-SETTINGS = Settings()
-WAIT_S = 60.0
-LOG_LENGTH = 120
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Three rooms that the run b joins into one place, and a third run."""
-    documents = walk(60) + list(bridge()) + walk(40, seed=3, run_id="run-c")
-    return write_log(tmp_path / "log", documents)
+    return three_rooms(tmp_path)
 
 
 @pytest.fixture(params=["one_database", "two_databases"][: rounds(2, 1)])
 def targets(request: pytest.FixtureRequest) -> Targets:
     found: Targets = request.getfixturevalue(request.param)
-    return found
-
-
-def fresh_rows(log: Path, targets: Targets, **options: Any) -> Any:
-    """The rows of a replay, which must also be those that the view of a plain fold asks for."""
-    rebuild(log, targets, SETTINGS, **options)
-    with LogReader(log) as reader:
-        corrections = read_corrections(reader)
-        _, view = fold_log(reader, SETTINGS, corrections=corrections)
-    found = all_rows(targets)
-    assert parsed(found[0]) == expected_graph(view)
     return found
 
 
@@ -85,24 +63,6 @@ def names(targets: Targets) -> dict[str, str]:
         for _, properties in parsed(graph_rows(targets.graph_url))["Place"]
         if "name" in properties
     }
-
-
-@contextmanager
-def tailing(
-    log: Path, targets: Targets, **options: Any
-) -> Iterator[tuple[TailProgress, "Future[TailReport]"]]:
-    """A live tail in a thread, stopped at the end."""
-    progress, stop = TailProgress(), threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(
-            tail, log, targets, options.pop("settings", SETTINGS), stop=stop, progress=progress,
-            **options,
-        )  # fmt: skip
-        try:
-            yield progress, running
-        finally:
-            stop.set()
-            running.result(WAIT_S)
 
 
 @pytest.mark.parametrize(
@@ -361,92 +321,6 @@ def test_a_projection_under_other_corrections_is_reported_and_refolded(
     assert all_rows(one_database) == fresh_rows(log, third_database)
 
 
-@pytest.mark.slow
-def test_a_refold_parks_what_it_cannot_fold(
-    log: Path, targets: Targets, third_database: Targets
-) -> None:
-    append_raw(log, b"not an envelope")
-    tail(log, targets, SETTINGS, once=True)
-    append_command(log, forget_run("run-b"))
-    append_raw(log, b"nor is this")
-    report = tail(log, targets, SETTINGS, once=True)
-    assert [letter.offset for letter in report.parked] == [122]  # 120 was parked before
-    for sink in projection_status(log, targets, SETTINGS).sinks:
-        assert [letter.offset for letter in sink.dead_letters] == [120, 122]
-    tail(log, third_database, SETTINGS, once=True)
-    assert all_rows(targets) == all_rows(third_database)
-    assert [c.sound for c in check(log, targets, SETTINGS)] == [True, True]
-
-
-def test_a_command_that_cannot_be_read_stops_the_tail_and_changes_nothing(
-    log: Path, one_database: Targets
-) -> None:
-    tail(log, one_database, SETTINGS, once=True)
-    before = all_rows(one_database)
-    append_raw(log, b'{"kind": "tidy-up"}', key="mapfold/command")
-    for refused in (tail, rebuild):
-        with pytest.raises(FoldError, match="event at offset 120 cannot be folded"):
-            refused(log, one_database, SETTINGS)  # type: ignore[operator]
-    assert all_rows(one_database) == before
-
-
-def beyond_the_map(run_id: str) -> Command:
-    """As a raw sender can give it; `mapfold edit` refuses it."""
-    return command(
-        commands.CorrectPoses,
-        run_id=run_id,
-        transform=commands.RigidTransform(cos=1.0, sin=0.0, dx=1e7, dy=1e7, dyaw=0.0),
-    )
-
-
-def test_a_command_that_no_fold_can_obey_leaves_the_old_map(log: Path, targets: Targets) -> None:
-    tail(log, targets, SETTINGS, once=True)
-    before = all_rows(targets)
-    bad = beyond_the_map("run-c")
-    at = append_command(log, bad)
-    says = (
-        rf"offset \d+ .*{bad.command_id} at offset {at} .*edit LOG undo {bad.command_id} --reason"
-    )
-    with pytest.raises(ImpossibleCommand, match=says):
-        tail(log, targets, SETTINGS, once=True)
-    assert all_rows(targets) == before
-    status = projection_status(log, targets, SETTINGS)
-    assert [(s.refold_done, s.dead_letters) for s in status.sinks] == [(None, ())] * 2
-    append_command(log, undo(bad))
-    assert tail(log, targets, SETTINGS, once=True).parked == []
-    assert all_rows(targets) == before
-
-
-@pytest.mark.slow
-def test_a_live_tail_tries_an_impossible_command_again_when_another_comes(
-    log: Path, targets: Targets, third_database: Targets
-) -> None:
-    notes: list[str] = []
-    noted = threading.Semaphore(0)
-
-    def note(text: str) -> None:
-        notes.append(text)
-        noted.release()
-
-    with tailing(log, targets, note=note) as (progress, running):
-        assert progress.wait(Offset(LOG_LENGTH), WAIT_S)
-        before = all_rows(targets)
-        bad = beyond_the_map("run-c")
-        append_command(log, bad)
-        assert noted.acquire(timeout=WAIT_S)
-        write_log(log, walk(4, seed=6, run_id="run-e"))
-        assert all_rows(targets) == before
-        append_command(log, forget_run("run-b"))
-        assert noted.acquire(timeout=WAIT_S)
-        assert all_rows(targets) == before
-        at = append_command(log, undo(bad))
-        assert progress.wait(Offset(at + 1), WAIT_S)
-    assert len(notes) == 2
-    assert bad.command_id in notes[0]
-    assert (running.result().refolds, running.result().parked) == (1, [])
-    assert all_rows(targets) == fresh_rows(log, third_database)
-
-
 def test_the_command_line_tells_of_a_refold(
     log: Path, tmp_path: Path, one_database: Targets
 ) -> None:
@@ -463,21 +337,6 @@ def test_the_command_line_tells_of_a_refold(
     assert "0 events written in 0 batches; the databases are at offset 121" in told()
 
 
-def test_a_stopped_refold_leaves_the_old_map(
-    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, third_database: Targets
-) -> None:
-    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
-    tail(log, one_database, SETTINGS, once=True)
-    before = all_rows(one_database)
-    append_command(log, forget_run("run-b"))
-    stop = threading.Event()
-    report = tail(log, one_database, SETTINGS, stop=stop, on_refold=lambda *_: stop.set())
-    assert report.refolds == 0
-    assert all_rows(one_database) == before
-    tail(log, one_database, SETTINGS, once=True)
-    assert all_rows(one_database) == fresh_rows(log, third_database)
-
-
 @pytest.mark.slow
 def test_checkpoints_of_an_older_version_are_used(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
@@ -491,13 +350,3 @@ def test_checkpoints_of_an_older_version_are_used(
     append_command(log, forget_run("run-b"))
     assert tail(log, one_database, SETTINGS, once=True).refolds == 1
     assert all_rows(one_database) == fresh_rows(log, third_database)
-
-
-def test_a_role_that_may_not_make_tables_is_told_who_can(
-    log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tail(log, one_database, SETTINGS, once=True)
-    append_command(log, forget_run("run-b"))
-    monkeypatch.setitem(statements("checkpoint"), "may_create", psycopg.sql.SQL("SELECT false"))
-    with pytest.raises(DatabaseError, match=r"have their owner make it.*mapfold replay"):
-        tail(log, one_database, SETTINGS, once=True)

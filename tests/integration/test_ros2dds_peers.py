@@ -15,7 +15,8 @@ from eventsrc.transport.session import Session
 from tests import dds, ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.integration.test_record_ros2dds import (
+from tests.ros2dds_drive import KINDS, drive
+from tests.ros2dds_recordings import (
     announce_all,
     check_derived,
     envelopes,
@@ -24,7 +25,6 @@ from tests.integration.test_record_ros2dds import (
     recording,
     wait_for_recorder,
 )
-from tests.ros2dds_drive import KINDS, drive
 from tests.ros_messages import TYPES
 
 KEYFRAMES = 12
