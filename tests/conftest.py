@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.commands import Commands
 from tests.thorough import examples
 
 # How long an example takes says how busy the machine is; benchmarks measure speed.
@@ -64,3 +65,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         network = NETWORK & set(getattr(item, "fixturenames", ()))
         if UNIT in item.path.parents and not slow and not network:
             item.add_marker(pytest.mark.unit)
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    """Commands in an empty folder."""
+    return Commands.in_folder(tmp_path)

@@ -5,7 +5,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,3 +117,13 @@ def showing(mapfold: Commands, *args: str | Path) -> Iterator[UiServer]:
     assert "Traceback" not in server.text, server.text
     assert code == 0, server.text
     assert server.said[-1] == "page closed"
+
+
+def until(heard: Iterator[dict[str, Any]], holds: Callable[[dict[str, Any]], bool]) -> Any:
+    """The first document for which it holds; the stream's own timeout is the deadline."""
+    return next(each for each in heard if holds(each))
+
+
+def digest(mapfold: Commands, log: Path) -> str:
+    """The digest that the command prints."""
+    return mapfold("state", log, "--digest").out.strip()

@@ -15,11 +15,6 @@ from tests.logs import write_log
 from tests.property.test_floors import drive
 
 
-@pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    return Commands.in_folder(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two floors, one above the other, and one without a name."""

@@ -78,11 +78,6 @@ def expected_entities(state: dict[str, Any], merges: list[dict[str, Any]]) -> li
     return names + [f"merge/{merge['offset']}" for merge in merges]
 
 
-@pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    return Commands.in_folder(tmp_path)
-
-
 @dataclass
 class Recording:
     """The messages of an MCAP file by topic: (log time, data)."""

@@ -2,28 +2,24 @@
 
 import json
 import shutil
-import sqlite3
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from eventsrc.errors import MapfoldError, MisuseError
-from eventsrc.importers import BagOptions, ImportReport, import_files
-from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import RejectedPayload
+from eventsrc.errors import MisuseError
+from eventsrc.log import LogReader
 from projections.model.digest import map_digest
 from projections.model.fold import fold_log
 from projections.settings import Settings
 from tests import ros_messages as ros
 from tests.commands import Commands
 from tests.fixtures_log import read_log
+from tests.imported_bags import DRIVE, envelopes, imported
 from tests.ros_bags import RUN, Drive, Raw, write_bag
-from tests.ros_messages import SECOND, START, flat
+from tests.ros_messages import START, flat
 from tests.thorough import every_other
-
-DRIVE = Drive(40)
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +36,10 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
-def imported(log: Path, *names: Path, **options: Any) -> ImportReport:
-    with LogWriter(log) as writer:
-        return import_files(writer, [*map(str, names)], bags=BagOptions(**options))
-
-
 def digest(log: Path, *settings: str) -> str:
     with LogReader(log) as reader:
         _, view = fold_log(reader, Settings().with_assignments(settings))
     return map_digest(view)
-
-
-def envelopes(log: Path) -> list[Any]:
-    return [json.loads(e.payload) for e in read_log(log) if not e.key.startswith("mapfold/")]
 
 
 BOTH_RULES: tuple[tuple[str, ...], ...] = ((), ("fusion=evidence", "places=rooms"))
@@ -295,177 +282,14 @@ def test_a_bag_without_detections_says_so(tmp_path: Path) -> None:
             assert said in report.bags[0].notes[-1]
 
 
-# Hostile bags
-
-
-def test_a_bag_cut_off_at_any_place_gives_what_was_before_it(
-    drives: dict[str, Path], tmp_path: Path
-) -> None:
-    (file,) = drives["mcap none"].glob("*.mcap")
-    whole = file.read_bytes()
-    for number, size in enumerate((len(whole) - 1, len(whole) // 2, 300, 40)):
-        bag = tmp_path / str(number) / "drive"
-        bag.mkdir(parents=True)
-        (bag / "drive_0.mcap").write_bytes(whole[:size])
-        log = tmp_path / str(number) / "log"
-        with pytest.raises(MapfoldError) as damage:
-            imported(log, bag)
-        found = envelopes(log)
-        before = "what was made of the messages before it is in the log"
-        assert (before if found else "no message before it could be read") in str(damage.value)
-        assert found == [json.loads(e) for e in DRIVE.envelopes(RUN)][: len(found)]
-        assert len(found) == DRIVE.pictures or number > 0
-
-
-def test_a_damaged_database_gives_what_was_before_the_damage(
-    drives: dict[str, Path], tmp_path: Path
-) -> None:
-    (file,) = drives["sqlite none"].glob("*.db3")
-    whole = file.read_bytes()
-    damaged = [
-        whole[: len(whole) // 2],
-        whole[:100],
-        whole[:4096] + b"\xff" * 4096 + whole[8192:],
-        whole[: len(whole) // 2] + b"\xff" * (len(whole) // 4) + whole[len(whole) * 3 // 4 :],
-    ]
-    for number, content in enumerate(damaged):
-        bag = tmp_path / str(number) / "drive"
-        bag.mkdir(parents=True)
-        (bag / "drive_0.db3").write_bytes(content)
-        log = tmp_path / str(number) / "log"
-        try:
-            report = imported(log, bag)
-        except MapfoldError as error:
-            said = [str(error)]
-        else:
-            said = report.bags[0].notes
-        assert any("drive_0.db3" in each for each in said)
-
-
-def test_what_is_no_bag_whatever_its_name_is_refused(tmp_path: Path) -> None:
-    bag = tmp_path / "drive"
-    bag.mkdir()
-    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
-    with pytest.raises(MisuseError, match=r"no \.db3 or \.mcap file"):
-        imported(tmp_path / "log", bag)
-    with pytest.raises(MisuseError, match="give its folder"):
-        imported(tmp_path / "log", bag / "metadata.yaml")
-    for content in (b"", b"hello", b"\x28\xb5\x2f\xfdrubbish"):
-        (bag / "drive_0.db3").write_bytes(content)
-        with pytest.raises(MisuseError, match="neither SQLite nor MCAP"):
-            imported(tmp_path / "log", bag)
-    (bag / "drive_0.db3").unlink()
-    with sqlite3.connect(bag / "drive_0.db3") as other:
-        other.execute("CREATE TABLE songs(title TEXT)")
-    other.close()
-    with pytest.raises(MapfoldError, match=r"drive_0\.db3"):
-        imported(tmp_path / "log", bag)
-
-
-def test_a_database_is_known_by_its_content_whatever_its_path(
-    drives: dict[str, Path], tmp_path: Path
-) -> None:
-    (file,) = drives["sqlite none"].glob("*.db3")
-    odd = tmp_path / "100%41? #1"
-    odd.mkdir()
-    for number, name in enumerate(("drive_0.sqlite", "drive_0.db3", "drive")):
-        shutil.copy(file, odd / name)
-        log = tmp_path / f"log{number}"
-        assert imported(log, odd / name).accepted == DRIVE.pictures
-        assert envelopes(log)[0]["run_id"] == RUN
-
-
-def test_messages_that_were_not_written_into_the_database_are_not_passed_over(
-    drives: dict[str, Path], tmp_path: Path
-) -> None:
-    bag = tmp_path / "drive"
-    shutil.copytree(drives["sqlite none"], bag)
-    (bag / "drive.db3-wal").write_bytes(b"x")
-    with pytest.raises(MisuseError, match="wal_checkpoint"):
-        imported(tmp_path / "log", bag)
-
-
-def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Path) -> None:
-    kind = "vision_msgs/msg/Detection2DArray"
-    good = ros.TYPES.encode(ros.detections(START, "camera"), kind)
-    lying = bytearray(good)
-    lying[-4:] = (2**31).to_bytes(4, "little")  # the number of detections
-    tf = Raw("tf2_msgs/msg/TFMessage", b"\0\1\0\0\xff\xff\xff\xff")
-    far = ros.detections(0, "camera")
-    far.header.stamp.sec = -1
-    bag = write_bag(
-        tmp_path / "drive",
-        [
-            ("/detections", START, Raw(kind, bytes(lying))),
-            ("/detections", START, Raw(kind, b"")),
-            ("/detections", START, Raw(kind, b"\0\7\0\0")),
-            ("/detections", START, Raw(kind, good[:-3])),
-            ("/detections", START, Raw(kind, good)),
-            ("/tf", START, tf),
-            ("/detections", START, far),
-        ],
-    )
-    report = imported(tmp_path / "log", bag)
-    assert (report.accepted, report.rejected) == (1, 6)
-    refused = [e for e in read_log(tmp_path / "log") if e.key == "mapfold/rejected"]
-    kept = [RejectedPayload.model_validate_json(event.payload) for event in refused]
-    assert kept[0].raw == bytes(lying)
-    assert "/detections: no vision_msgs/msg/Detection2DArray in CDR" in kept[0].reason
-
-
-def test_a_type_is_read_as_the_bag_defines_it_and_a_broken_definition_is_told(
-    drives: dict[str, Path], tmp_path: Path
-) -> None:
-    (file,) = drives["sqlite none"].glob("*.db3")
-    bag = tmp_path / "drive"
-    bag.mkdir()
-    shutil.copy(file, bag / "drive_0.db3")
-    with sqlite3.connect(bag / "drive_0.db3") as database:
-        database.execute(
-            "UPDATE message_definitions SET encoded_message_definition = 'import os; os.abort()' "
-            "WHERE topic_type = 'tf2_msgs/msg/TFMessage'"
-        )
-    database.close()
-    report = imported(tmp_path / "log", bag)
-    assert (report.accepted, report.rejected) == (DRIVE.pictures, 0)
-    assert "definition of tf2_msgs/msg/TFMessage cannot be read" in report.bags[0].notes[0]
-
-
-@pytest.mark.seconds
-def test_very_many_transforms_a_second_are_read_in_bounded_memory(tmp_path: Path) -> None:
-    messages: list[tuple[str, int, Any]] = []
-    kind = "tf2_msgs/msg/TFMessage"
-    for number in range(3_000):
-        at = START + number * SECOND // 100_000
-        if number < 50 or number % 1_000 == 0:
-            links = [ros.transform(f"f{i}", f"f{i + 1}", at, flat(0, 0, 0)) for i in range(20)]
-            payload = Raw(kind, ros.TYPES.encode(ros.tf(*links), kind))
-        messages.append(("/tf", at, payload))
-    messages.insert(1_500, ("/detections", START, ros.detections(START, "f20")))
-    report = imported(
-        tmp_path / "log",
-        write_bag(tmp_path / "drive", messages),
-        map_frame="f0",
-        base_frame="f19",
-    )
-    assert report.accepted == 1
-    assert report.bags[0].streams["/detections"].without_pose == 0
-
-
 # The command
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Commands:
-    """Commands in an empty folder."""
-    return Commands.in_folder(tmp_path)
-
-
-def test_the_command_says_what_it_took_for_what(run: Commands) -> None:
+def test_the_command_says_what_it_took_for_what(mapfold: Commands) -> None:
     messages = [*Drive(3).messages()]
     other = [(f"/other{n:02}", START, ros.text("x")) for n in range(12)]
-    write_bag(run.folder / "drive", [*messages, *other], "sqlite")
-    said = run("import", "log", "drive")
+    write_bag(mapfold.folder / "drive", [*messages, *other], "sqlite")
+    said = mapfold("import", "log", "drive")
     lines = said.err.splitlines()
     assert lines[0] == "drive: 25 messages of 17 topics, 0.4 s"
     assert [line.split() for line in lines[1:3]] == [
@@ -474,16 +298,16 @@ def test_the_command_says_what_it_took_for_what(run: Commands) -> None:
     ]
     assert "  … and 2 more topics that are not used" in lines
     assert lines[-1].startswith("imported 3 envelopes into log, offsets 0 to 2, 12 messages")
-    document = run("import", "other", "drive", "--json").json
+    document = mapfold("import", "other", "drive", "--json").json
     assert document["bags"][0]["streams"]["/detections"]["keyframes"] == 3
     assert document["accepted"] == 3
 
 
-def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(run: Commands) -> None:
-    write_bag(run.folder / "empty", [])
-    said = run("import", "log", "empty", code=3)
+def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(mapfold: Commands) -> None:
+    write_bag(mapfold.folder / "empty", [])
+    said = mapfold("import", "log", "empty", code=3)
     assert "note: nothing to import: no topic is of type" in said.err
-    write_bag(run.folder / "drive", Drive(2).messages())
+    write_bag(mapfold.folder / "drive", Drive(2).messages())
     wrong = [
         (["--detections", "/x"], "--detections /x"),
         (["--topic", "/detections"], "--topic does not choose what is used of a bag"),
@@ -493,14 +317,14 @@ def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(run: Comm
         (["--labels", "none.txt"], "--labels none.txt: No such file"),
     ]
     for options, told in every_other(wrong):
-        assert told in run("import", "log", "drive", *options, code=2).err
+        assert told in mapfold("import", "log", "drive", *options, code=2).err
 
 
-def test_numbered_classes_get_the_names_of_a_file(run: Commands) -> None:
+def test_numbered_classes_get_the_names_of_a_file(mapfold: Commands) -> None:
     seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "2", "7")]
     shown = ("/detections", START, ros.detections(START, "camera", *seen))
-    write_bag(run.folder / "drive", [shown])
-    (run.folder / "names.txt").write_text("person\n\nbicycle \n")
-    run("import", "log", "drive", "--labels", "names.txt")
-    (made,) = envelopes(run.folder / "log")
+    write_bag(mapfold.folder / "drive", [shown])
+    (mapfold.folder / "names.txt").write_text("person\n\nbicycle \n")
+    mapfold("import", "log", "drive", "--labels", "names.txt")
+    (made,) = envelopes(mapfold.folder / "log")
     assert [each["class"] for each in made["detections"]] == ["person", "bicycle", "7"]

@@ -14,22 +14,16 @@ from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Commands:
-    """Commands in an empty folder."""
-    return Commands.in_folder(tmp_path)
-
-
 def _lines(first: int, count: int) -> list[bytes]:
     return [payload(envelope(k)) for k in range(first, first + count)]
 
 
 def test_rejections_are_printed_with_file_line_and_reason_and_the_rest_counted(
-    run: Commands,
+    mapfold: Commands,
 ) -> None:
-    (run.folder / "a.jsonl").write_bytes(b"\n".join([*_lines(0, 2), b"", b"junk", b"[1]"]))
-    (run.folder / "b.jsonl").write_bytes(b"{}\n" * 8)
-    said = run("import", "L", "a.jsonl", "b.jsonl", code=3).err.splitlines()
+    (mapfold.folder / "a.jsonl").write_bytes(b"\n".join([*_lines(0, 2), b"", b"junk", b"[1]"]))
+    (mapfold.folder / "b.jsonl").write_bytes(b"{}\n" * 8)
+    said = mapfold("import", "L", "a.jsonl", "b.jsonl", code=3).err.splitlines()
     assert said[0].startswith("a.jsonl: line 4: rejected: not JSON: ")
     assert said[1] == "a.jsonl: line 5: rejected: not a JSON object but list"
     assert [line.partition(": rejected: ")[0] for line in said[2:5]] == [
@@ -38,16 +32,16 @@ def test_rejections_are_printed_with_file_line_and_reason_and_the_rest_counted(
     assert said[5] == "… and 5 more rejected"
     assert said[6].startswith("imported 2 envelopes into L, offsets 0 to 11, 10 rejected; ")
     assert len(said) == 7
-    said = run("import", "again", "-", stdin=b"\njunk", code=3).err.splitlines()
+    said = mapfold("import", "again", "-", stdin=b"\njunk", code=3).err.splitlines()
     assert said[0].startswith("standard input: line 2: rejected: not JSON")
     assert len(said) == 2
 
 
-def test_ctrl_c_prints_what_is_kept_and_its_last_place(run: Commands) -> None:
+def test_ctrl_c_prints_what_is_kept_and_its_last_place(mapfold: Commands) -> None:
     program = subprocess.Popen(
         [PROGRAM, "import", "L", "-"],
-        cwd=run.folder,
-        env=dict(run.env),
+        cwd=mapfold.folder,
+        env=dict(mapfold.env),
         stdin=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
@@ -65,7 +59,7 @@ def test_ctrl_c_prints_what_is_kept_and_its_last_place(run: Commands) -> None:
         "import only what comes after that, or the log holds the rest twice"
     )
     assert ended == "mapfold: interrupted"
-    assert len(read_log(run.folder / "L")) == 4
+    assert len(read_log(mapfold.folder / "L")) == 4
 
 
 def test_an_interruption_is_exact_also_within_a_message(tmp_path: Path) -> None:
@@ -86,7 +80,7 @@ def test_an_interruption_is_exact_also_within_a_message(tmp_path: Path) -> None:
     assert len(read_log(tmp_path / "L")) == 165
 
 
-def test_a_key_that_nothing_can_be_published_under_is_misuse(run: Commands) -> None:
-    said = run("import", "L", "-", "--key", "a b/*", stdin=b"", code=2)
+def test_a_key_that_nothing_can_be_published_under_is_misuse(mapfold: Commands) -> None:
+    said = mapfold("import", "L", "-", "--key", "a b/*", stdin=b"", code=2)
     assert said.err.startswith("mapfold: --key 'a b/*': ")
-    assert not (run.folder / "L").exists()
+    assert not (mapfold.folder / "L").exists()

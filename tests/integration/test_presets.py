@@ -12,11 +12,6 @@ from tests.logs import write_log
 
 
 @pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    return Commands.in_folder(tmp_path)
-
-
-@pytest.fixture
 def log(tmp_path: Path) -> Path:
     """A corridor of 30 m, which the page's rule makes one place."""
     return write_log(tmp_path / "log", [envelope(k, 0.5 * k, 0.0) for k in range(60)])

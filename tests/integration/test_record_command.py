@@ -2,8 +2,6 @@
 
 import json
 import os
-import random
-import resource
 import signal
 import socket
 import subprocess
@@ -18,22 +16,17 @@ import zenoh
 from eventsrc.append import append_payload
 from eventsrc.gap_history import unread_events
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.log.format import LEDGER
-from eventsrc.robot.acks import Ack, ack_key, payload_sha256
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, Router, Session, ZenohOptions
+from eventsrc.robot.acks import ack_key
+from eventsrc.transport.session import Router, Session
 from tests.commands import PROGRAM
 from tests.envelopes import envelope, payload
+from tests.fixtures_log import KEY, read_log
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program
 
 Start = Callable[..., Program]
+
+
 Sessions = Callable[[], Session]
-KEY = "tb/detections"
-
-
-def _stored(log: Path) -> list[bytes]:
-    with LogReader(log) as reader:
-        return [event.payload for event in reader.read()]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -46,7 +39,7 @@ def test_a_signal_drains_the_queue_and_exits_0(
     assert f"recording {KEY} to {log} from offset 0" in recorder.wait_for("recording")
     assert publish(KEY, *(p.decode() for p in sent)).wait() == 0
     assert recorder.end(number) == 0
-    assert _stored(log) == sent
+    assert [event.payload for event in read_log(log)] == sent
     assert recorder.lines[-1].endswith(
         "30 recorded, 0 rejected, 0 lost, 0 keyframes missing; 30 events in the log"
     )
@@ -113,7 +106,7 @@ def test_no_gaps_is_for_robots_that_do_not_count_by_one(
     recorder.wait_for("recording")
     publish(KEY, *(payload(envelope(k * 15)).decode() for k in range(3)))
     assert recorder.wait() == code
-    assert len(_stored(log)) == 3 + losses
+    assert len(read_log(log)) == 3 + losses
 
 
 def test_without_a_router_it_is_one_line_and_no_log(start: Start, tmp_path: Path) -> None:
@@ -136,7 +129,7 @@ def test_a_robot_can_connect_to_a_recorder_without_a_router(
     recorder.wait_for("recording")
     assert start_code(PUBLISHER, free, KEY, payload(envelope(1)).decode()).wait() == 0
     assert recorder.wait() == 0
-    assert len(_stored(log)) == 1
+    assert len(read_log(log)) == 1
 
 
 def test_a_second_recorder_is_refused_with_the_name_of_the_holder(
@@ -217,84 +210,6 @@ def test_what_zenoh_drops_while_the_recorder_stands_still_is_counted(
     assert numbers["missing"] == numbers["transport_missed"] > 0
 
 
-_ON_A_SMALL_DISK = """
-import resource, sys
-from projections.cli import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-main()
-"""
-
-
-@pytest.mark.parametrize("fsync", ["always", "50ms"])
-def test_a_full_disk_is_one_line_and_what_is_synced_stays(
-    start_code: Start, endpoint: str, connected: Sessions, tmp_path: Path, fsync: str
-) -> None:
-    """A limit on the size of files is the disk here: some of 20 envelopes fit."""
-    log = tmp_path / "log"
-    acked: set[str] = set()
-    heard = threading.Event()
-
-    def hear(message: Received) -> None:
-        acked.update(Ack.decode(message.payload).sha256)
-        if len(acked) >= 3:
-            heard.set()
-
-    watcher = connected()
-    watcher.subscribe(ack_key("run-a"), hear)
-    watcher.confirm()
-    arguments = ("record", str(log), "--connect", endpoint, "--fsync", fsync, "--json")
-    recorder = start_code(_ON_A_SMALL_DISK, *arguments)
-    recorder.wait_for("recording")
-    publisher = connected().publisher(KEY)
-    assert publisher.wait_for_subscriber(DEADLINE_S)
-    sent = [payload(envelope(k, note="x" * 10_000)) for k in range(20)]
-    for message in sent[:3]:
-        publisher.put(message)
-    assert heard.wait(DEADLINE_S)
-    for message in sent[3:]:
-        publisher.put(message)
-    assert recorder.wait() == 1
-    line = recorder.lines[-1]
-    assert line.startswith(f"mapfold: {log}")
-    assert "File too large" in line
-    assert "every event before it is safe" in line
-    assert not any("Traceback" in said for said in recorder.lines)
-    stored = _stored(log)
-    assert stored == sent[: len(stored)]
-    assert acked <= set(map(payload_sha256, stored))
-    numbers = json.loads(recorder.output())
-    assert numbers["recorded"] == numbers["next_offset"] == len(stored)
-    assert 0 < numbers["unwritten"] <= len(sent) - len(stored)
-    lost, summary = recorder.lines[-3:-1]
-    assert lost.startswith(f"LOST {numbers['unwritten']} message")
-    assert f"{len(stored)} recorded, 0 rejected, {numbers['unwritten']} lost" in summary
-
-
-def test_a_failing_seal_is_reported_with_the_numbers(
-    start: Start, endpoint: str, connected: Sessions, tmp_path: Path
-) -> None:
-    """The disk fills up when all is synced: there is no room for the sealed segment."""
-    log = tmp_path / "log"
-    recorder = start("record", str(log), "--connect", endpoint, "--fsync", "always", "--json")
-    recorder.wait_for("recording")
-    covered = threading.Event()
-    watcher = connected()
-    watcher.subscribe(ack_key("run-a"), lambda said: covered.set())
-    watcher.confirm()
-    publisher = connected().publisher(KEY)
-    assert publisher.wait_for_subscriber(DEADLINE_S)
-    noise = random.Random(1).randbytes(50_000).hex()
-    publisher.put(payload(envelope(1, note=noise)))
-    assert covered.wait(DEADLINE_S)
-    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (20_000, 20_000))
-    assert recorder.end(signal.SIGINT) == 1
-    numbers = json.loads(recorder.output())
-    assert (numbers["recorded"], numbers["unwritten"], numbers["unsealed"]) == (1, 0, 1)
-    assert "could not be sealed: File too large" in numbers["sealing_error"]
-    assert recorder.lines[-1] == f"mapfold: {numbers['sealing_error']}"
-    assert len(_stored(log)) == 1
-
-
 def test_the_ledger_is_saved_soon_after_the_start(
     start: Start, publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
@@ -328,101 +243,6 @@ def _known(log: Path) -> int:
         return reader.next_offset - unread_events(reader)
 
 
-def test_a_segment_that_is_cut_short_is_reported_and_recording_goes_on(
-    start: Start, endpoint: str, tmp_path: Path
-) -> None:
-    log = tmp_path / "log"
-    recorder = start("record", str(log), "--connect", endpoint, "--fsync", "always", "--json")
-    recorder.wait_for("recording")
-    with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), tmp_path / "spool") as robot:
-        for k in range(5):
-            robot.publish(envelope(k))
-        assert robot.flush(DEADLINE_S)
-        (active,) = log.glob("*.active")
-        os.truncate(active, 0)
-        for k in range(5, 9):
-            robot.publish(envelope(k))
-        assert robot.flush(DEADLINE_S)
-    said = recorder.wait_for("SEGMENT GIVEN UP")
-    assert f"{active} was cut short to 0 of" in said
-    assert "offsets 0 to 4, which had been recorded in it, are lost" in said
-    assert recorder.end(signal.SIGINT) == 1
-    numbers = json.loads(recorder.output())
-    assert (numbers["recorded"], numbers["lost_from_log"], numbers["next_offset"]) == (9, 5, 9)
-    assert "mapfold log recover" in recorder.lines[-1]
-    with LogReader(log) as reader:
-        assert [e.payload for e in reader.read(5)] == [payload(envelope(k)) for k in range(5, 9)]
-    assert not (log / LEDGER).exists(), "it would know keyframes that the log has lost"
-
-
-def _leave_torn(log: Path) -> None:
-    """What a recorder leaves that is killed in the middle of writing its fourth event."""
-    last = payload(envelope(3))
-    with LogWriter(log) as writer:
-        for k in range(4):
-            append_payload(writer, KEY, payload(envelope(k)))
-            writer.sync()
-        (active,) = log.glob("*.active")
-        whole = active.read_bytes()
-    (sealed,) = log.glob("*.mcap")
-    sealed.unlink()
-    active.write_bytes(whole[: whole.index(last) + 20])
-
-
-@pytest.mark.parametrize("command", ["record", "import"])
-def test_what_a_killed_writer_left_is_reported(
-    start: Start, endpoint: str, tmp_path: Path, command: str
-) -> None:
-    log, nothing = tmp_path / "log", tmp_path / "nothing.jsonl"
-    nothing.touch()
-    _leave_torn(log)
-    if command == "record":
-        program = start("record", str(log), "--connect", endpoint, "--json")
-        program.wait_for("from offset 3")
-        assert program.end(signal.SIGINT) == 0
-    else:
-        program = start("import", str(log), str(nothing), "--json")
-        assert program.wait() == 0
-    numbers = json.loads(program.output())
-    assert (numbers["recovered_segments"], numbers["recovered_events"]) == (1, 3)
-    assert (numbers["torn_bytes"] > 20, numbers["torn_events"]) == (True, 1)
-    assert program.lines[0] == (
-        f"{log}: the last writer did not finish; recovered 1 segment with 3 events, cut off "
-        f"{numbers['torn_bytes']} torn bytes with 1 event that were never recorded"
-    )
-
-
-def test_a_place_where_no_log_can_be_is_one_line(
-    start: Start, endpoint: str, tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    recorder = start("record", str(tmp_path / "file" / "log"), "--connect", endpoint)
-    assert recorder.wait() in (1, 2)
-    (line,) = recorder.lines
-    assert str(tmp_path / "file") in line
-
-
-def test_recording_goes_on_without_gap_history_when_an_old_segment_is_damaged(
-    start: Start, publish: Start, endpoint: str, tmp_path: Path
-) -> None:
-    log = tmp_path / "log"
-    with LogWriter(log) as writer:
-        for k in range(3):
-            noise = random.Random(k).randbytes(20_000).hex()  # so that the middle is a payload
-            append_payload(writer, KEY, payload(envelope(k, note=noise)))
-    (segment,) = log.glob("*.mcap")
-    rotten = bytearray(segment.read_bytes())
-    rotten[len(rotten) // 2] ^= 0xFF
-    segment.write_bytes(rotten)
-    recorder = start("record", str(log), "--connect", endpoint)
-    recorder.wait_for("recording without gap history")
-    recorder.wait_for("from offset 3")
-    assert publish(KEY, payload(envelope(3)).decode()).wait() == 0
-    assert recorder.end(signal.SIGINT) == 0
-    assert "1 recorded" in recorder.lines[-1]
-    assert not (log / LEDGER).exists()
-
-
 def test_a_full_stderr_does_not_end_a_recording(
     publish: Start, endpoint: str, tmp_path: Path
 ) -> None:
@@ -432,4 +252,4 @@ def test_a_full_stderr_does_not_end_a_recording(
     with Path("/dev/full").open("wb") as full, subprocess.Popen(args, stderr=full) as recorder:
         assert publish(KEY, "no envelope", payload(envelope(1)).decode()).wait() == 0
         assert recorder.wait(DEADLINE_S) == 3  # one was rejected
-    assert len(_stored(log)) == 2
+    assert len(read_log(log)) == 2

@@ -179,10 +179,6 @@ class TestCommand:
     """`mapfold relocalize` as a user runs it."""
 
     @pytest.fixture
-    def mapfold(self, tmp_path: Path) -> Commands:
-        return Commands.in_folder(tmp_path)
-
-    @pytest.fixture
     def question(self, tmp_path: Path) -> Path:
         file = tmp_path / "question.json"
         seen = next(d for d in walk(60, seed=3) if d["detections"])

@@ -37,11 +37,6 @@ def token_file(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.fixture
-def mapfold(tmp_path: Path) -> Commands:
-    return Commands.in_folder(tmp_path)
-
-
 def get(port: int, path: str = "/health", **headers: str) -> tuple[int, Any]:
     got = ask(port, request("GET", path, headers=headers))
     return status(got), json.loads(got.partition(b"\r\n\r\n")[2])

@@ -1,0 +1,183 @@
+"""Bags of ROS 2 that are cut off, damaged, no bags, or hold what is none of its type."""
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.errors import MapfoldError, MisuseError
+from eventsrc.system_events import RejectedPayload
+from tests import ros_messages as ros
+from tests.fixtures_log import read_log
+from tests.imported_bags import DRIVE, envelopes, imported
+from tests.ros_bags import RUN, Raw, write_bag
+from tests.ros_messages import SECOND, START, flat
+
+# Hostile bags
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One drive by storage."""
+    folder = tmp_path_factory.mktemp("drives")
+    return {
+        storage: write_bag(folder / storage / "drive", DRIVE.messages(), storage)
+        for storage in ("mcap", "sqlite")
+    }
+
+
+def test_a_bag_cut_off_at_any_place_gives_what_was_before_it(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["mcap"].glob("*.mcap")
+    whole = file.read_bytes()
+    for number, size in enumerate((len(whole) - 1, len(whole) // 2, 300, 40)):
+        bag = tmp_path / str(number) / "drive"
+        bag.mkdir(parents=True)
+        (bag / "drive_0.mcap").write_bytes(whole[:size])
+        log = tmp_path / str(number) / "log"
+        with pytest.raises(MapfoldError) as damage:
+            imported(log, bag)
+        found = envelopes(log)
+        before = "what was made of the messages before it is in the log"
+        assert (before if found else "no message before it could be read") in str(damage.value)
+        assert found == [json.loads(e) for e in DRIVE.envelopes(RUN)][: len(found)]
+        assert len(found) == DRIVE.pictures or number > 0
+
+
+def test_a_damaged_database_gives_what_was_before_the_damage(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite"].glob("*.db3")
+    whole = file.read_bytes()
+    damaged = [
+        whole[: len(whole) // 2],
+        whole[:100],
+        whole[:4096] + b"\xff" * 4096 + whole[8192:],
+        whole[: len(whole) // 2] + b"\xff" * (len(whole) // 4) + whole[len(whole) * 3 // 4 :],
+    ]
+    for number, content in enumerate(damaged):
+        bag = tmp_path / str(number) / "drive"
+        bag.mkdir(parents=True)
+        (bag / "drive_0.db3").write_bytes(content)
+        log = tmp_path / str(number) / "log"
+        try:
+            report = imported(log, bag)
+        except MapfoldError as error:
+            said = [str(error)]
+        else:
+            said = report.bags[0].notes
+        assert any("drive_0.db3" in each for each in said)
+
+
+def test_what_is_no_bag_whatever_its_name_is_refused(tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    with pytest.raises(MisuseError, match=r"no \.db3 or \.mcap file"):
+        imported(tmp_path / "log", bag)
+    with pytest.raises(MisuseError, match="give its folder"):
+        imported(tmp_path / "log", bag / "metadata.yaml")
+    for content in (b"", b"hello", b"\x28\xb5\x2f\xfdrubbish"):
+        (bag / "drive_0.db3").write_bytes(content)
+        with pytest.raises(MisuseError, match="neither SQLite nor MCAP"):
+            imported(tmp_path / "log", bag)
+    (bag / "drive_0.db3").unlink()
+    with sqlite3.connect(bag / "drive_0.db3") as other:
+        other.execute("CREATE TABLE songs(title TEXT)")
+    other.close()
+    with pytest.raises(MapfoldError, match=r"drive_0\.db3"):
+        imported(tmp_path / "log", bag)
+
+
+def test_a_database_is_known_by_its_content_whatever_its_path(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite"].glob("*.db3")
+    odd = tmp_path / "100%41? #1"
+    odd.mkdir()
+    for number, name in enumerate(("drive_0.sqlite", "drive_0.db3", "drive")):
+        shutil.copy(file, odd / name)
+        log = tmp_path / f"log{number}"
+        assert imported(log, odd / name).accepted == DRIVE.pictures
+        assert envelopes(log)[0]["run_id"] == RUN
+
+
+def test_messages_that_were_not_written_into_the_database_are_not_passed_over(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite"], bag)
+    (bag / "drive.db3-wal").write_bytes(b"x")
+    with pytest.raises(MisuseError, match="wal_checkpoint"):
+        imported(tmp_path / "log", bag)
+
+
+def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Path) -> None:
+    kind = "vision_msgs/msg/Detection2DArray"
+    good = ros.TYPES.encode(ros.detections(START, "camera"), kind)
+    lying = bytearray(good)
+    lying[-4:] = (2**31).to_bytes(4, "little")  # the number of detections
+    tf = Raw("tf2_msgs/msg/TFMessage", b"\0\1\0\0\xff\xff\xff\xff")
+    far = ros.detections(0, "camera")
+    far.header.stamp.sec = -1
+    bag = write_bag(
+        tmp_path / "drive",
+        [
+            ("/detections", START, Raw(kind, bytes(lying))),
+            ("/detections", START, Raw(kind, b"")),
+            ("/detections", START, Raw(kind, b"\0\7\0\0")),
+            ("/detections", START, Raw(kind, good[:-3])),
+            ("/detections", START, Raw(kind, good)),
+            ("/tf", START, tf),
+            ("/detections", START, far),
+        ],
+    )
+    report = imported(tmp_path / "log", bag)
+    assert (report.accepted, report.rejected) == (1, 6)
+    refused = [e for e in read_log(tmp_path / "log") if e.key == "mapfold/rejected"]
+    kept = [RejectedPayload.model_validate_json(event.payload) for event in refused]
+    assert kept[0].raw == bytes(lying)
+    assert "/detections: no vision_msgs/msg/Detection2DArray in CDR" in kept[0].reason
+
+
+def test_a_type_is_read_as_the_bag_defines_it_and_a_broken_definition_is_told(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    (file,) = drives["sqlite"].glob("*.db3")
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    shutil.copy(file, bag / "drive_0.db3")
+    with sqlite3.connect(bag / "drive_0.db3") as database:
+        database.execute(
+            "UPDATE message_definitions SET encoded_message_definition = 'import os; os.abort()' "
+            "WHERE topic_type = 'tf2_msgs/msg/TFMessage'"
+        )
+    database.close()
+    report = imported(tmp_path / "log", bag)
+    assert (report.accepted, report.rejected) == (DRIVE.pictures, 0)
+    assert "definition of tf2_msgs/msg/TFMessage cannot be read" in report.bags[0].notes[0]
+
+
+@pytest.mark.seconds
+def test_very_many_transforms_a_second_are_read_in_bounded_memory(tmp_path: Path) -> None:
+    messages: list[tuple[str, int, Any]] = []
+    kind = "tf2_msgs/msg/TFMessage"
+    for number in range(3_000):
+        at = START + number * SECOND // 100_000
+        if number < 50 or number % 1_000 == 0:
+            links = [ros.transform(f"f{i}", f"f{i + 1}", at, flat(0, 0, 0)) for i in range(20)]
+            payload = Raw(kind, ros.TYPES.encode(ros.tf(*links), kind))
+        messages.append(("/tf", at, payload))
+    messages.insert(1_500, ("/detections", START, ros.detections(START, "f20")))
+    report = imported(
+        tmp_path / "log",
+        write_bag(tmp_path / "drive", messages),
+        map_frame="f0",
+        base_frame="f19",
+    )
+    assert report.accepted == 1
+    assert report.bags[0].streams["/detections"].without_pose == 0
