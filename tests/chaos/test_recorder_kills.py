@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.thorough import rounds
+
 from .recorder_killer import Ordeal
 
 
 def test_a_few_kills(tmp_path: Path) -> None:
-    _kill(tmp_path, 6, 300, 20260324)
+    _kill(tmp_path, rounds(6, 4), 300, 20260324)
 
 
 @pytest.mark.slow

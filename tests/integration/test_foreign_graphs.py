@@ -53,7 +53,7 @@ def make(pg: psycopg.Connection, *statements: str) -> None:
 @pytest.mark.seconds
 @pytest.mark.parametrize(
     ("labels", "act"),
-    mostly_slow([((LABELS,), by_replay), ((), by_tail), ((LABELS,), by_tail), ((), by_replay)], 2),
+    mostly_slow([((LABELS,), by_replay), ((), by_tail), ((LABELS,), by_tail), ((), by_replay)]),
 )
 def test_an_empty_graph_is_adopted(
     log: Path,

@@ -52,8 +52,7 @@ except LogError as error:
             *((limit, "1ms") for limit in (20_000, 20_500)),
             *((limit, "50ms") for limit in (20_000, 1_000_000)),
             *((limit, "always") for limit in (20_500, 1_000_000)),
-        ],
-        2,
+        ]
     ),
 )
 def test_synced_events_stay(log_path: Path, limit: int, fsync: str) -> None:

@@ -26,7 +26,7 @@ from tests.fixtures_log import flip
 from tests.thorough import THOROUGH
 from tests.verbatim import mixed_events
 
-SEED = 20260324
+SEED = 20260415
 
 
 @pytest.mark.slow
@@ -43,7 +43,7 @@ def test_thirty_kills(log_path: Path, fsync: str) -> None:
 
 @pytest.mark.seconds
 def test_messages_pictures_and_envelopes_survive_kills(log_path: Path, tmp_path: Path) -> None:
-    _check_mixed(log_path, tmp_path / "alone", times=4)
+    _check_mixed(log_path, tmp_path / "alone", times=2)
 
 
 @pytest.mark.slow

@@ -118,7 +118,7 @@ def test_the_table_has_the_maps_in_force_after_every_step(
         assert _in_database(found) == _as_folded(log)
         assert [r.differing for r in check(log, found, Settings())] == [0, 0]
     tailed = all_rows(found)
-    for until in range(0, end + 1, 3 * stride(2)):
+    for until in range(0, end + 1, 3 * stride(4)):
         rebuild(log, found, Settings(), until=until)
         assert _in_database(found) == _as_folded(log, until)
     rebuild(log, found, Settings())

@@ -25,7 +25,7 @@ WAIT_S = 60.0
 REBUILDS = rounds(6, 2)
 HALF = rounds(150, 60)
 """Keyframes of the smaller map, without its bridge of 20."""
-PAUSE_S = 0.0 if THOROUGH else 0.002
+PAUSE_S = 0.0 if THOROUGH else 0.01
 """Between two questions of a reader, so that a rebuild is not slowed down most of all."""
 
 COUNT_PATHS = (

@@ -20,6 +20,7 @@ from tests.integration.test_rebuild_under_readers import (
     COUNT_LABELS,
     COUNT_PATHS,
     COUNT_VECTORS,
+    HALF,
     PAUSE_S,
     Reader,
     single_answer,
@@ -59,7 +60,7 @@ class Asker(threading.Thread):
 def test_readers_see_one_map_or_the_other_and_never_an_error(
     tmp_path: Path, one_database: Targets, what: str
 ) -> None:
-    documents = walk(150, rooms=2) + list(bridge()) + walk(150, first=150)
+    documents = walk(HALF, rooms=2) + list(bridge()) + walk(HALF, first=HALF)
     log = write_log(tmp_path / "log", documents)
     append_command(log, name_place(0, "kitchen"))
     question = json.dumps({"crops": next(d["detections"] for d in documents if embedded(d))})

@@ -63,7 +63,7 @@ def said(log: Path, targets: Targets, workers: int) -> str:
 def test_rows_and_reports_are_those_of_one_process(
     tmp_path: Path, two_databases: Targets, settings: Settings
 ) -> None:
-    log = write_random_log(tmp_path / "log", 7, 400)
+    log = write_random_log(tmp_path / "log", 7, rounds(400, 150))
     for until in (None, 217)[: rounds(2, 1)]:
         alone = rebuild(log, two_databases, settings, until=until, workers=0)  # type: ignore[arg-type]
         rows = all_rows(two_databases)
@@ -132,7 +132,7 @@ def test_an_interruption_ends_the_processes_and_keeps_the_map(
 def test_a_killed_process_is_reported_and_the_map_is_right(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = write_random_log(tmp_path / "log", 7, 400)
+    log = write_random_log(tmp_path / "log", 7, rounds(400, 150))
     alone = rebuild(log, one_database, SETTINGS, workers=0)
     rows, stretches = all_rows(one_database), ParsedLog.stretches
 
