@@ -52,8 +52,8 @@ class CountIndex:
                     self.places_called[name].append(place)
 
     def _add_classes(self, record: ObjectHistory) -> None:
-        """When an object counts to which class: one of it from being found or called so on, until
-        it is called otherwise or fused into another."""
+        """Add the offsets at which the object begins and ends to count for each class: it counts
+        from being found or reclassified as the class, until reclassified again or absorbed."""
         name = record.found.class_name
         until = record.absorbed_by
         self.objects_of[name].append(record.found.offset)

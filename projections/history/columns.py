@@ -1,4 +1,4 @@
-"""What events changed, as columns: tables of numbers and texts whose rows are in order of events.
+"""The changes of a history as columns: tables of numbers and texts, rows in order of events.
 
 A `Stripe` has the rows of a span of events. Rows are only ever added, so the map after any number
 of events is made from the first rows of each table, and a log that has grown adds a stripe.
@@ -125,7 +125,7 @@ class Stripe:
     """The rows that the events from ``start`` to before ``end`` add.
 
     ``rows`` is the number of rows of each table that has any, ``arrays`` the columns by
-    ``TABLE.COLUMN``. ``release`` takes those that were read out of memory, if they are in a file.
+    ``TABLE.COLUMN``. ``release`` drops arrays that were read from a file from memory.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ def _text_arrays(name: str, texts: Iterable[str]) -> dict[str, Array]:
 
 
 def joined(stripes: Sequence[Stripe]) -> Stripe:
-    """One stripe of adjacent ones, in order."""
+    """One stripe made of adjacent stripes, given in order."""
     if len(stripes) == 1:
         return stripes[0]
     codes: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""The commands that are about a place, an object or two keyframes, as entries of an explanation.
+"""Entries of an explanation for the commands about a place, an object or two keyframes.
 
 A command names keyframes and det_ids. It is about a place if a keyframe that it names is in that
 place, and about an object if a detection that it names is one of the object's.
@@ -33,8 +33,8 @@ from .records import Cause, PlaceHistory, Refusal
 _NS = 1e9
 
 
-class CommandTeller:
-    """Entries for recorded commands, with the times of their events."""
+class EntryMaker:
+    """Makes the entries of recorded commands, with the times of their events."""
 
     def __init__(self, reader: LogReader) -> None:
         self._reader = reader
@@ -50,7 +50,7 @@ class CommandTeller:
         return self._causes[offset]
 
     def entry(self, recorded: RecordedCommand, text: str, **facts: Any) -> Entry:
-        """An entry whose text says what the command did, which it is, who gave it, and why."""
+        """An entry: ``text`` (what the command did), its kind and id, its author and its reason."""
         command = recorded.command
         told = {"command": command_document(recorded), **facts}
         by = f"{text} by {command_title(command)}"
@@ -58,13 +58,13 @@ class CommandTeller:
 
 
 def place_commands(
-    teller: CommandTeller, history: History, record: PlaceHistory, end: Offset
+    maker: EntryMaker, history: History, record: PlaceHistory, end: Offset
 ) -> list[Entry]:
     """Commands that named, kept apart, joined or moved something of a place, and the merges of it
     that they refused, after the events below ``end``."""
     place, moment = record.formed.place, _last_moment(record, end)
     entries = [
-        teller.entry(recorded, text)
+        maker.entry(recorded, text)
         for recorded in history.corrections.in_force
         for text in _place_texts(history, recorded, place, moment, end)
     ]
@@ -73,7 +73,7 @@ def place_commands(
 
 
 def _last_moment(record: PlaceHistory, end: Offset) -> Offset:
-    """The last point up to ``end`` at which a place stood."""
+    """The greatest number of events, at most ``end``, after which the place stood."""
     merge = record.absorbed_by
     return end if merge is None else min(end, merge.cause.offset)
 
@@ -81,7 +81,8 @@ def _last_moment(record: PlaceHistory, end: Offset) -> Offset:
 def _place_texts(
     history: History, recorded: RecordedCommand, place: PlaceOrdinal, moment: Offset, end: Offset
 ) -> Iterator[str]:
-    """What a command says about a place as it is after ``moment`` events, of ``end`` in all."""
+    """What a command did to a place as it is after ``moment`` events; joins are judged after
+    ``end``."""
     command = recorded.command
     match command:
         case NamePlace() if _place_of(history, command.place, moment) == place:
@@ -104,7 +105,7 @@ def _place_texts(
 def _apart_text(
     history: History, own: Sequence[Anchor], others: Sequence[Anchor], end: Offset
 ) -> str:
-    """What a command that keeps anchors apart does, where ``own`` are in one place."""
+    """The text of a command that keeps anchors apart; ``own`` are in the explained place."""
     if others:
         text = f"kept apart from {_named(history, others, end)}"
         if not _some_pair(own, others, history.corrections.apart):
@@ -121,7 +122,7 @@ def _apart_text(
 
 
 def _join_text(history: History, command: Join, end: Offset) -> str:
-    """What a join of anchors does, as things are after ``end`` events."""
+    """The text of a join of anchors, with its effect after ``end`` events."""
     one, other = command.places
     text = f"joined {_both(command.places)}"
     if one == other:
@@ -140,7 +141,7 @@ def _both(anchors: Sequence[Anchor]) -> str:
     return " and ".join(f"{anchor.run_id}:{anchor.keyframe_id}" for anchor in anchors)
 
 
-def object_commands(teller: CommandTeller, history: History, det_ids: Iterable[str]) -> list[Entry]:
+def object_commands(maker: EntryMaker, history: History, det_ids: Iterable[str]) -> list[Entry]:
     """Commands that fuse or keep apart detections of an object."""
     own = set(det_ids)
     entries = []
@@ -148,12 +149,12 @@ def object_commands(teller: CommandTeller, history: History, det_ids: Iterable[s
         command = recorded.command
         if isinstance(command, SameObject | DifferentObjects) and own & set(command.det_ids):
             word = "fused" if isinstance(command, SameObject) else "kept apart"
-            entries.append(teller.entry(recorded, f"{word} {' and '.join(command.det_ids)}"))
+            entries.append(maker.entry(recorded, f"{word} {' and '.join(command.det_ids)}"))
     return entries
 
 
 def same_place_commands(
-    teller: CommandTeller,
+    maker: EntryMaker,
     history: History,
     keyframes: tuple[KeyframeOrdinal, KeyframeOrdinal],
     end: Offset,
@@ -171,9 +172,9 @@ def same_place_commands(
         places = {_place_of(history, anchor, end) for anchor in command.places} - {None}
         if isinstance(command, Join):
             if asked <= names or (first == second and places == {first}):
-                entries.append(teller.entry(recorded, "joined"))
+                entries.append(maker.entry(recorded, "joined"))
         elif asked <= names or (first != second and {first, second} <= places):
-            entries.append(teller.entry(recorded, "kept apart"))
+            entries.append(maker.entry(recorded, "kept apart"))
     return entries + [
         _refusal_entry(history, refusal, None)
         for refusal in history.refusals
@@ -217,7 +218,7 @@ def _some_pair(
     others: Sequence[Anchor],
     pairs: tuple[tuple[Keyframe, Keyframe], ...],
 ) -> bool:
-    """Whether a pair of an own anchor and another is among the pairs in force."""
+    """Whether ``pairs``, those in force, have a pair of an own and another anchor."""
     first, second = ({_keyframe(anchor) for anchor in anchors} for anchors in (own, others))
     return any((a in first and b in second) or (b in first and a in second) for a, b in pairs)
 

@@ -1,4 +1,4 @@
-"""Functions of conditions over the map, the types of their values, and how these can change.
+"""The functions that conditions can call, the types of their values, and how values can change.
 
 The parser, ``bisect --help`` and the docs take them from one table, `FUNCTIONS`; the values come
 from a map through `Facts`.
@@ -54,7 +54,7 @@ class Direction(Enum):
 
 
 class Facts(Protocol):
-    """The map at one offset, as conditions see it.
+    """The values of the functions of conditions, for the map at one offset.
 
     Arguments are ids; a keyframe is ``run_id:keyframe_id``. For a thing that is not in the map
     (yet) the place is None and counts are 0.

@@ -236,7 +236,7 @@ class Difference:
         }
 
     def _counts(self) -> dict[str, list[int]]:
-        """What corrections leave out is counted only in a map that leaves out something."""
+        """The counts of both maps by name; one that a map does not have counts as 0 there."""
         first, second = self.counts
         names = dict.fromkeys((*first, *second))
         return {name: [first.get(name, 0), second.get(name, 0)] for name in names}

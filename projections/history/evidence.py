@@ -24,8 +24,8 @@ _NATS = 1000
 
 
 def evidence_text(evidence: MergeEvidence | None) -> str:
-    """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; the first two
-    are log-likelihood ratios in nats. A command needs none."""
+    """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; the first two are
+    log-likelihood ratios in nats. None stands for a merge by a command."""
     if evidence is None:
         return "a command"
     return (
@@ -47,7 +47,8 @@ def evidence_document(evidence: MergeEvidence) -> dict[str, Any]:
 
 
 def standing_text(history: History, record: ObjectHistory, end: Offset) -> str:
-    """``stands at (1.20, 3.40) ± 0.12 m, seen from 3 spots; missing since …``, or nothing."""
+    """``; stands at (1.20, 3.40) ± 0.12 m, seen from 3 spots; missing since …``; empty without an
+    estimate."""
     estimated = last_before(record.estimates, end)
     if estimated is None:
         return ""
@@ -72,7 +73,7 @@ def votes_text(votes: Counter[str]) -> str:
 
 
 def evidence_facts(record: ObjectHistory, votes: Counter[str], end: Offset) -> dict[str, Any]:
-    """Its estimate, votes of classes, and presence as JSON."""
+    """The object's estimate, votes of classes and presence as JSON."""
     estimated = last_before(record.estimates, end)
     if estimated is None:
         return {}
@@ -97,7 +98,8 @@ def _ordered(votes: Counter[str]) -> list[tuple[str, int]]:
 def evidence_entries(
     record: ObjectHistory,
 ) -> Iterator[tuple[Offset, str, str, dict[str, Any]]]:
-    """Offset, kind, text and facts of each event that only fusion by evidence has."""
+    """Offset, kind, text and facts of each of the object's events that only fusion by evidence
+    has."""
     spots = 0
     for estimated in record.estimates:
         if _is_milestone(spots, estimated.spots):
@@ -139,14 +141,14 @@ def evidence_entries(
 
 
 def _presence(record: ObjectHistory) -> list[tuple[Offset, ObjectMissing | None]]:
-    """When it was looked for, and (None) when it turned out to stand elsewhere, in order."""
+    """The object's missed sightings by offset, with None for each relocation, in order."""
     moved = [(each.offset, None) for each in record.relocations]
     looked = [(each.offset, each) for each in record.misses]
     return sorted([*moved, *looked], key=lambda event: event[0])
 
 
 def _missing_since(record: ObjectHistory, end: Offset) -> Offset | None:
-    """The event since which it is missing, of those below ``end``; None if it is not."""
+    """The event below ``end`` since which the object is missing; None if it is not."""
     since = None
     for offset, looked in _presence(record):
         if offset >= end:

@@ -71,8 +71,8 @@ class _Move:
     before: PlaceOrdinal | None
 
 
-class SeenFrom:
-    """The sightings of a history so far, each with its keyframe, in order of offset."""
+class SightingIndex:
+    """The sightings of a history, each with its keyframe, in order of offset."""
 
     def __init__(self, history: "History") -> None:
         self._history = history
@@ -84,9 +84,9 @@ class SeenFrom:
         self._placed_at = np.array(history.placed_offsets)
         self._placed_in = np.array(history.placed_in)
 
-    def from_all(self, places: Iterable[PlaceOrdinal], end: Offset) -> Sequence[ObjectOrdinal]:
-        """The objects that keyframes of each of these places saw by the events below ``end``, by
-        their ordinals."""
+    def seen_from_all(self, places: Iterable[PlaceOrdinal], end: Offset) -> Sequence[ObjectOrdinal]:
+        """The objects seen from every one of these places by the events below ``end``, as ascending
+        ordinals."""
         count, history = bisect_left(self._offsets, end), self._history
         survivors: list[int] = [NO_PLACE] * len(history.places)
         for place, record in enumerate(history.places):
@@ -133,7 +133,7 @@ class History:
         self.place_ordinals: dict[str, PlaceOrdinal] = {}
         self.object_ordinals: dict[str, ObjectOrdinal] = {}
         self._neighbours: tuple[int, Neighbours] | None = None
-        self._seen_from: tuple[Offset, SeenFrom] | None = None
+        self._sighting_index: tuple[Offset, SightingIndex] | None = None
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
@@ -158,18 +158,18 @@ class History:
 
     @property
     def neighbours(self) -> Neighbours:
-        """Neighbourhoods of the keyframes so far; made again when there are more."""
+        """The index of keyframes within ε of each other; rebuilt after new events."""
         count = len(self.keyframes)
         if self._neighbours is None or self._neighbours[0] != count:
             self._neighbours = count, Neighbours(Posed.of(self.keyframes), self.settings)
         return self._neighbours[1]
 
     @property
-    def seen_from(self) -> SeenFrom:
-        """What was seen from where so far; made again when there is more."""
-        if self._seen_from is None or self._seen_from[0] != self.next_offset:
-            self._seen_from = self.next_offset, SeenFrom(self)
-        return self._seen_from[1]
+    def sighting_index(self) -> SightingIndex:
+        """The index of sightings; rebuilt after new events."""
+        if self._sighting_index is None or self._sighting_index[0] != self.next_offset:
+            self._sighting_index = self.next_offset, SightingIndex(self)
+        return self._sighting_index[1]
 
     def place_at(self, keyframe: KeyframeOrdinal, end: Offset | None = None) -> PlaceOrdinal | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""
@@ -207,7 +207,7 @@ class History:
         return found
 
     def cause_at(self, offset: Offset) -> Cause:
-        """The cause of what the event at ``offset`` did."""
+        """The event at ``offset`` as a cause."""
         number = bisect_left(self.keyframe_offsets, offset)
         added = self.keyframes[number : number + 1]
         return cause_of(offset, [k for k in added if k.offset == offset])

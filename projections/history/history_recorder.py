@@ -1,7 +1,6 @@
-"""Folds a log into the tables of a history, from where a kept one ends.
+"""Folds a log into the tables of a history, from the end of the cached history on.
 
-What was folded is kept beside the log when that is worth it, so that the next process folds only
-what was recorded since.
+Long folds are cached beside the log, so that the next process folds only later events.
 """
 
 from collections.abc import Callable
@@ -110,7 +109,8 @@ class HistoryRecorder:
             self._kept = tables.end
 
     def _folded_again(self, end: Offset, damage: DamagedPart) -> list[Stripe]:
-        """The stripes of ``end`` events from the log, after the kept ones turned out damaged."""
+        """The stripes of ``end`` events folded from the log again, after a cached part was
+        damaged."""
         if self._cache is not None:
             self._cache.forget(damage)
         # With a reader of its own: a map may be looked at after its timeline was closed.
@@ -125,7 +125,7 @@ class HistoryRecorder:
 
 
 def _builder(tables: Tables) -> StripeBuilder:
-    """A builder of the rows after those of ``tables``."""
+    """A builder for the rows that follow those of ``tables``."""
     moved = tables.column("moved", "object")
     last = last_rows(moved, tables.count("found"))
     places = tables.rows_at("moved", last[last >= 0])
@@ -135,7 +135,7 @@ def _builder(tables: Tables) -> StripeBuilder:
 
 
 def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:
-    """The occupancy map that the event at ``offset`` is."""
+    """The occupancy map in the event at ``offset``."""
     (event,) = parse_events(list(reader.read(offset, Offset(offset + 1))))
     if not isinstance(event.parsed, OccupancyMap):
         raise FoldError(offset, "its history says that it is an occupancy map")

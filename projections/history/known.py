@@ -1,9 +1,9 @@
 """The history of one log under given settings and the commands recorded before a point.
 
-It folds the log once, at the first question that needs the history, and keeps what happened, in
-memory and beside the log (`projections.history.timeline_cache`); after that every question is a
-look-up. An event at offset o, and a merge it causes, shows in ``at(o + 1)``. A command shows in
-every map of a history that knows it.
+The first question that needs the history folds the log once. The history is kept in memory and
+beside the log (`projections.history.timeline_cache`); later questions are look-ups. An event at
+offset o, and a merge it causes, shows in ``at(o + 1)``. A command shows in every map of a history
+that knows it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +23,7 @@ from projections.settings import Settings
 
 from .bisect import CountIndex, HistoryFacts, Search, Searcher
 from .command_entries import (
-    CommandTeller,
+    EntryMaker,
     object_commands,
     place_commands,
     same_place_commands,
@@ -55,7 +55,8 @@ def checked_end(reader: LogReader, end: Offset | None) -> Offset:
 
 
 class KnownHistory:
-    """What happened to the map, under ``corrections``; an ``end`` is a number of events.
+    """The history of a log under ``settings`` and ``corrections``; an ``end`` is a number of
+    events.
 
     ``progress`` is called while events are folded, ``note`` with a line about each snapshot or kept
     history that could not be used. Without ``cache`` no history is read or kept beside the log.
@@ -81,7 +82,7 @@ class KnownHistory:
         self._history: StoredHistory | None = None
         self._latest: StoredView | None = None
         self._index: CountIndex | None = None
-        self._teller = CommandTeller(reader)
+        self._entries = EntryMaker(reader)
 
     @property
     def end(self) -> Offset:
@@ -95,7 +96,7 @@ class KnownHistory:
 
     @property
     def latest(self) -> MapView:
-        """The map up to `end`, not to be changed; its observations carry no embeddings."""
+        """The map up to `end`, read-only; its observations carry no embeddings."""
         history = self.history
         if self._latest is None or self._latest.next_offset != history.next_offset:
             self._latest = StoredView(history, history.next_offset, self._cache)
@@ -178,12 +179,12 @@ class KnownHistory:
         if thing in history.object_ordinals:
             seen = self.latest.observations.__getitem__
             explained = explain_object(history, seen, find_object(history, thing), last)
-            told = object_commands(self._teller, history, explained.facts["det_ids"])
+            told = object_commands(self._entries, history, explained.facts["det_ids"])
             return with_entries(explained, told)
         if thing not in history.place_ordinals and thing.startswith("obj-"):
             raise NoSuchThing("object", thing, history.object_ordinals)
         place = find_place(history, thing, last)
-        told = place_commands(self._teller, history, place, last)
+        told = place_commands(self._entries, history, place, last)
         return with_entries(explain_place(history, place, last), told)
 
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
@@ -191,7 +192,7 @@ class KnownHistory:
         commands join them or keep them apart."""
         history, last = self.history, self._checked(end)
         a, b = (find_keyframe(history, text) for text in (first, second))
-        told = same_place_commands(self._teller, history, (a, b), last)
+        told = same_place_commands(self._entries, history, (a, b), last)
         return with_entries(explain_same_place(history, a, b, last), told)
 
     def facts(self, end: Offset | None = None) -> HistoryFacts:
@@ -256,7 +257,7 @@ def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:
 
 
 def _check_names(expression: Expression, facts: HistoryFacts) -> None:
-    """Raises ExpressionError for a name that is not in the log: a condition on it would never
+    """Raise ExpressionError for a name that is not in the log: a condition on it would never
     hold."""
     for mention in expression.mentions():
         if not facts.has(mention.kind, mention.text):

@@ -1,4 +1,4 @@
-"""Sequences whose items are made from rows of tables when they are asked for."""
+"""Sequences and mappings whose items are made from rows of tables on access."""
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,10 +14,10 @@ _MOST_CHUNKS: Final = 256
 
 
 class Chunks(Sequence[_T]):
-    """``count`` items; ``make`` makes those from an index to before another.
+    """A sequence of ``count`` items; ``make(first, last)`` returns those from ``first`` to before
+    ``last``.
 
-    Items that are asked for one by one are kept with their neighbours, those made last; a walk over
-    all keeps none.
+    Indexing keeps the chunks made last; iterating keeps none.
     """
 
     __slots__ = ("_count", "_kept", "_make")
@@ -56,8 +56,8 @@ class Chunks(Sequence[_T]):
 
 
 class Items(Chunks[_T]):
-    """The items of some rows, in order of offset. ``make`` makes those of given rows, ``offsets``
-    says of which events they are."""
+    """A sequence of items made from ``rows``, in order of offset. ``make`` returns the items of
+    given rows, ``offsets`` the offsets of their events."""
 
     __slots__ = ("_made_offsets", "_offsets", "_rows")
 
@@ -72,15 +72,16 @@ class Items(Chunks[_T]):
         self._made_offsets: memoryview | None = None
 
     def before(self, end: int) -> int:
-        """How many items are of events below ``end``."""
+        """The number of items of events below ``end``."""
         if self._made_offsets is None:
             found: Any = self._offsets(self._rows)
             self._made_offsets = memoryview(found)
         return bisect_left(self._made_offsets, end)
 
 
-class Found(Mapping[Any, Any]):
-    """The ordinals of ``count`` things by name; ``find`` is given a name, ``names`` gives all."""
+class OrdinalsByName(Mapping[Any, Any]):
+    """A mapping from ``count`` names to ordinals: ``find`` returns a name's ordinal or None,
+    ``names`` iterates over all names."""
 
     def __init__(
         self, count: int, find: Callable[[Any], int | None], names: Callable[[], Iterator[Any]]

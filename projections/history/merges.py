@@ -32,7 +32,7 @@ from .names import keyframe_name, log_name, place_name
 from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
 MOST_SEEN = 4
-"""Objects named in a text; of more, all but three are only counted."""
+"""The most objects that a text names; of more, the first are named and the others counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Chain:
 def chains_of(history: History, merge: Merge) -> list[Chain]:
     """A chain for each absorbed place, in the order of joining, shortest first.
 
-    None for a place that a command joined, and none at all for places by rooms.
+    A place that a command joined has no chain, nor has any place by rooms.
     """
     if history.settings.places == "rooms":
         return []
@@ -183,7 +183,7 @@ def _drive_text(history: History, merge: Merge, most_seen: int | None) -> str:
 
 def seen_from_both(history: History, merge: Merge) -> Sequence[ObjectOrdinal]:
     """The objects that keyframes of all the places had seen when these merged."""
-    return history.seen_from.from_all(merge.places, merge.cause.offset)
+    return history.sighting_index.seen_from_all(merge.places, merge.cause.offset)
 
 
 def join_links(merge: Merge) -> list[PlaceLink]:

@@ -1,4 +1,4 @@
-"""The columns of a history as of an offset: what a map there is made from."""
+"""The rows of a history's tables below an offset, from which the map at that offset is made."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -38,13 +38,13 @@ class Moment:
         return self.tables.rows(table, 0, self.count(table))
 
     def last(self, table: str, column: str, size: int) -> Rows:
-        """By value of a column the last row that has it, -1 for none."""
+        """For each value 0 … ``size`` − 1 of a column, the last row that has it; -1 for none."""
         if not self.count(table):
             return np.full(size, NONE, np.int64)
         return last_rows(self.column(table, column), size)
 
     def last_values(self, table: str, column: str, size: int) -> list[tuple[Any, ...] | None]:
-        """The same with all columns, None for none."""
+        """As `last`, with the values of all columns of the row; None for none."""
         last = self.last(table, column, size)
         rows = iter(self.tables.rows_at(table, last[last >= 0]))
         return [next(rows) if row >= 0 else None for row in last.tolist()]
@@ -109,7 +109,7 @@ class Moment:
 
 
 def _survivors(count: int, pairs: Sequence[tuple[int, int]]) -> Array:
-    """What each of ``count`` things is part of after these merges (survivor, absorbed)."""
+    """The survivor of each of ``count`` things after the merges ``pairs`` (survivor, absorbed)."""
     found = np.arange(count, dtype=np.int32)
     for survivor, absorbed in reversed(pairs):  # what a survivor is part of is known by then
         found[absorbed] = found[survivor]

@@ -1,4 +1,4 @@
-"""Names of keyframes, places and objects in a history, and what a name stands for.
+"""Names of keyframes, places and objects in a history, and look-up by name.
 
 Names are looked up in the whole history, so an absorbed place is found too. A name that is not in
 it raises `NoSuchThing`, which lists the nearest names.
@@ -21,7 +21,7 @@ MOST_NAMES = 5
 
 
 class NoSuchThing(MisuseError):
-    """Nothing of this name is in the history; the message lists the nearest names.
+    """No thing of this name is in the history; the message lists the nearest names.
 
     Places and objects depend on the settings, keyframes, runs and classes on the log alone.
     """
@@ -38,7 +38,7 @@ def keyframe_name(history: History, keyframe: KeyframeOrdinal) -> str:
 
 
 def log_name(history: History, keyframe: KeyframeOrdinal) -> Keyframe:
-    """Run and keyframe id, by which commands name it."""
+    """Run and keyframe id: the form in which commands name a keyframe."""
     added = history.keyframes[keyframe]
     return Keyframe(added.run_id, added.keyframe_id)
 

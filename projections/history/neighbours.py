@@ -29,7 +29,7 @@ class Posed(NamedTuple):
 
     @classmethod
     def of(cls, keyframes: Sequence[KeyframeAdded]) -> "Posed":
-        """Of keyframes as records."""
+        """The posed keyframes among these records."""
         posed = [(k, k.pose) for k in keyframes if k.pose is not None]
         names: dict[str | None, int] = {}
         return cls(

@@ -1,12 +1,12 @@
 """Fold one log under several rules in parallel processes.
 
 Rules are settings and corrections. Each process reads and validates the log once for all of its
-rules. Few events are folded in this process, since starting one takes longer.
+rules. A short log is folded in this process: starting another takes longer.
 
-A `FoldResult` is small enough to send between processes, and comparable: a keyframe is known by its
-event, an observation by its event and det_id; which of them are in the map depends on the
-corrections. Places are numbered here by the event that founded them and then by their first member,
-and two folds have the same numbers until they differ.
+A `FoldResult` is small enough to send between processes. Two can be compared: a keyframe is
+identified by its event, an observation by its event and det_id; which of them are in the map
+depends on the corrections. Places are numbered here by the event that founded them and then by
+their first member, and two folds have the same numbers until they differ.
 """
 
 import multiprocessing
@@ -58,7 +58,7 @@ _POLL_S = 0.2
 _PLACE_DELTAS = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
 _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
-"""Needed too where two objects may become one."""
+"""Also needed where objects may merge."""
 
 _done: "Synchronized[int] | None" = None
 """In a worker process: the number of events that all workers have folded, or `_STOP`."""
@@ -69,7 +69,7 @@ NO_NUMBER: Final = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rules:
-    """What a log is folded under."""
+    """Settings and corrections that a log is folded under."""
 
     settings: Settings
     corrections: Corrections = NO_CORRECTIONS
@@ -82,7 +82,7 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class FoldResult:
-    """The map of a log under some rules, and how it was built.
+    """The map of a log under some rules, and when its places and objects came to be.
 
     ``places`` are place ids by keyframe, ``objects`` object ids by observation, None for none;
     ``posed`` are the ordinals of keyframes with a pose. By keyframe, ``keyframe_offsets`` is its
@@ -168,7 +168,7 @@ def _scores(view: MapView, truth: "Truth") -> dict[str, dict[str, Any]]:
 
 
 def _object_number(object_id: str) -> int:
-    """The same in every fold for Objects that the same detection founded."""
+    """An object's number: equal in all folds for Objects that the same detection founded."""
     return int(object_id[-15:], 16)
 
 
@@ -231,7 +231,7 @@ def fold_in_this_process(
 
 
 class _Fold:
-    """The fold under some rules, and the time it took."""
+    """A fold under some rules, and the seconds that it took."""
 
     def __init__(self, reader: LogReader, rules: Rules) -> None:
         settings, corrections = rules.settings, rules.corrections

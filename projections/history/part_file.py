@@ -1,10 +1,11 @@
 """Stripes as a file: an ``.npz`` as `numpy.savez` writes it, whose arrays are mapped and checked.
 
 A ``.npz`` is a ZIP archive of ``.npy`` files, here without compression, named ``NUMBER/ARRAY.npy``
-by the number of the stripe. The last member, ``manifest.json``, says what the file is of, and for
-each array where its bytes are and their CRC-32; the archive's comment says where the manifest is,
-and its CRC-32. So opening a file reads its end only; an array is checked when it is first used, and
-nothing else of the archive is relied on. `numpy.load` reads the file, too.
+by the number of the stripe. The last member, ``manifest.json``, states which log, events and
+settings the file is of, and for each array the position and CRC-32 of its bytes; the archive's
+comment has the position and CRC-32 of the manifest. So opening a file reads only its end; an array
+is checked when it is first used, and nothing else of the archive is relied on. `numpy.load` reads
+the file, too.
 
 docs/decisions/history-cache.md says why it is not SQLite, Arrow or a folder of arrays.
 """
@@ -39,12 +40,12 @@ _PLAIN_DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
 class Unwritable(Exception):
-    """A history that no file holds; the message says why."""
+    """A history that cannot be written to a file; the message says why."""
 
 
 def write_part(file: BinaryIO, about: Mapping[str, Any], stripes: Sequence[Stripe]) -> None:
-    """Write stripes, and what they are of, to a new file. Raises OSError, and Unwritable for a
-    number of more than 64 bits."""
+    """Write stripes and ``about``, which states what they are of, to a new file. Raises OSError,
+    and Unwritable for a number of more than 64 bits."""
     documents = []
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for number, stripe in enumerate(stripes):
@@ -60,8 +61,8 @@ def write_part(file: BinaryIO, about: Mapping[str, Any], stripes: Sequence[Strip
         archive.comment = comment.encode()
 
 
-def _write_array(archive: zipfile.ZipFile, name: str, array: Array) -> "_Place":
-    """Write an array; where it is then."""
+def _write_array(archive: zipfile.ZipFile, name: str, array: Array) -> "_ArrayLocation":
+    """Write an array and return its location."""
     little = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
     if little.dtype.str not in _TYPES:
         raise Unwritable(f"{name} has numbers of more than 64 bits")
@@ -69,11 +70,11 @@ def _write_array(archive: zipfile.ZipFile, name: str, array: Array) -> "_Place":
     np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(little))
     member = head.getvalue() + little.tobytes()
     at = _write_member(archive, name, member)
-    return _Place(little.dtype.str, len(little), at, len(head.getvalue()), crc32(member))
+    return _ArrayLocation(little.dtype.str, len(little), at, len(head.getvalue()), crc32(member))
 
 
 def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> int:
-    """Where the content begins in the file."""
+    """Write a member of the archive and return the byte at which its content begins."""
     info = zipfile.ZipInfo(name, _PLAIN_DATE)
     archive.writestr(info, content)
     return info.header_offset + _LOCAL_HEADER + len(name.encode()) + len(info.extra)
@@ -99,11 +100,11 @@ class Part:
 
     @property
     def span(self) -> tuple[Offset, Offset]:
-        """The first offset, and that after the last."""
+        """The first offset, and the one after the last."""
         return self.stripes[0].start, self.stripes[-1].end
 
     def release(self) -> None:
-        """Take what was read out of this process's memory; it is read again where it is used."""
+        """Drop the pages that were read from this process's memory; access reads them again."""
         _release(self._map, 0, len(self._map))
 
     def _manifest(self) -> dict[str, Any]:
@@ -121,22 +122,26 @@ class Part:
         return manifest
 
     def _stripe(self, document: dict[str, Any]) -> Stripe:
-        places = {name: _Place(*place) for name, place in document["arrays"].items()}
+        locations = {
+            name: _ArrayLocation(*location) for name, location in document["arrays"].items()
+        }
         for table, count in document["rows"].items():
             for column, kind in TABLES[table].items():
                 name = f"{table}.{column}"
-                if places[ends_of(name) if kind == "text" else name].length != count:
+                if locations[ends_of(name) if kind == "text" else name].length != count:
                     raise DamagedPart(f"{self.path}: {name} is not as long as its table")
-        if any(place.dtype not in _TYPES or min(place[1:]) < 0 for place in places.values()):
+        if any(
+            location.dtype not in _TYPES or min(location[1:]) < 0 for location in locations.values()
+        ):
             raise DamagedPart(f"{self.path} has arrays of another kind")
-        arrays = _MappedArrays(self.path, self._map, places)
+        arrays = _MappedArrays(self.path, self._map, locations)
         start, end = Offset(document["start"]), Offset(document["end"])
         return Stripe(start, end, document["rows"], arrays, self.release)
 
 
-class _Place(NamedTuple):
-    """Where an array is: its dtype and length, where the member begins, the length of the member's
-    header, and the CRC-32 of both."""
+class _ArrayLocation(NamedTuple):
+    """The location of an array: its dtype and length, the byte at which its member begins, the
+    length of the member's header, and the CRC-32 of header and array."""
 
     dtype: str
     length: int
@@ -146,38 +151,42 @@ class _Place(NamedTuple):
 
 
 class _MappedArrays(Mapping[str, Array]):
-    """Arrays in a mapped file by name; each is checked when it is first asked for."""
+    """Arrays in a mapped file by name; the checksum of each is checked on first access."""
 
-    def __init__(self, path: Path, data: mmap.mmap, places: Mapping[str, _Place]) -> None:
-        self._path, self._data, self._places = path, data, places
+    def __init__(
+        self, path: Path, data: mmap.mmap, locations: Mapping[str, _ArrayLocation]
+    ) -> None:
+        self._path, self._data, self._locations = path, data, locations
         self._checked: dict[str, Array] = {}
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._locations)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
+        return iter(self._locations)
 
     def __getitem__(self, name: str) -> Array:
         if name not in self._checked:
-            self._checked[name] = self._check(self._places[name])
+            self._checked[name] = self._check(self._locations[name])
         return self._checked[name]
 
-    def _check(self, place: _Place) -> Array:
-        start = place.at + place.head
-        end = start + place.length * np.dtype(place.dtype).itemsize
+    def _check(self, location: _ArrayLocation) -> Array:
+        start = location.at + location.head
+        end = start + location.length * np.dtype(location.dtype).itemsize
         if end > len(self._data):
             raise DamagedPart(f"{self._path} is cut off")
-        with memoryview(self._data)[place.at : end] as member:
-            if crc32(member) != place.crc:
-                raise DamagedPart(f"{self._path}: a checksum does not match at byte {place.at:,}")
-        _release(self._data, place.at, end)
-        return np.frombuffer(self._data, place.dtype, place.length, start)
+        with memoryview(self._data)[location.at : end] as member:
+            if crc32(member) != location.crc:
+                raise DamagedPart(
+                    f"{self._path}: a checksum does not match at byte {location.at:,}"
+                )
+        _release(self._data, location.at, end)
+        return np.frombuffer(self._data, location.dtype, location.length, start)
 
 
 def _release(data: mmap.mmap, start: int, end: int) -> None:
-    """Let go of the whole pages in a range, until something in them is used again: mostly a few
-    rows are, of what a checksum had to read."""
+    """Drop the whole pages of a range from memory: a checksum reads all of them, and mostly few
+    rows are used afterwards."""
     first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
     length = end // mmap.PAGESIZE * mmap.PAGESIZE - first
     if length > 0 and hasattr(mmap, "MADV_DONTNEED"):

@@ -25,9 +25,9 @@ from .records import ObjectHistory, count_before, last_before
 def view_at(history: History, latest: MapView, end: Offset) -> MapView:
     """The `MapView` that applying every delta below ``end`` makes, without folding.
 
-    ``latest`` is a view of at least as many events. What never changes after its event
-    (observations, poses) is shared with it; places, objects and the place of a keyframe are made
-    again, so that changing one view does not change another.
+    ``latest`` is a view of at least as many events. Values that never change after their event
+    (observations, poses) are shared with it; places, objects and the place of a keyframe are
+    copied, so that changing one view does not change another.
     """
     view = MapView(
         history.settings,

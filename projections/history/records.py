@@ -261,8 +261,8 @@ class ObjectHistory:
         return self.found.class_name if classified is None else classified.class_name
 
     def looked_for(self, end: Offset) -> ObjectMissing | None:
-        """In how many keyframes it was looked for and not seen, after the events below ``end``;
-        None if it has stood elsewhere since."""
+        """Its count of keyframes that should show it and do not, after the events below ``end``;
+        None if it was relocated since."""
         looked, moved = last_before(self.misses, end), last_before(self.relocations, end)
         if looked is None or (moved is not None and moved.offset > looked.offset):
             return None
@@ -279,7 +279,7 @@ _offset = attrgetter("offset")
 
 
 def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
-    """How many of the items, sorted by offset, are of events below ``end``."""
+    """The number of items, sorted by offset, that are of events below ``end``."""
     if isinstance(items, Items):
         return items.before(end)
     return bisect_left(items, end, key=_offset)

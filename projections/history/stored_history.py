@@ -1,4 +1,5 @@
-"""A history read from tables: what `History` keeps as records in memory, made when asked for."""
+"""A history read from tables. The records that `History` keeps in memory are made on first
+access."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -38,7 +39,7 @@ from projections.settings import Settings
 
 from .columns import NONE, Array
 from .history import NEVER, NO_PLACE, History
-from .lazy_rows import Chunks, Found, Items
+from .lazy_rows import Chunks, Items, OrdinalsByName
 from .neighbours import Neighbours, Posed
 from .records import Cause, Merge, ObjectHistory, ObjectMerge, PlaceHistory, Refusal
 from .tables import Groups, Tables
@@ -49,7 +50,7 @@ MapAt = Callable[[Offset], OccupancyMap]
 
 
 class StoredHistory(History):
-    """The history of the events that ``tables`` have. Nothing can be applied to it.
+    """The history of the events in ``tables``; read-only.
 
     Each attribute is made from the tables when it is first read; `_PARTS` says how.
     """
@@ -64,7 +65,7 @@ class StoredHistory(History):
         self.tables = tables
         self.map_at = map_at
         self._neighbours = None
-        self._seen_from = None
+        self._sighting_index = None
 
     def __getattr__(self, name: str) -> Any:
         if name not in _PARTS:
@@ -74,8 +75,8 @@ class StoredHistory(History):
         return found
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
-        """Raises TypeError: the tables have all."""
-        raise TypeError(f"{len(deltas)} deltas of the event at {offset} for tables, which have it")
+        """Raise TypeError: the history is read-only."""
+        raise TypeError(f"a stored history is read-only; {len(deltas)} deltas of event {offset}")
 
     @property
     def neighbours(self) -> Neighbours:
@@ -107,7 +108,7 @@ class StoredHistory(History):
         return cause
 
     def causes_at(self, offsets: Sequence[Offset]) -> list[Cause]:
-        """`cause_at` of many."""
+        """`cause_at` for many offsets."""
         tables, keyframes = self.tables, np.asarray(self.keyframe_offsets)
         asked = np.array(offsets, np.int64)
         rows = np.searchsorted(keyframes, asked)
@@ -188,8 +189,7 @@ def _placed_in(history: StoredHistory) -> memoryview:
 
 
 def placed_columns(tables: Tables, end: Offset | None = None) -> tuple[Array, Array]:
-    """By keyframe the event that placed it, and the place that it joined, by the events below
-    ``end``."""
+    """For each keyframe the event below ``end`` that placed it, and the place that it joined."""
     keyframes = tables.count("keyframe") if end is None else tables.before("keyframe", end)
     count = None if end is None else tables.before("placed", end)
     offsets = np.full(keyframes, NEVER, np.int64)
@@ -247,7 +247,7 @@ def _objects(history: StoredHistory) -> list[ObjectHistory]:
 def _items(
     tables: Tables, table: str, column: str, delta: Callable[..., _T], value: int
 ) -> list[_T]:
-    """The rows of a table with this value as deltas, in order."""
+    """The rows of a table whose ``column`` has this value, as deltas in order."""
     if not tables.count(table):
         return []
     rows = tables.group(table, column)[value]
@@ -263,7 +263,7 @@ def _items(
 
 
 def documents(tables: Tables, table: str, type_: type[_T], count: int | None = None) -> list[_T]:
-    """The records that a table has as JSON."""
+    """The records of a table that stores them as JSON."""
     texts = tables.texts(table, "document", 0, tables.count(table) if count is None else count)
     decode = msgspec.json.Decoder(type_).decode
     return [decode(text or "") for text in texts]
@@ -300,7 +300,7 @@ def _edges(history: StoredHistory) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], li
     return edges
 
 
-def _keyframe_ordinals(history: StoredHistory) -> Found:
+def _keyframe_ordinals(history: StoredHistory) -> OrdinalsByName:
     tables = history.tables
     runs = {seen[0].run_id: number for number, seen in enumerate(history.runs)}
 
@@ -315,7 +315,7 @@ def _keyframe_ordinals(history: StoredHistory) -> Found:
     def names() -> Iterator[tuple[RunId, KeyframeId]]:
         return ((k.run_id, k.keyframe_id) for k in history.keyframes)
 
-    return Found(tables.count("keyframe"), find, names)
+    return OrdinalsByName(tables.count("keyframe"), find, names)
 
 
 def _ordinals(table: str, column: str, history: StoredHistory) -> dict[str | None, int]:

@@ -1,7 +1,7 @@
 """Records of a map as of an offset, made from the columns of a history.
 
-The members of a place and the observations of an Object are most of them: they are made on
-first access.
+The members of a place and the observations of an Object, most of the data, are made on first
+access.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from .records import ObjectMerge
 
 
 class StoredPlace(PlaceRecord):
-    """A place whose members are made when they are asked for."""
+    """A place whose members are made on first access."""
 
     __slots__ = ("_made", "_moment")
 
@@ -70,7 +70,7 @@ def places_of(moment: Moment) -> list[PlaceRecord]:
 
 
 class StoredObject(ObjectRecord):
-    """An Object whose observations are made when they are asked for."""
+    """An Object whose observations are made on first access."""
 
     __slots__ = ("_made", "_moment")
 
@@ -127,7 +127,7 @@ def objects_of(moment: Moment) -> list[ObjectRecord]:
 
 
 def _merge(survivor: ObjectRecord, absorbed: ObjectRecord, merge: ObjectMerge) -> None:
-    """What a merge leaves of two Objects; later merges of the survivor come later."""
+    """Apply a merge to the records of two Objects; merges are applied in order."""
     values = merge.values
     relocations = survivor.relocations + absorbed.relocations
     survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
@@ -166,7 +166,7 @@ def adjacency_of(moment: Moment) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]
 
 
 def floors_of(moment: Moment) -> list[str]:
-    """The floors that have a name, by their first keyframe."""
+    """The named floors in the order of their first keyframes."""
     codes, strings = moment.tables.codes("keyframe", "floor", moment.count("keyframe"))
     named = codes[codes >= 0]
     _, first = np.unique(named, return_index=True)

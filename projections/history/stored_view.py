@@ -95,13 +95,13 @@ class StoredView(MapView):
         super().apply_event(offset, deltas)
 
     def known_digest(self) -> str | None:
-        """The digest of this map, if it was computed before."""
+        """The digest of this map from the cache; None if it was not computed before."""
         if self._cache is None or self._is_changed:
             return None
         return self._cache.digest_at(self.next_offset)
 
     def keep_digest(self, digest: str) -> None:
-        """Keep the digest for the next who asks for it."""
+        """Store the digest in the cache."""
         if self._cache is not None and not self._is_changed:
             self._cache.keep_digest(self.next_offset, digest)
 

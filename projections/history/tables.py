@@ -3,7 +3,7 @@
 Numbers are read as whole columns, which are put together from the stripes when first used, texts by
 the span of rows. A stripe may lie in a file (`projections.history.part_file`), whose arrays raise
 `DamagedPart` when their checksum does not match; then the stripes are made again from the log and
-the look-up goes on. The same log gives the same rows, so what was read before still holds.
+the look-up is repeated. The same log gives the same rows, so what was read before still holds.
 """
 
 from bisect import bisect_left
@@ -31,7 +31,7 @@ class DamagedPart(Exception):
 class Tables:
     """Stripes in order, the first from the first event on.
 
-    ``again`` makes the stripes up to an offset from the log, where one turns out to be damaged.
+    ``again`` makes the stripes up to an offset from the log; it is called when one is damaged.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class Tables:
         return sum(stripe.rows.get(table, 0) for stripe in self.stripes)
 
     def before(self, table: str, end: Offset) -> int:
-        """How many rows are of events below ``end``."""
-        return self._safely(lambda: self._before(table, end))
+        """The number of rows of events below ``end``."""
+        return self._with_repair(lambda: self._before(table, end))
 
     def column(self, table: str, column: str, count: int | None = None) -> Array:
         """The first ``count`` values of a column that holds no texts, all for None."""
-        return self._safely(lambda: self._column(table, column, count))
+        return self._with_repair(lambda: self._column(table, column, count))
 
     def integers(self, table: str, column: str, count: int | None = None) -> Rows:
         """`column` as int64, to compute with."""
@@ -84,7 +84,7 @@ class Tables:
 
     def texts(self, table: str, column: str, first: int, last: int) -> list[str | None]:
         """The texts of the rows from ``first`` to before ``last``."""
-        return self._safely(
+        return self._with_repair(
             lambda: [
                 text
                 for stripe, a, b in self._spans(table, first, last)
@@ -99,10 +99,10 @@ class Tables:
 
     def codes(self, table: str, column: str, count: int | None = None) -> tuple[Array, list[str]]:
         """A column of repeated texts as numbers, and the texts that they stand for; -1 is none."""
-        return self._safely(lambda: self._codes(table, column, count))
+        return self._with_repair(lambda: self._codes(table, column, count))
 
     def group(self, table: str, column: str) -> "Groups":
-        """The rows of a table by the value of a column."""
+        """The rows of a table grouped by the value of a column."""
         key = f"{table}.{column}"
         if key not in self._groups:
             self._groups[key] = Groups(self.column(table, column))
@@ -114,15 +114,15 @@ class Tables:
 
     def lists(self, table: str, first: int, last: int) -> list[list[Any]]:
         """The same rows as a list for each column."""
-        found = self._safely(lambda: self._lists(table, first, last))
+        found = self._with_repair(lambda: self._lists(table, first, last))
         self._unreleased += last - first
-        if self._unreleased >= _MANY:  # perhaps on the way through all, which must not fill memory
+        if self._unreleased >= _MANY:  # so that reading all rows does not fill memory
             self._release()
         return found
 
     def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
         """These rows, each with all its columns in order."""
-        return self._safely(lambda: self._rows_at(table, numbers))
+        return self._with_repair(lambda: self._rows_at(table, numbers))
 
     def _before(self, table: str, end: Offset) -> int:
         count = 0
@@ -190,7 +190,7 @@ class Tables:
         return np.concatenate(parts), strings
 
     def _spans(self, table: str, first: int, last: int) -> Iterator[tuple[Stripe, int, int]]:
-        """The stripes that have rows of a span, and which of their own."""
+        """The stripes that have rows of a span, each with the span in its own rows."""
         counts = [stripe.rows.get(table, 0) for stripe in self.stripes]
         for stripe, count, before in zip(
             self.stripes, counts, accumulate(counts, initial=0), strict=False
@@ -199,7 +199,7 @@ class Tables:
             if a < b:
                 yield stripe, a, b
 
-    def _safely(self, look_up: Callable[[], _T]) -> _T:
+    def _with_repair(self, look_up: Callable[[], _T]) -> _T:
         try:
             return look_up()
         except DamagedPart as damage:
@@ -219,7 +219,7 @@ _NOTHING: Final[Array] = np.zeros(0, np.int8)
 
 
 class Groups:
-    """Indices by their value of 0 or more; with ``items`` these instead of the indices."""
+    """Indices grouped by ``values`` of 0 or more; with ``items`` these are grouped instead."""
 
     def __init__(self, values: Array, items: Array | None = None) -> None:
         order = np.argsort(values, kind="stable").astype(np.int32)
@@ -267,7 +267,7 @@ def _values(array: Array, kind: str) -> list[Any]:
 
 
 def last_rows(values: Array, size: int) -> Rows:
-    """For each of 0 … ``size`` - 1 the last index at which ``values`` has it, -1 for none."""
+    """For each value 0 … ``size`` - 1 its last index in ``values``, -1 for none."""
     found = np.full(size, NONE, np.int64)
     for first in range(0, len(values), _AT_ONCE):  # in spans: numpy makes 64-bit copies of both
         some = values[first : first + _AT_ONCE]

@@ -2,8 +2,8 @@
 
 **The map at W is the fold of the events before W under the commands recorded before V**, V being
 ``known_at``: W itself unless asked otherwise, and for a question about a span its end. A timeline
-folds its log once for each knowledge that it is asked under; without commands in the log that is
-once in all.
+folds its log once for each set of commands that it is asked under, so once in all if the log has no
+commands.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,8 @@ from .names import place_name
 from .records import Cause, Merge
 
 SettingsChoice: TypeAlias = Callable[[Corrections], Settings]
-"""The settings to fold with under some corrections, which may hold the log's own."""
+"""A function that returns the settings to fold with under some corrections, which may hold the
+settings recorded in the log."""
 
 _MOST_HISTORIES = 4
 """Histories that are kept; each may take as much memory as the map."""
@@ -37,9 +38,9 @@ _MOST_HISTORIES = 4
 class Timeline:
     """A context manager over a log. An ``end`` means the map after that many events.
 
-    ``settings`` are those of every fold, or a function of what is known; by default those that the
-    log names. ``progress`` is called while events are folded, ``note`` with a line about each
-    snapshot or kept history that could not be used. ``reader`` reads ``log`` instead of a new
+    ``settings`` are those of every fold, or a function of the corrections; by default those
+    recorded in the log. ``progress`` is called while events are folded, ``note`` with a line about
+    each snapshot or kept history that could not be used. ``reader`` reads ``log`` instead of a new
     reader; the timeline closes it. At most ``histories`` are kept in memory. Without ``cache`` none
     is read or kept beside the log.
     """
@@ -93,7 +94,7 @@ class Timeline:
         return [recorded for recorded in self._commands if start <= recorded.offset < last]
 
     def corrections(self, known_at: Offset | None = None) -> Corrections:
-        """What the commands before ``known_at`` compile to; all of them for None."""
+        """The corrections compiled from the commands before ``known_at``, from all for None."""
         commands = self.commands(end=checked_end(self.reader, known_at))
         if len(commands) not in self._compiled:
             self._compiled[len(commands)] = compile_corrections(commands)
@@ -116,19 +117,19 @@ class Timeline:
             note=self._note,
             cache=self._cache,
         )
-        self._histories[key] = found  # the last one asked is the last one to go
+        self._histories[key] = found  # in order of last use
         for old in list(self._histories)[: -self._most]:
             del self._histories[old]
         return found
 
     @property
     def settings(self) -> Settings:
-        """The settings under all that is known."""
+        """The settings under all commands of the log."""
         return self._settings_under(self.corrections())
 
     @property
     def history(self) -> History:
-        """The history up to `end` under all that is known."""
+        """The history up to `end` under all commands of the log."""
         return self.knowing().history
 
     def at(self, end: Offset | None = None, *, known_at: Offset | None = None) -> MapView:
@@ -209,9 +210,9 @@ class Timeline:
     def _absorbed(
         self, before: MapView, end: Offset, known_at: Offset
     ) -> dict[str, tuple[str, Cause]]:
-        """By id of a place of ``before`` the one that it is part of after ``end`` events, and the
-        cause. A command may have made that merge earlier than the map before, so all are looked
-        at; a place is the same in both if its founder is."""
+        """For each place of ``before`` that is absorbed after ``end`` events, by id: its survivor
+        and the cause. A command may put that merge before ``before``, so all merges are searched; a
+        place is the same in both maps if its founder is."""
         history = self.knowing(known_at).history
         founders = {p.place_id: before.keyframes[p.founder].offset for p in before.places.values()}
         return {

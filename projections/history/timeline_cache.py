@@ -3,15 +3,14 @@
 For each choice of settings and commands in force there are parts, ``KEY-START-END.npz``, of which
 each has the history of the events from START to before END, and the fold at the last END,
 ``KEY-END.fold``, from which it is folded on. ``KEY-END.VERSION.digest`` has the digest of the map
-after END events, of the moments asked for last. Files appear whole (written beside,
-then renamed) and are never changed, so any number of processes may read and write: the same log
-gives the same files.
+after END events, for the ENDs used last. Files are written under another name and renamed, and
+never changed, so any number of processes may read and write: the same log gives the same files.
 
 A part is used only if it is of this log, these settings and commands and this version of the fold,
 if the segments that it was made from are as they were, and if the last event that it covers is
-still that event: a log that lost its end and was recorded on has others there. Parts from the first
-that does not fit on are not used and are replaced. A failure of the cache is reported as a note and
-makes the answer slower, never wrong.
+still the same: a log that lost its end and was recorded on has other events there. Parts from the
+first that does not fit on are not used and are replaced. A failure of the cache is reported as a
+note and makes the answer slower, never wrong.
 """
 
 import contextlib
@@ -52,20 +51,20 @@ from .tables import DamagedPart
 MIN_EVENTS: Final = 2_000
 """Events; folding fewer takes about as long as starting Python."""
 MOST_KEPT: Final = 4
-"""Histories of a log that are kept: those used last."""
+"""The most histories of a log that are kept: those used last."""
 MOST_BYTES: Final = 1024 * 1024 * 1024
-"""All but the one used last are deleted, the oldest first, while together they take more."""
+"""While all together take more, those unused for longest are deleted, except the one used last."""
 MOST_DIGESTS: Final = 16
-"""Digests of a history that are kept: those made last."""
+"""The most digests of a history that are kept: those made last."""
 _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
 _DIGEST: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.\d+\.digest")
 _OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|fold|digest)")
 _LEFT_OVER_S: Final = 3_600.0
 _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
-"""Errors of opening what is no regular file."""
+"""Errors of opening something other than a regular file."""
 _TRIES: Final = 3
-"""Readings of a folder in which other processes replace files."""
+"""The most attempts to read a folder in which other processes replace files."""
 
 _T = TypeVar("_T")
 Note = Callable[[str], None]
@@ -94,7 +93,7 @@ class TimelineCache:
         self._kept_at: Offset | None = None  # by this process
 
     def stripes(self, end: Offset) -> list[Stripe]:
-        """The history that is kept, of at most ``end`` events, from the first on."""
+        """The cached stripes of at most the first ``end`` events."""
         for _ in range(_TRIES):
             with contextlib.suppress(FileNotFoundError):  # another process replaced parts
                 return self._chain(end)
@@ -117,7 +116,7 @@ class TimelineCache:
         return found
 
     def fold_at(self, end: Offset) -> SemanticMap | None:
-        """The fold after ``end`` events, if it is kept."""
+        """The fold after ``end`` events; None if it is not cached."""
         semantic_map = SemanticMap(self._settings, self._corrections)
 
         def load(state: State) -> SemanticMap:
@@ -129,13 +128,13 @@ class TimelineCache:
         return None if loaded is None else with_vectors(loaded, self._reader)
 
     def digest_at(self, end: Offset) -> str | None:
-        """The digest of the map after ``end`` events, if it is kept."""
+        """The digest of the map after ``end`` events; None if it is not cached."""
         if end < MIN_EVENTS:
             return None
         return self._loaded(self._digest_path(end), end, lambda state: str(state["digest"]))
 
     def keep_digest(self, end: Offset, digest: str) -> None:
-        """Keep the digest of the map after ``end`` events; of those kept before only the last."""
+        """Store the digest of the map after ``end`` events, and delete all but the latest ones."""
         if end < MIN_EVENTS or not self.folder.is_dir():
             return
         try:
@@ -149,7 +148,8 @@ class TimelineCache:
             self._say(f"{self.folder}: no digest was kept: {error}")
 
     def _loaded(self, path: Path, end: Offset, load: Callable[[State], _T]) -> _T | None:
-        """What ``load`` makes of a file about the first ``end`` events; None without one."""
+        """``load`` applied to a file about the first ``end`` events; None if there is none or it is
+        unusable."""
         try:
             state = unpack(_read(path))
             self._check(part("about", state), FIRST_OFFSET, end)
@@ -163,13 +163,13 @@ class TimelineCache:
         return None
 
     def is_worth(self, folded: int) -> bool:
-        """Whether to keep a history after ``folded`` more events than are kept: the first time if
-        folding them took a moment, then, in a process that goes on, at each tenth more."""
+        """Whether to cache a history with ``folded`` more events than the cache has: first from
+        `MIN_EVENTS` on, later in the same process when it has grown by a tenth."""
         grown = 0 if self._kept_at is None else self._kept_at // 10
         return folded >= max(MIN_EVENTS, grown)
 
     def keep(self, stripes: Sequence[Stripe], semantic_map: SemanticMap) -> None:
-        """Keep the history of all events that ``semantic_map`` has folded."""
+        """Cache the history of all events that ``semantic_map`` has folded."""
         end = semantic_map.next_offset
         try:
             make_cache_folder(self._reader.path, "history")
@@ -189,7 +189,7 @@ class TimelineCache:
         self._say(f"{self.folder}: no history was kept: {why}; --no-cache goes without one")
 
     def forget(self, damage: DamagedPart) -> None:
-        """Delete the parts, of which one is damaged."""
+        """Delete all parts of this history, after one was found damaged."""
         self._say(f"{damage}; the history is folded again")
         for file in self._files():
             with contextlib.suppress(OSError):
@@ -197,7 +197,7 @@ class TimelineCache:
         self._kept_at = None
 
     def _keep_part(self, stripes: Sequence[Stripe], end: Offset) -> None:
-        """Write the stripes that no part has yet, together with parts that are no longer."""
+        """Write the stripes that no part has yet, merged with earlier parts that are not longer."""
         start = FIRST_OFFSET
         while longer := [
             file
@@ -269,7 +269,7 @@ class TimelineCache:
         return None
 
     def _check(self, about: dict[str, Any], start: Offset, end: Offset) -> None:
-        """Raises DamagedPart for what is not of these events of this log."""
+        """Raise DamagedPart unless ``about`` names these events of this log."""
         if (about["key"], about["start"], about["end"]) != (self._key, start, end):
             raise DamagedPart("it is of another log or other events, settings or commands")
         signatures = segment_signatures(self._reader.path, end)
@@ -278,7 +278,7 @@ class TimelineCache:
             raise DamagedPart("the log has lost events since it was made")
 
     def _event_hash(self, end: Offset) -> str:
-        """That of the last event below ``end``."""
+        """The hash of the last event below ``end``."""
         (event,) = self._reader.read(Offset(end - 1), end)
         return event_hash(event)
 
@@ -304,19 +304,19 @@ class TimelineCache:
         return self.folder / f"{self._key}-{end:020d}.{VERSION}.digest"
 
     def _is_own(self, pattern: re.Pattern[str], path: Path) -> bool:
-        """Whether a file is of this history, and is named so."""
+        """Whether the name of a file matches the pattern and is of this history."""
         found = pattern.fullmatch(path.name)
         return found is not None and found[1] == self._key
 
     def _touch(self, files: Sequence[_File]) -> None:
-        """This history was used last."""
+        """Mark this history as the one used last."""
         for file in files:
             with contextlib.suppress(OSError):
                 os.utime(file.path)
 
     def _tidy(self, end: Offset) -> None:
-        """Delete what the history of ``end`` events replaces, histories that were not used for
-        longest, and what killed processes left."""
+        """Delete files that the history of ``end`` events replaces, the histories unused for
+        longest, and temporary files of killed processes."""
         needed, at = set(), end
         files = self._files()
         while at > FIRST_OFFSET and (before := [file for file in files if file.end == at]):
@@ -360,7 +360,7 @@ class TimelineCache:
 
 
 def _key(log_id: str, settings: Settings, corrections: Corrections) -> str:
-    """16 hex digits that are equal for equal histories of equal events."""
+    """16 hex digits that identify log, settings and corrections."""
     made = {
         "format": FORMAT,
         "fold_version": FOLD_VERSION,

@@ -1,4 +1,5 @@
-"""The maps of one log under other settings or without a command, compared with the base's map."""
+"""What-if: maps of one log under other settings or without a command, compared with the base's
+map."""
 
 from array import array
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -31,7 +32,8 @@ _V = TypeVar("_V")
 def alternatives(
     base: Settings, sets: Sequence[str], tries: Sequence[str], grids: Sequence[str]
 ) -> list[Settings]:
-    """The settings of ``--set``, ``--try`` and ``--grid``, each once, in the order given.
+    """The alternative settings of ``--set``, ``--try`` and ``--grid``, each once, in the order
+    given.
 
     ``sets`` together make one alternative (``eps_m=1.0``), and hold for all of the grid; each of
     ``tries`` is one alternative of assignments separated by spaces or commas; ``grids``

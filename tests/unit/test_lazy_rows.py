@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projections.history.lazy_rows import Chunks, Found, Items
+from projections.history.lazy_rows import Chunks, Items, OrdinalsByName
 
 
 class Making:
@@ -56,6 +56,6 @@ def test_a_name_is_looked_for_once() -> None:
         asked.append(name)
         return {"a": 0}.get(name)
 
-    found = Found(1, find, lambda: iter(["a"]))
+    found = OrdinalsByName(1, find, lambda: iter(["a"]))
     assert [found.get("a"), found.get("a"), found.get("b"), found.get("b")] == [0, 0, None, None]
     assert asked == ["a", "b"]
