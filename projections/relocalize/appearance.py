@@ -1,18 +1,20 @@
-"""Appearance: how much the likenesses of a landmark's observations speak for its being the crop.
+"""Appearance: log-likelihood ratios of a landmark being the crop, by the likeness of its
+observations.
 
 Two parts, each a log-likelihood ratio for every direction from which the robot may look.
 
-*Which thing*: a likeness u is normal about μ(Δ) = same_back + same_side · exp(κ (cos Δ − 1)) −
-session_shift if it is the same thing, and flat above; Δ is the change of side. Different things are
-a mixture of look-alikes (a little below μ), other things of the class, and others. Of a landmark's
-observations the four best count, by their mean (`projections.reducers.looks` decides likewise).
+*Which thing*: a likeness u of the same thing is normally distributed about μ(Δ) = same_back +
+same_side · exp(κ (cos Δ − 1)) − session_shift, and flat above; Δ is the change of side. Different
+things are a mixture of look-alikes (a little below μ), other things of the class, and others. Of a
+landmark's observations the four best count, by their mean (`projections.reducers.looks` decides
+likewise).
 
 *Which side*: the likenesses of all observations of a landmark fall together with the change of
-side. What they have in common, a crop of another day or a hidden half, says nothing about the side,
-so the spread about their mean counts more than the mean. This part is a density over directions:
-its mean is 1.
+side. A common offset, as of a crop from another day or with a hidden half, is no evidence of the
+side, so the spread about their mean counts more than the mean. This part is a density over
+directions: its mean is 1.
 
-An observation with a likeness of nearly 1 is the very picture asked with. Then its landmark is the
+An observation with a likeness of nearly 1 is the crop's own picture. Then its landmark is the
 thing, and the robot is on that side of it.
 """
 
@@ -30,7 +32,7 @@ from .constants import MapConstants
 from .model import Model
 
 DIRECTIONS: Final = 36
-"""Directions in a landmark's table, 10° apart."""
+"""The number of directions in a landmark's table, 10° apart."""
 _STEPS: Final = 32
 _LEAST_LIKENESS, _PER_LIKENESS, _LIKENESSES = -1.0, 128.0, 289
 _WORST: Final = 8.0
@@ -41,21 +43,22 @@ Indices = NDArray[np.intp]
 
 
 def relative(cosines: Floats, constants: MapConstants) -> Floats:
-    """Likenesses: 0 for different things of different classes, 1 for the same picture."""
+    """Relative likenesses of cosines: 0 for different things of different classes, 1 for the same
+    picture."""
     return (cosines - constants.different) / (1.0 - constants.different)
 
 
 def usual_likeness(evidence: EvidenceConstants) -> float:
-    """Of one thing in two runs, seen from the same side."""
+    """The usual likeness of one thing in two runs, seen from the same side."""
     return evidence.same_back + evidence.same_side - evidence.session_shift
 
 
 def appearance_tables(
     likeness: Floats, side: Floats, starts: Indices, constants: MapConstants, model: Model
 ) -> Floats:
-    """Logarithms of shape (landmarks, DIRECTIONS). ``likeness`` and ``side``, the angle from which
-    it was seen, are of the landmarks' observations, one landmark after the other from ``starts``
-    on."""
+    """Log-likelihood ratios of shape (landmarks, DIRECTIONS). ``likeness`` and ``side``, the angle
+    from which it was seen in radians, are of the observations, grouped by landmark; ``starts`` has
+    the index of each landmark's first."""
     evidence = constants.evidence
     cosines = np.cos(_ANGLES[:, None] - side[None])
     same = np.minimum(likeness, model.same_picture)
@@ -104,7 +107,7 @@ def _key(evidence: EvidenceConstants) -> _Key:
 
 @lru_cache(maxsize=16)
 def _ratios(key: _Key, different_spread: float, model: Model) -> Floats:
-    """Of single pairs, by change of side and likeness."""
+    """The table of log-likelihood ratios of single pairs, by change of side and by likeness."""
     back, side, kappa, spread, shift, of_class, class_spread = key
     sides = np.exp(kappa * (np.arange(_STEPS + 1) * (2.0 / _STEPS) - 2.0))
     below = np.arange(_LIKENESSES) / _PER_LIKENESS + _LEAST_LIKENESS
@@ -128,7 +131,7 @@ def _bell(z: Floats) -> Floats:
 def _which_side(
     likeness: Floats, cosines: Floats, starts: Indices, evidence: EvidenceConstants, model: Model
 ) -> Floats:
-    """Of shape (landmarks, DIRECTIONS): a log-likelihood whose exponential's mean is 1."""
+    """Log-likelihoods of shape (landmarks, DIRECTIONS), whose exponentials have the mean 1."""
     mean = usual_likeness(evidence) + evidence.same_side * (
         np.exp(evidence.same_kappa * (cosines - 1.0)) - 1.0
     )

@@ -1,10 +1,10 @@
 """Camera model: a level pinhole; bearings, sizes and edges of boxes.
 
 A box's centre gives a bearing, its height a relative depth: the height in pixels times the depth in
-metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). Its upper
-and its lower edge do so each for itself: the rise of the line of sight to an edge times the
-distance is how high above the camera that edge is. A box that touches the picture's border is cut
-off there: such an edge tells nothing, and the bearing counts less.
+metres is the same for one thing from wherever it is seen (its *size*, in pixel metres). So do its
+upper and its lower edge: the rise of the line of sight to an edge times the distance is the height
+of that edge above the camera. A box that touches the picture's border is cut off there: such an
+edge is not used, and the bearing counts less.
 """
 
 import math
@@ -23,7 +23,7 @@ _EDGE_PX = 1.0
 _UNKNOWN_HEIGHT_PX = 100.0
 _STEEPEST = 10.0
 _FARTHEST_PX = 1e6
-"""Coordinates are limited to it, so that the geometry's squares stay finite."""
+"""The limit of coordinates, which keeps squares in the geometry finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +57,9 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Of n boxes the tangent of the bearing (``slope``, left positive) and the height in pixels.
+    """Tangents of the bearings (``slope``, left positive) and heights in pixels of n boxes.
 
-    ``cut_x`` and ``cut_y`` tell which boxes touch the picture's edge at a side, at top or bottom.
+    ``cut_x`` and ``cut_y`` mark boxes that touch the picture's edge at a side, at top or bottom.
     ``known`` is False where there is no box.
     """
 
@@ -75,13 +75,13 @@ _NO_BOX = (0.0, 0.0, 0.0, 0.0)
 
 
 def box_rows(boxes: Sequence[_Box | None]) -> Floats:
-    """Boxes (n, 4): x_min, y_min, x_max, y_max in pixels; None as an empty box, an unknown one."""
+    """Boxes as rows (n, 4): x_min, y_min, x_max, y_max in pixels; None becomes an empty box."""
     rows = [_NO_BOX if box is None else box for box in boxes]
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
 def views(camera: Camera, rows: Floats) -> Views:
-    """Read boxes of `box_rows`."""
+    """The slopes and heights of boxes of `box_rows`."""
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -_FARTHEST_PX), _FARTHEST_PX)
     known = (x1 > x0) & (y1 > y0)
     slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
@@ -99,7 +99,7 @@ UPPER, LOWER = 0, 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """Of n boxes the lines of sight. Distances are along the ground.
+    """Lines of sight to n boxes. Distances are along the ground.
 
     ``bearing`` is radians to the left of the robot's heading, 0 without a box; ``log_height`` the
     logarithm of the box's height at a distance of 1 m; ``rise`` (2, n) how steeply the lines to the
@@ -121,7 +121,7 @@ class Sights:
         return both
 
     def take(self, index: NDArray[np.intp] | slice) -> "Sights":
-        """Those at ``index``."""
+        """The lines of sight at ``index``."""
         return Sights(
             self.bearing[index],
             self.log_height[index],
@@ -133,8 +133,8 @@ class Sights:
 
 
 def sights(camera: Camera, rows: Floats) -> Sights:
-    """Read boxes of `box_rows`; what is farther outside the picture than the picture is large is
-    left out."""
+    """The lines of sight of boxes of `box_rows`; parts farther outside the picture than the picture
+    is large are cut off."""
     most = np.array((camera.width_px, camera.height_px) * 2)[:, None]
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -most), 2.0 * most)
     known = (x1 > x0) & (y1 > y0)

@@ -1,8 +1,8 @@
-"""Candidates: for each crop the map's observations most similar to it, and their Places.
+"""Candidates: the map's observations most similar to each crop, and their Places.
 
 `Candidates` is the whole input of the ranking. The databases make it with one query
-(`projections.queries.relocalize`), a folded map by exact search (`ExactIndex`). Which of the two it
-was makes no difference to the ranking.
+(`projections.queries.relocalize`), a folded map by exact search (`ExactIndex`). The ranking treats
+both alike.
 
 Exact search: unit vectors are multiples of 2⁻²⁰ and multiplied in float64, so every sum is exact
 whatever BLAS does (see `projections.exact`). The same map and crops give the same candidates to the
@@ -40,19 +40,20 @@ NEIGHBOURS = 64
 fewer leave too few directions to triangulate an object from."""
 
 OBJECTS_OF_A_CLASS = 96
-"""For a crop of which only the class is known: so many Objects, those seen most often …"""
+"""The most Objects fetched for a crop of which only the class is known: those seen most often."""
 MOST_OBJECTS = 128
-"""… with several classes at most so many in all, since each takes a third of a millisecond …"""
+"""The most Objects fetched for all classes of such crops, since each takes a third of a
+millisecond."""
 OBSERVATIONS_OF_EACH = 3
-"""… and of each so many observations, spread evenly over all."""
+"""Observations fetched of each such Object, spread evenly over all of its observations."""
 
 Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Stand:
-    """Where an Object of fusion by evidence stands, in metres, with its covariance in m²; seen from
-    ``spots`` places to stand."""
+    """The estimated position of an Object under fusion by evidence, in metres, with its covariance
+    in m²; the Object was seen from ``spots`` positions of robots."""
 
     x: float
     y: float
@@ -68,7 +69,7 @@ class Match(NamedTuple):
     ``pose`` is that of its keyframe in metres and radians, None if the robot had none.
     ``object_place`` is where its Object is located and ``keyframe_place`` where the robot was:
     ordinals of Places, None for noise. ``class_name`` is the Object's if there is one.
-    ``object_stand`` is where the Object stands, None on maps of the page's rule.
+    ``object_stand`` is the estimated position of the Object, None under the default fusion.
 
     A tuple, because a question makes hundreds, each of which would take 4 µs as a frozen dataclass.
     """
@@ -113,7 +114,8 @@ class Candidates:
 
 
 class ExactIndex:
-    """The observations of a view that have an embedding, as one matrix, for many searches."""
+    """An index for exact search: the observations of a view that have an embedding, as one
+    matrix."""
 
     def __init__(self, view: MapView) -> None:
         self._view = view
@@ -148,17 +150,16 @@ class ExactIndex:
         note: Note | None = None,
         corrections: Corrections = NO_CORRECTIONS,
     ) -> Self:
-        """That of the map as of ``point`` of a log: offset, ISO time, run:keyframe or end.
+        """The index of the map at ``point`` of a log: offset, ISO time, run:keyframe or end.
 
-        ``note`` is called with what the user should know about ``point``
-        (`eventsrc.log.seek.resolve`).
+        ``note`` is called with remarks for the user about ``point`` (`eventsrc.log.seek.resolve`).
         """
         with LogReader(log) as reader:
             end = resolve(reader, point, note=note)
             return cls(fold_log(reader, settings, end, corrections=corrections)[1])
 
     def _different(self) -> Cosines:
-        """The cosines of different things in one picture, of a sample of the observations."""
+        """The statistics of cosines between different things in one picture, over a sample."""
         ordinals = self._ordinals
         sample = Sample.of(int(ordinals[-1]) + 1 if len(ordinals) else 0)
         rows = np.flatnonzero((ordinals < sample.limit) & ((ordinals + 1) % sample.stride == 0))
@@ -265,7 +266,7 @@ def _stand(estimate: Estimate | None) -> Stand | None:
 
 
 def objects_of_a_class(crops: Sequence[Crop]) -> int:
-    """How many Objects are taken for each crop of which only the class is known."""
+    """The number of Objects to fetch for each crop of which only the class is known."""
     classes = {crop.class_name for crop in crops if crop.vector is None}
     return min(OBJECTS_OF_A_CLASS, MOST_OBJECTS // max(len(classes), 1))
 

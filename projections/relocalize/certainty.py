@@ -1,5 +1,6 @@
-"""How sure an answer is: `known`, whether the map has the things shown, `confidence`, whether the
-pose is within 1.5 m, and `thinness`, whether the map has too few observations to trust either.
+"""Certainty of an answer: `known`, the probability that the map has the things shown, and
+`thinness`, what the map has too little of for probabilities to hold. `features` has `confidence`,
+the probability that the pose is within 1.5 m.
 
 `known` and `confidence` are logistic models. Their inputs depend neither on the embedding model nor
 on the size of the map: likenesses are relative, (cosine - different) / (1 - different), 0 for what
@@ -33,7 +34,7 @@ KNOWN_WEIGHTS: Final[tuple[float, ...]] = (-15.095, 19.053, 4.775, 10.356, -1.61
 """Intercept, then one for each of `known_features`."""
 _NEAREST: Final = 4
 _LEAST: Final = 0.4
-"""Less alike is as good as not alike at all, in the means over the crops."""
+"""Least likeness in the means over the crops: a lower one counts as this."""
 _NO_LOOK: Final = 0.5
 """`known` of a question whose crops have no embedding: their classes are in the map."""
 
@@ -55,10 +56,10 @@ def known_features(
     crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
 ) -> tuple[float, ...] | None:
     """The greatest relative likeness of any crop to an observation, and the mean over the crops of
-    each one's greatest. Then of each crop's mean likeness to the four most similar: by how much the
-    mean over the crops is below the greatest, and the second greatest; both are 0 for one crop. In
-    all but the first a likeness counts as at least 0.4. None if no crop has an embedding and
-    matches."""
+    each crop's greatest. Then, of each crop's mean likeness to its four most similar observations:
+    by how much the mean over the crops is below the greatest, and the second greatest; both are 0
+    for one crop. In all but the first a likeness counts as at least 0.4. None if no crop has an
+    embedding and matches."""
     zero, localizer = constants.different, constants.localizer
     best, mean = [], []
     for crop, row in zip(crops, matches, strict=True):
@@ -80,29 +81,31 @@ def known_features(
 
 
 def logit_of(weights: Sequence[float], features: Sequence[float]) -> float:
-    """The intercept and the weighted features."""
+    """The logit of a logistic model: the intercept ``weights[0]`` plus the weighted features."""
     return weights[0] + math.fsum(
         weight * value for weight, value in zip(weights[1:], features, strict=True)
     )
 
 
 def corrected(logit: float, scale: float, shift: float) -> float:
-    """A logit with a map's own correction."""
+    """A logit corrected by a map's own scale and shift."""
     return scale * logit + shift
 
 
 def probability(logit: float) -> float:
-    """Between 0 and 1; the same bits on every machine."""
+    """The logistic function of a logit; the same bits on every machine."""
     return 1.0 / (1.0 + exp(-max(-40.0, min(40.0, logit))))
 
 
 LEAST_SPOTS: Final = 5
-"""Candidates from fewer places to stand are of a robot that looked around, not of a drive."""
+"""Least number of robot positions among the candidates; with fewer the robot has only looked
+around."""
 SPOT_M: Final = 0.35
 
 
 def thinness(crops: Sequence[Crop], matches: Sequence[Sequence[Match]]) -> str | None:
-    """What the map is thin of, as a clause; None where it is not, or no crop has an embedding.
+    """A clause that names what the map has too little of; None if it has enough or no crop has an
+    embedding.
 
     A map is thin with fewer observations than are fetched for one crop, or if those that are were
     made from fewer than five spots.
@@ -121,7 +124,7 @@ def thinness(crops: Sequence[Crop], matches: Sequence[Sequence[Match]]) -> str |
 
 
 def _spots(matches: Iterable[Match]) -> int:
-    """How many places to stand the matches were seen from, counted up to `LEAST_SPOTS`."""
+    """The number of distinct robot positions of the matches, counted up to `LEAST_SPOTS`."""
     spots: list[tuple[float, float]] = []
     for match in matches:
         if match.pose is None:

@@ -17,15 +17,15 @@ from projections.settings import LocalizerConstants, Settings
 from .camera import Camera
 
 SAMPLED: Final = 1_024
-"""Observations that are compared with others of their picture."""
+"""The most observations that are compared with others of their picture."""
 FOLLOWERS: Final = 3
-"""… with those that come up to so many later."""
+"""How many of the observations after it each one is compared with."""
 _GUESS: Final = 0.5
 _GUESS_WEIGHT: Final = 0.5
 _SPREAD_WEIGHT: Final = 10.0
 _DIGITS: Final = 4
-"""Cosines of a database are sums of float32: rounded to so many digits, they nearly always agree
-with exact ones."""
+"""Digits that cosines are rounded to: those of a database are sums of float32, and rounded they
+nearly always equal exact ones."""
 
 
 class Sample(NamedTuple):
@@ -69,8 +69,8 @@ class MapConstants:
 
     @classmethod
     def of(cls, settings: Settings, cosines: Cosines) -> Self:
-        """The constants of a map with these settings, in whose sample different things have these
-        cosines. With few of them they are drawn towards a guess."""
+        """The constants of a map with these settings and these cosines of different things. A few
+        cosines are shrunk towards a guess."""
         evidence, camera = settings.evidence, settings.camera
         different = evidence.different
         if different is None:

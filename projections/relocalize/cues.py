@@ -6,9 +6,9 @@ does not cut there:
 size        logarithm of the box's height in metres, log(height at 1 m) + log(distance)
 elevation   of the upper or lower edge above the camera: rise of the line of sight × distance
 
-Both rest on the estimated position, so an error of it is in them: they come with their gradient by
-the position. A thing seen from one spot may stand half as far again, but then it is larger, too,
-and looks from that spot as it did.
+Both are computed from the estimated position, so they contain its error; each comes with its
+gradient by the position. A thing seen from one spot may be half as far again, but then it is
+larger, too, and looks the same from that spot.
 """
 
 import math
@@ -41,15 +41,16 @@ class Cue:
     variance: Floats
 
     def part(self, rows: slice) -> "Cue":
-        """That of some of the landmarks."""
+        """The cue of some of the landmarks."""
         return Cue(self.mean[rows], self.by_x[rows], self.by_y[rows], self.variance[rows])
 
 
 def cues(
     boxes: Sights, poses: Floats, sight: Floats, at: Floats, starts: Indices, model: Model
 ) -> tuple[Cue, tuple[Cue, Cue]]:
-    """Size, and upper and lower edge, of landmarks at the positions ``at`` of the observations'
-    landmarks; ``sight`` (m,) is the direction in the map of each observation."""
+    """The cues of landmarks: size, and the elevations of the upper and the lower edge. Of each
+    observation, ``at`` (m, 2) is the position of its landmark and ``sight`` (m,) its direction in
+    the map."""
     ux, uy = np.cos(sight), np.sin(sight)
     ahead = (at[:, 0] - poses[:, 0]) * ux + (at[:, 1] - poses[:, 1]) * uy
     ahead = np.maximum(ahead, _NEAREST_M)
@@ -86,7 +87,7 @@ def _mean_cue(
 def with_class_sizes(
     size: Cue, classes: Sequence[str], evidence: EvidenceConstants, model: Model
 ) -> Cue:
-    """Where no box of a landmark has a height, the size of its class, if that is known."""
+    """``size``, with the known size of the class for landmarks that have no box with a height."""
     mean, variance = size.mean.copy(), size.variance.copy()
     for index in np.flatnonzero(~np.isfinite(variance)).tolist():
         height = evidence.sizes_m.get(classes[index])

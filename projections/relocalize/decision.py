@@ -1,10 +1,10 @@
-"""Decision: which of the weighed positions is the answer.
+"""Decision: choose the answer among the weighed positions.
 
 The one with the least expected error, errors above 4 m counting as 4 m (like a median; a mean could
-lie between two look-alike spots). In that expectation a fifth is the plain recipe: the robot is
-where robots stood at the ten observations most similar to each crop. It decides where the weights
-are spread over half the building, as with one crop of things that the map has many of, and is too
-little to matter where they are not.
+lie between two look-alike spots). A fifth of that expectation is over the positions of robots at
+the ten observations most similar to each crop. This fifth decides where the weights are spread over
+half the building, as with one crop of a thing that the map has many of, and hardly matters
+elsewhere.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def stood_at(views: Sequence[View], matches: Sequence[Sequence[Match]]) -> Float
 
 
 def least_error(cells: Floats, weights: Floats, stood: Floats) -> int:
-    """The number of the cell (h, 2) with the least expected error. ``weights`` (h,) add up to 1;
+    """The index of the cell (h, 2) with the least expected error. ``weights`` (h,) add up to 1;
     ``stood`` (n, 2) is of `stood_at`."""
     expected = (np.minimum(_apart(cells, cells), MAX_ERROR_M) * weights[None]).sum(1)
     if len(stood):
@@ -46,7 +46,7 @@ def least_error(cells: Floats, weights: Floats, stood: Floats) -> int:
 
 
 def _apart(one: Floats, other: Floats) -> Floats:
-    """The distance of each position (n, 2) to each other (m, 2), of shape (n, m)."""
+    """The distances between positions ``one`` (n, 2) and ``other`` (m, 2), of shape (n, m)."""
     dx = one[:, 0, None] - other[None, :, 0]
     dy = one[:, 1, None] - other[None, :, 1]
     dx *= dx

@@ -1,9 +1,9 @@
 """Features of a posterior, and its confidence: a logistic model of them.
 
-`confidence` is the probability that the pose is within 1.5 m of the truth. A robot that sees only
-what the map does not have counts as never right. Where only classes are known, no likeness tells
-whether the things are those of the map; `confidence` is then the posterior's own weight near the
-answer, which supposes that they are.
+`confidence` is the probability that the pose is within 1.5 m of the truth. In the fit, an answer to
+crops of things that the map lacks counts as wrong. Where only classes are known, there is no
+likeness by which to decide whether the things are those of the map; `confidence` is then the
+posterior's weight near the answer, which assumes that they are.
 """
 
 import math
@@ -53,8 +53,8 @@ def features_of(
     loss: float,
     model: Model,
 ) -> Features:
-    """``crops`` are the log-likelihoods of those with evidence, ``landmarks`` those of crops that
-    have a look too; ``asked`` counts all crops."""
+    """The features of a posterior. ``crops`` are the log-likelihoods of crops with evidence,
+    ``landmarks`` those of crops that have an embedding too; ``asked`` counts all crops."""
     missing = (asked - len(crops)) * unexplained(model)
     return Features(
         max((float(each.likeness.max()) for each in landmarks), default=None),

@@ -3,7 +3,7 @@
 Where candidates are of several floors, positions on each are laid out beside those on the others,
 `STEP_M` apart in x, before the ranking sees them; the pose of the answer is moved back and says
 which floor it is on. A match that is of no Place is on a floor of its own. With one floor nothing
-is moved. Only floors of the matches count, not all of the map: the databases know no others.
+is moved. Only the floors of matches are laid out, since the databases return no others.
 """
 
 import math
@@ -66,7 +66,8 @@ class Layout:
 
     @classmethod
     def of(cls, candidates: Candidates) -> "Layout":
-        """The floors of these matches: those with a name by name, then that without."""
+        """The floors of these matches: named ones in the order of their names, then the unnamed
+        one."""
         ordinals = {
             place
             for row in candidates.matches
@@ -80,7 +81,7 @@ class Layout:
 
     @property
     def has_several(self) -> bool:
-        """Whether anything is moved."""
+        """Whether there are several floors, so that positions are moved."""
         return len(self.numbers) > 1
 
     def laid_out(self, candidates: Candidates) -> Candidates:
@@ -118,7 +119,7 @@ class Layout:
         return math.sqrt(float(weights @ (dx * dx + dy * dy)) / float(weights.sum()))
 
     def hypotheses(self, posterior: Posterior) -> Hypotheses:
-        """The poses of a posterior, as they are on their floors."""
+        """The poses of a posterior, moved back to their floors."""
         if not self.has_several:
             floor = next(iter(self.numbers), None)
             return Hypotheses(posterior.poses, posterior.weights, (floor,) * len(posterior.poses))

@@ -24,9 +24,9 @@ _MOST_SPOTS: Final = 600
 
 
 def likely_spots(marks: Sequence[Landmarks], grid_m: float) -> Floats:
-    """Positions that saw a landmark, those in one square of a grid once: of all landmarks, or with
-    many crops of each crop's best by looks, so that a question of many views costs no more for each
-    of them. There are at most `_MOST_SPOTS`."""
+    """Positions from which a landmark was seen, one for each square of a grid, at most
+    `_MOST_SPOTS`. With many crops, only landmarks that look most like each crop are used, which
+    bounds the cost of a question with many views."""
     most = max(_LEAST_LANDMARKS, _LANDMARKS // len(marks))
     found = []
     for each in marks:
@@ -41,19 +41,20 @@ def likely_spots(marks: Sequence[Landmarks], grid_m: float) -> Floats:
 
 
 def distinct(points: Floats, grid_m: float) -> Floats:
-    """The points, those in one square of a grid once, in order."""
+    """The points in order, only the first of each square of a grid."""
     keys, least = _keys(np.rint(points.T / grid_m))
     keys = np.sort(keys)
     return _squares(keys.take(_first_of_each(keys)), least) * grid_m
 
 
 _BITS: Final = np.uint64(27)
-"""For y: ± 10,000 km in squares of 0.175 m. The other 37 are for x, of which floors take 100,000 km
-each (`floors`): some 240 of them."""
+"""Bits of a key for y: ± 10,000 km in squares of 0.175 m. The other 37 bits are for x, in which
+each floor takes 100,000 km (`floors`): some 240 floors."""
 
 
 def _keys(squares: Floats) -> tuple[Keys, Floats]:
-    """Numbers of pairs (2, …) of whole numbers, in their order, and the least of each."""
+    """Keys of pairs (2, …) of whole numbers, which sort as the pairs do, and the least of both
+    numbers."""
     least = squares.reshape(2, -1).min(axis=1)
     above = squares - least.reshape(2, *(1,) * (squares.ndim - 1))
     across, up = above.astype(np.int64).view(np.uint64)
@@ -61,7 +62,7 @@ def _keys(squares: Floats) -> tuple[Keys, Floats]:
 
 
 def _squares(keys: Keys, least: Floats) -> Floats:
-    """The pairs (n, 2) that have these numbers."""
+    """The pairs (n, 2) that have these keys."""
     across = keys >> _BITS
     up = keys - (across << _BITS)
     return np.stack((across, up), axis=1).astype(np.float64) + least
@@ -74,8 +75,8 @@ def _first_of_each(ordered: Keys) -> Indices:
 
 
 def cells_near(points: Floats, cell_m: float, reach_m: float) -> tuple[Floats, Floats]:
-    """Middles of the cells of a grid within reach of a point, in order, and the squared distance of
-    each to the nearest point."""
+    """Centres of the grid cells within ``reach_m`` of a point, in order, and the squared distance
+    of each to its nearest point."""
     steps, within = _steps(cell_m, reach_m)
     points = points.T[:, :, None]
     squares = np.rint(points / cell_m) + steps[:, None]
@@ -93,9 +94,9 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> tuple[Floats, F
 
 @lru_cache(maxsize=8)
 def _steps(cell_m: float, reach_m: float) -> tuple[Floats, Flags]:
-    """Steps (2, n) from the cell of a point, and which of them are within reach. The others lead to
-    cells whose nearest point it may be though another point has them within reach: both are
-    rounded."""
+    """Steps (2, n) from the cell of a point, and which of them are within reach. The others are
+    needed for a cell that is within reach of another point while this one, as both are rounded, is
+    nearest."""
     most = math.ceil((reach_m + 2.0 * cell_m) / cell_m)
     steps = np.array(list(itertools.product(range(-most, most + 1), repeat=2)), dtype=np.float64).T
     far = np.hypot(*steps) * cell_m
@@ -104,7 +105,7 @@ def _steps(cell_m: float, reach_m: float) -> tuple[Floats, Flags]:
 
 
 def square_to_nearest(xy: Floats, points: Floats) -> Floats:
-    """The squared distance of each position to the nearest point."""
+    """The squared distance of each position to its nearest point."""
     dx = xy[:, 0, None] - points[None, :, 0]
     dy = xy[:, 1, None] - points[None, :, 1]
     squared: Floats = (dx * dx + dy * dy).min(1)
@@ -112,8 +113,8 @@ def square_to_nearest(xy: Floats, points: Floats) -> Floats:
 
 
 def log_prior(xy: Floats, squared: Floats, model: Model, walls: Walls | None = None) -> Floats:
-    """How likely a robot is there: by the squared distance from where robots have been; inside a
-    wall less so."""
+    """The log prior of robot positions ``xy``: by the squared distance from earlier robot
+    positions, and lower inside walls."""
     squared = -0.5 * squared
     near = model.driven_share * np.exp(squared / model.driven_m**2)
     far = (1.0 - model.driven_share) * np.exp(squared / model.driven_far_m**2)

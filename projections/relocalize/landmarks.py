@@ -1,4 +1,4 @@
-"""Landmarks: the things in the map that a crop may show, and the evidence of its box for each.
+"""Landmarks: the things in the map that a crop may show, and their cues for its box.
 
 Where the map knows Objects with an estimate (fusion by evidence), a crop's matches are grouped by
 Object, whose position and covariance count. All others are triangulated from the matches themselves
@@ -35,11 +35,12 @@ _FULL_WEIGHT: Final = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Of crops. ``xy`` (n, 2) metres, ``spread`` (n, 3) the covariance xx, xy, yy in m².
+    """The n landmarks of crops. ``xy`` (n, 2) in metres, ``spread`` (n, 3) the covariance xx, xy,
+    yy in m².
 
     ``ratios`` (n, DIRECTIONS) are likelihood ratios by looks. ``seen_from`` (m, 2) are the
     positions from which they were seen, one landmark after the other from ``starts`` (n,) on.
-    ``likeness`` (n,) is that of the most similar observation.
+    ``likeness`` (n,) is the likeness of the most similar observation.
     """
 
     xy: Floats
@@ -52,7 +53,7 @@ class Landmarks:
     likeness: Floats
 
     def part(self, start: int, end: int) -> "Landmarks":
-        """Those from ``start`` to ``end``."""
+        """The landmarks from ``start`` to before ``end``."""
         rows = slice(start, end)
         begin = int(self.starts[start])
         stop = int(self.starts[end]) if end < len(self.starts) else len(self.seen_from)
@@ -79,9 +80,9 @@ class CropGroup:
     sight: Sights
     has_look: tuple[bool, ...]
     owner: Indices = field(init=False)
-    """Number of the crop of each landmark."""
+    """The index of each landmark's crop."""
     edges: Cue = field(init=False)
-    """Those of the landmarks, as arrays (2, n)."""
+    """The edges of the landmarks, as arrays (2, n)."""
 
     def __post_init__(self) -> None:
         counts = np.diff(self.first, append=len(self.landmarks.xy))
@@ -110,7 +111,7 @@ class CropGroup:
 
 
 def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Floats:
-    """Relative likenesses of a crop's matches; of a text with the map's shift added."""
+    """Relative likenesses of a crop's matches; those of a text have the map's shift added."""
     cosines = np.array([match.similarity for match in row], dtype=np.float64)
     if crop.is_text:
         cosines = np.minimum(cosines + constants.localizer.text_shift, 1.0)
@@ -118,8 +119,8 @@ def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Fl
 
 
 class Seen(NamedTuple):
-    """A crop, its matches that have a pose, and their relative likenesses: as they are, and less
-    the shifts of their runs."""
+    """A crop, its matches that have a pose, and their relative likenesses: ``raw``, and with the
+    shifts of their runs subtracted."""
 
     crop: Crop
     matches: Sequence[Match]
@@ -130,7 +131,8 @@ class Seen(NamedTuple):
     def of(
         cls, crop: Crop, row: Sequence[Match], likeness: Floats, shifts: Mapping[str, float]
     ) -> "Seen | None":
-        """None if no match has a pose. ``likeness`` is of `likeness_of`."""
+        """The crop with its posed matches; None if no match has a pose. ``likeness`` is of
+        `likeness_of`."""
         matches = [match for match in row if match.pose is not None]
         if not matches:
             return None
@@ -144,8 +146,8 @@ def crop_groups(
 ) -> list[list[CropGroup]]:
     """The evidence of the crops of each view, in two groups at most; there is at least one crop.
 
-    What can be is computed for all crops at once: an array operation takes a microsecond or more,
-    however few numbers it has.
+    Most is computed for all crops at once, because an array operation takes a microsecond or more
+    even for few numbers.
     """
     seen = [each for view in views_seen for each in view]
     view_of = [number for number, view in enumerate(views_seen) for _ in view]
@@ -179,7 +181,8 @@ class _Thing:
 def _landmarks(
     seen: Sequence[Seen], constants: MapConstants, model: Model
 ) -> tuple[Landmarks, Indices]:
-    """The landmarks of all crops, and where each crop's begin: one number more than crops."""
+    """The landmarks of all crops, and the index of each crop's first one, with the total at the
+    end."""
     matches = [match for each in seen for match in each.matches]
     begins = np.cumsum([0, *(len(each.matches) for each in seen[:-1])])
     poses = np.array([match.pose for match in matches], dtype=np.float64)
@@ -225,7 +228,7 @@ def _things(
     constants: MapConstants,
 ) -> list[list[_Thing]]:
     """The landmarks of each crop, those with the most similar observation first. The arrays are of
-    all crops' matches, ``begins`` tells where each crop's begin."""
+    all crops' matches; ``begins`` has the index of each crop's first."""
     found: list[list[_Thing]] = []
     others: list[list[int]] = []
     for begin, each in zip(begins.tolist(), seen, strict=True):
@@ -318,7 +321,8 @@ def _ratios(
 
 
 def _spots(poses: Floats, owner: Indices) -> tuple[Floats, Indices]:
-    """Where each landmark was seen from, to 0.18 m, and where each landmark's begin."""
+    """The positions from which each landmark was seen, rounded to 0.18 m, and the index of each
+    landmark's first."""
     x, y = np.rint(poses[:, :2].T / _SPOT_M)
     order = np.lexsort((y, x, owner))
     x, y, owner = x[order], y[order], owner[order]

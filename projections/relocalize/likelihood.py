@@ -1,6 +1,6 @@
 """Likelihood of a crop at a pose: a mixture of its landmarks, and of none of them.
 
-For a robot at a pose the crop's likelihood, as a ratio against a thing that the map lacks, is
+For a robot at a pose the crop's likelihood, as a ratio to that of a thing that the map lacks, is
 
     (1 − k) + k · share · Σ  looks · seen_from · (box + tail · in_front)
                        landmarks
@@ -12,8 +12,8 @@ box         ratio by the bearing of the box's middle, and by its height and edge
             without a box, by the usual distance and whether the landmark is in the field of view
 in_front    1 if the landmark is in the field of view and within twice the usual distance
 
-The last term is a heavy tail: what looks like a landmark and is near where that was seen counts
-whatever the box says, as the plain method has it. k is below 1, so one unknown or wrong crop does
+The last term is a heavy tail: a crop that looks like a landmark counts near where that was seen
+even if its box contradicts, as in the plain method. k is below 1, so one unknown or wrong crop does
 not outvote the others.
 
 Errors of the landmark's position, of the pose and of the box add up; all are linearised. The
@@ -45,23 +45,23 @@ _MOST_BY_SIZE: Final = 6.0
 _MOST_BY_EDGE: Final = 4.0
 _MOST_CHI2: Final = 40.0
 _LEAST_LOOKS: Final = 0.02
-"""Part of the largest from which it is worth to look whether a wall is between."""
+"""Share of the largest ``looks`` from which walls in between are looked for."""
 _ROUGH_BEARING: Final = 0.05
-"""Variance added to bearings where no heading is considered."""
+"""Variance added to bearings where no heading is given."""
 _FAR: Final = 120.0
 """χ² of the distance to where a landmark was seen from: beyond it, seen_from is below 1e-26."""
 _LEAST_PART: Final = 1e-24
 """``looks`` times seen_from below which a landmark does not change the mixture."""
 _MANY: Final = 4_000
-"""Landmarks times positions from which it pays to leave those out."""
+"""Number of pairs of landmark and position from which dropping those saves time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """Of pairs of a landmark and a position, arrays of one shape: ``looks`` times seen_from,
-    ``box`` without the bearing, ``heading`` that puts the landmark where the crop shows it (in the
-    middle of the picture without a box), ``variance`` of its bearing, and ``near``, whether it is
-    within twice the usual distance.
+    """Factors of the likelihood for pairs of a landmark and a position, arrays of one shape:
+    ``looks``, already times seen_from; ``box`` without the bearing; ``heading``, at which the
+    landmark is where the crop shows it (without a box in the middle of the picture); ``variance``
+    of its bearing; ``near``, whether it is within twice the usual distance.
 
     The shape is (n, h) for all pairs of n landmarks and h positions, or one axis for some of them.
     ``slot`` is the number of the landmark's crop times h, plus that of the position.
@@ -77,12 +77,12 @@ class Terms:
     positions: int
 
     def take(self, index: Indices) -> "Terms":
-        """Those of the positions at ``index``; only of terms of all pairs."""
+        """The terms at the positions ``index``; only for terms of all pairs."""
         slot = self.slot[:, :1] // self.positions * len(index) + np.arange(len(index))
         return self._at(lambda values: values.take(index, axis=1), slot, len(index))
 
     def that_count(self) -> "Terms":
-        """Without the pairs that change nothing, if there may be many."""
+        """The terms without pairs that do not change the mixture; all of them if there are few."""
         if self.looks.size < _MANY:
             return self
         index = np.flatnonzero(self.looks > _LEAST_PART)
@@ -104,7 +104,8 @@ class Terms:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What all crops of a question share: the map's constants, the asking camera, parameters."""
+    """What all crops of a question share: the map's constants, the question's camera, parameters,
+    walls."""
 
     constants: MapConstants
     camera: Camera
@@ -113,7 +114,7 @@ class Scene:
 
 
 class _Pairs:
-    """Pairs of a landmark and a position: all, or those that are near enough."""
+    """Pairs of a landmark and a position: all, or only near ones."""
 
     def __init__(self, group: CropGroup, xy: Floats, reach_m: float | None) -> None:
         marks = group.landmarks
@@ -130,7 +131,7 @@ class _Pairs:
             self.row = self._marks
 
     def of(self, values: Any) -> Any:
-        """A quantity of the landmarks, in the last axis, for each pair."""
+        """A quantity of the landmarks (last axis) for each pair."""
         return values[..., None] if self._marks is None else values.take(self._marks, axis=-1)
 
     def nearest(self, points: Floats, starts: Indices) -> Floats:
@@ -173,7 +174,8 @@ def terms_at(
     group: CropGroup, xy: Floats, error_m2: float, scene: Scene, *, every: bool = False
 ) -> Terms:
     """The terms at positions ``xy`` (h, 2) that have the variance ``error_m2`` in each direction,
-    beside that of every pose; with ``every`` of all pairs, also of those that change nothing."""
+    added to that of every pose; with ``every`` for all pairs, also those that do not change the
+    mixture."""
     marks, evidence, model = group.landmarks, scene.constants.evidence, scene.model
     pose_m2 = model.pose_m**2 + error_m2
     seen_m2 = model.seen_from_m**2 + error_m2
@@ -217,8 +219,8 @@ def terms_at(
 
 
 def _hidden(group: CropGroup, pairs: _Pairs, xy: Floats, looks: Floats, walls: Walls) -> Flags:
-    """Which pairs have a wall between; of those that look little like their crop it is not
-    asked."""
+    """Flags of the pairs that have a wall in between; False, unchecked, where the landmark looks
+    little like the crop."""
     crop, place = np.divmod(pairs.slot, len(xy))
     most = np.zeros(len(group.first))
     np.maximum.at(most, crop, looks)
@@ -229,7 +231,7 @@ def _hidden(group: CropGroup, pairs: _Pairs, xy: Floats, looks: Floats, walls: W
 
 
 class _Offset(NamedTuple):
-    """Where landmarks lie from positions: unit vector, inverse and logarithm of the distance, the
+    """Landmarks relative to positions: unit vector, inverse and logarithm of the distance, the
     variance of the position and the covariance of the landmark."""
 
     ux: Floats
@@ -241,7 +243,7 @@ class _Offset(NamedTuple):
 
 
 def _ratio_towards(ratios: Floats, row: Indices, towards: Floats) -> Floats:
-    """The ratios by looks, between two directions of the table in proportion."""
+    """The ratios by looks, interpolated linearly between directions of the table."""
     place = towards * (DIRECTIONS / _TURN)
     low = np.floor(place)
     part = place - low
@@ -253,7 +255,8 @@ def _ratio_towards(ratios: Floats, row: Indices, towards: Floats) -> Floats:
 
 
 def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Floats:
-    """By the box's height; by a cut box's only whether the thing is too far away for it."""
+    """The log ratio by the box's height; a cut box is only evidence against things too far away for
+    it."""
     size, per = group.landmarks.size, offset.per
     known = np.isfinite(size.variance)
     own = np.where(known, size.variance, 1.0)
@@ -275,7 +278,8 @@ def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> 
 
 
 def _by_edges(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Any:
-    """By the upper and the lower edge, where the picture's border does not cut them."""
+    """The log ratio by the upper and the lower edge, where the picture's border does not cut
+    them."""
     edges, per = group.edges, offset.per
     counts = np.isfinite(edges.variance) & group.sight.whole.take(group.owner, axis=1)
     if not counts.any():
@@ -308,8 +312,8 @@ def _gain(off: Floats, variance: Floats, other: float, most: float) -> Floats:
 def log_likelihood(
     group: CropGroup, terms: Terms, yaw: Floats, yaw_variance: float, scene: Scene
 ) -> Floats:
-    """Logarithms of the crops' mixtures, shape (c, k, h), at the terms' positions with ``yaw``
-    (k, h)."""
+    """Log-likelihoods of the crops, shape (c, k, h), at the terms' positions with the headings
+    ``yaw`` (k, h)."""
     half = scene.camera.half_field_rad
     at = yaw[:, None] if terms.looks.ndim == 2 else yaw.take(terms.slot % terms.positions, axis=1)
     off = terms.heading - at
@@ -326,7 +330,7 @@ def log_likelihood(
 
 
 def log_likelihood_of_place(group: CropGroup, terms: Terms, scene: Scene) -> Floats:
-    """About the logarithms of the mixtures at the best heading, shape (c, h)."""
+    """Approximate log-likelihoods of the crops at the best heading, shape (c, h)."""
     fit: Any = terms.box
     if group.boxed:
         wide = terms.variance + _ROUGH_BEARING
@@ -336,7 +340,7 @@ def log_likelihood_of_place(group: CropGroup, terms: Terms, scene: Scene) -> Flo
 
 
 def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
-    """About the logarithms of the mixtures at headings that no landmark's bearing fits, shape
+    """Approximate log-likelihoods of the crops at headings that fit no landmark's bearing, shape
     (c, h)."""
     in_view = scene.camera.half_field_rad / math.pi
     tail: Floats = terms.near.astype(np.float64) * (scene.model.tail * in_view)
@@ -345,7 +349,8 @@ def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
 
 
 def _mixture(terms: Terms, fit: Floats, scene: Scene) -> Floats:
-    """Of shape (k, c, h); ``fit`` has that of the terms, or one axis of k more."""
+    """The logarithms of the mixtures, shape (k, c, h); ``fit`` has the shape of the terms, or one
+    axis of k more."""
     model, parts, count = scene.model, terms.looks * fit, terms.crops * terms.positions
     slot, times = terms.slot, 1
     if parts.ndim > slot.ndim:

@@ -1,7 +1,7 @@
-"""Parameters of the ranking that hold for all maps; what differs from map to map is read off it.
+"""Parameters of the ranking that hold for all maps; constants of one map are in `MapConstants`.
 
-How far away things are seen, how good bearings are, how alike one thing and two things look:
-`projections.evidence`, in `MapConstants`. What is here was chosen on the developing half of our
+`MapConstants` has the usual distance of things, the error of bearings and the likeness of one thing
+and of two (`projections.evidence`). The parameters here were chosen on the developing half of the
 trial data (docs/relocalization.md).
 """
 
@@ -17,19 +17,19 @@ class Model:
     in_map: float = 0.85
     """Probability beforehand that a crop's thing is in the map."""
     share: float = 0.5
-    """Of a landmark that fits as well as a thing anywhere would."""
+    """Likelihood ratio of a landmark that fits no better than a thing anywhere would."""
     tail: float = 0.03
-    """How much a landmark counts that is roughly in front, whatever its box says."""
+    """The weight of a landmark that is roughly in front, whatever its box."""
     twice: float = 2.0
-    """… up to so many times the usual distance."""
+    """The distance up to which a landmark is in front, in multiples of the usual distance."""
     seen_from_m: float = 1.6
     """Standard deviation of the distance to the nearest pose that saw the landmark: walls are not
     in the map."""
 
     through_walls: float = 0.3
-    """What is left of a landmark with a wall between: where it stands is an estimate."""
+    """The factor of a landmark behind a wall; above 0, because its position is an estimate."""
     in_walls: float = 0.1
-    """… and of a pose inside a wall: poses are a little off."""
+    """The factor of a pose inside a wall; above 0, because poses have errors."""
 
     # Where robots are: see `pose`.
     driven_m: float = 0.6
@@ -41,7 +41,8 @@ class Model:
 
     # Looks: see `appearance`.
     best_pairs: int = 4
-    """Observations of a landmark that count; missing ones cost ``missing`` each."""
+    """The number of observations of a landmark that count; with fewer, each missing one costs
+    ``missing``."""
     missing: float = 0.5
     most: float = 8.0
     """Limit of a landmark's log-likelihood ratio by its looks."""
@@ -51,28 +52,29 @@ class Model:
     look_alike_below: float = 0.04
     of_class: float = 0.35
     least_spread: float = 0.06
-    """The spread of a thing's likenesses counts as at least this."""
+    """The least spread of a thing's likenesses."""
     own_spread: float = 0.4
-    """Part of their variance that is not common to all likenesses of a landmark with a crop."""
+    """Share of their variance that is not common to all likenesses of a landmark to a crop."""
     independent: float = 6.0
-    """Likenesses of a landmark are related: no more than this many count."""
+    """The most likenesses of a landmark that count, since they are correlated."""
     side_weight: float = 0.85
-    """How much of the log-likelihood by the side of view counts."""
+    """The weight of the log-likelihood by the side of view."""
     same_picture: float = 0.98
-    """A likeness above this is to the very crop asked with; the robot then looks from there, as
-    exp(kappa (cos Δ − 1))."""
+    """A likeness above this is to the crop itself; the robot then looks from there, as exp(kappa
+    (cos Δ − 1))."""
     same_picture_kappa: float = 50.0
     text_weight: float = 0.5
-    """Part of the logarithm of the ratio that counts when the crop is a text."""
+    """The weight of the log ratio when the crop is a text."""
     class_ratio: float = 1.5
-    """Log-likelihood ratio of a landmark that has the class of a crop without a look."""
+    """Log-likelihood ratio of a landmark that has the class of a crop without an embedding."""
 
     # Boxes: see `landmarks` and `likelihood`.
     pose_m: float = 0.1
     size_spread: float = 0.2
-    """Of the logarithm of a landmark's height in a box, beside what is common to all boxes."""
+    """Standard deviation of the logarithm of a landmark's height in a box, beside the error common
+    to all boxes."""
     other_sizes: float = 0.7
-    """… of any other thing."""
+    """Standard deviation of the logarithm of the height of any other thing."""
     edge_m: float = 0.08
     edge_part: float = 0.1
     """Standard error of an edge's elevation, and what a part of the elevation adds."""

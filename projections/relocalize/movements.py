@@ -1,4 +1,4 @@
-"""Views from several poses: where the robot was at each, given where it is at the last.
+"""Views from several poses: the robot's pose at each, given its pose at the last one.
 
 The movement between two views is known but for a small error that grows with it: 2 cm and a
 twentieth of the way, and 0.01 rad and a twentieth of the turn. The errors of all movements up to
@@ -22,7 +22,8 @@ _TURN_RAD, _TURN_PART = 0.01, 0.05
 
 @dataclass(frozen=True, slots=True)
 class Behind:
-    """How sure the pose at a view is, given that at the last one, and how far it lies from it."""
+    """The error of the pose at a view, given the pose at the last one, and its distance from
+    that."""
 
     m2: float
     yaw2: float
@@ -31,7 +32,7 @@ class Behind:
 
 
 def behind_last(movements: Sequence[Movement]) -> list[Behind]:
-    """Of each view, what lies between it and the last one."""
+    """For each view the movement and its error between it and the last one."""
     m2 = yaw2 = turn = 0.0
     x = y = 0.0
     found = [Behind(0.0, 0.0, 0.0, 0.0)]

@@ -1,4 +1,4 @@
-"""Poses: weigh where the robot may be, at the last view of a question, and choose.
+"""Poses: weigh the robot's possible poses at the last view of a question, and choose one.
 
 The posterior is a grid of cells of 0.35 m near positions from which a landmark was seen, times
 headings. Of all cells within 1.6 m those are kept that fit best whatever the heading, by cells of
@@ -49,7 +49,8 @@ _TermsOfViews = Sequence[Sequence[Terms]]
 CELL_M: Final = 0.35
 _COARSE_KEPT, _COARSE_IN_ALL = 40, 96
 _KEPT, _IN_ALL = 100, 240
-"""So many cells are kept, and with few crops, which leave more open, so many for all together."""
+"""Cells that are kept; with few crops, which leave more poses open, so many for all crops
+together."""
 _HEADINGS: Final = 8
 _TURN: Final = 2.0 * math.pi
 _FINE_M: Final = 0.12
@@ -58,7 +59,7 @@ _FINE_SQUARE: Final = np.array([(dx, dy) for dx in _FINE for dy in _FINE])
 _QUARTERS: Final = np.array([(x, y) for x in (-1, 1) for y in (-1, 1)]) * (CELL_M / 2)
 _FINE_YAW: Final = np.array([-0.16, -0.08, 0.0, 0.08, 0.16])
 _MAX_LOSS_M: Final = 2.5
-"""Of the feature of the confidence."""
+"""The most that an error counts in the feature ``loss`` of the confidence, in metres."""
 _NEAR_M: Final = 1.0
 _MIN_YAW_AGREEMENT: Final = 0.8
 _SAME_SPOT_M: Final = 0.05
@@ -159,7 +160,8 @@ def _terms_at(
     *,
     every: bool = False,
 ) -> _TermsOfViews:
-    """The terms at cells. A view from elsewhere counts as one from here with a larger error."""
+    """The terms at cells. A view from another pose is treated as one from this pose with a larger
+    error."""
     found = []
     for view, back in zip(sighted, behind, strict=True):
         error = cell_m * cell_m / 12.0 + back.m2 + 0.5 * back.away_m**2
@@ -221,8 +223,7 @@ def _hypotheses(
     terms: _TermsOfViews,
     scene: Scene,
 ) -> tuple[Floats, Floats]:
-    """Headings (k, h) of the last view at the cells, and how densely the headings of a cell lie
-    there."""
+    """Headings (k, h) of the last view at the cells, and the density of a cell's headings there."""
     found = []
     for view, back, of_view in zip(sighted, behind, terms, strict=True):
         for group, each in zip(view.groups, of_view, strict=True):

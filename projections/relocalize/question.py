@@ -42,7 +42,7 @@ class Crop:
 
     @property
     def sort_key(self) -> tuple[bytes, Box, str, str]:
-        """Puts crops into one order, whatever order they came in."""
+        """A key that sorts crops in the same order however they were sent."""
         look = b"" if self.vector is None else self.vector.tobytes()
         box = self.bbox or (0.0, 0.0, 0.0, 0.0)
         return look, box, self.det_id or "", self.class_name or ""
@@ -50,8 +50,8 @@ class Crop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The crops of one picture, and how the robot moved since the view before: metres ahead and to
-    the left, and radians to the left, in its frame there; all 0 in the first view."""
+    """The crops of one picture, and the robot's movement since the view before: metres ahead and to
+    the left, and radians to the left, in its frame at that view; all 0 in the first view."""
 
     dx: float
     dy: float
@@ -61,7 +61,7 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """Views of a robot one after the other; the answer is where it is at the last one.
+    """Successive views of a robot; the answer is its pose at the last one.
 
     ``camera`` is None where the question does not state it.
     """

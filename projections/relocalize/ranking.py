@@ -3,7 +3,7 @@
 The joint method weighs poses (`pose`), and a Place's score is the share of their weight that lies
 in it: each pose counts for the Place of the nearest keyframe among the candidates. Places that no
 pose lies in come last, by the plain method's sums. Ties go to the Place founded first. Crops are
-first put into one order, so that theirs does not matter.
+sorted first, so the order in which they were sent does not matter.
 
 The plain method is the baseline that everything else is measured against: each of the ten nearest
 observations of a crop gives its similarity to the Place of its Object; the Place with the greatest
@@ -105,9 +105,9 @@ class Answer:
     """Two calibrated probabilities: ``known`` that the map has one of the things shown,
     ``confidence`` that the pose is right within 1.5 m.
 
-    ``hypotheses`` are what the pose was chosen from; None where there is no pose, and with the
-    plain method. ``thin`` names what the map has too little of (`certainty.thinness`), None where
-    it has enough.
+    ``hypotheses`` are the poses from which the answer was chosen; None where there is no pose, and
+    with the plain method. ``thin`` names what the map has too little of (`certainty.thinness`),
+    None where it has enough.
     """
 
     places: tuple[RankedPlace, ...]
@@ -161,7 +161,7 @@ def rank(
 
 
 def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
-    """Views whose crops are in one order, whatever order they came in, and their candidates."""
+    """The views with sorted crops, and their candidates in that order."""
     views, rows, start = [], [], 0
     for view in question.views:
         crops = view.crops

@@ -8,7 +8,7 @@ as in an envelope, or a JSON list of numbers; or else a ``class``, and then thin
 meant. ``"text": true`` says that the embedding is one of a text. ``class``, ``bbox``, ``det_id``
 and ``embedding_model`` are optional, and so is the question's ``camera``, as in an envelope. Crops
 with neither embedding nor class are left out, because nothing can be searched with them. The pose
-in an envelope is *not* read: it is what is being asked.
+in an envelope is *not* read: it is the answer that is sought.
 """
 
 import binascii
@@ -41,7 +41,7 @@ _Pixels = Annotated[list[float], Field(min_length=4, max_length=4, fail_fast=Tru
 
 
 class CropModel(BaseModel):
-    """A crop as it is sent."""
+    """The JSON form of a crop."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
@@ -60,7 +60,7 @@ _CROPS: TypeAdapter[list[CropModel]] = TypeAdapter(
 
 
 class MovementModel(BaseModel):
-    """How the robot moved since the view before."""
+    """The JSON form of the robot's movement since the view before."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
@@ -75,7 +75,8 @@ def parse_question(payload: bytes) -> Question:
 
 
 def parse_json(payload: bytes) -> Any:
-    """The JSON document of a question. Raises QuestionError when it is none or too complex."""
+    """The JSON document of a question. Raises QuestionError for a payload that is not JSON or too
+    complex."""
     marks = sum(map(payload.count, (b"[", b"{", b":")))
     if marks > MAX_MARKS:
         raise QuestionError(
@@ -157,7 +158,7 @@ def _read_views(items: Any, camera: Any) -> Question:
 
 def read_moved(document: Any) -> Movement:
     """How a robot whose questions are tracked has moved since the one before: ``dx``, ``dy`` and
-    ``dyaw`` of the question, or of its first view; not at all if there is none of them."""
+    ``dyaw`` of the question, or of its first view; no movement if there is none of them."""
     if not isinstance(document, dict):
         return STILL
     views = document.get("views")
@@ -168,7 +169,7 @@ def read_moved(document: Any) -> Movement:
 
 
 def _movement(document: dict[str, Any], name: str, since: str) -> Movement:
-    """``since`` is what it is since the one before, a view or a question."""
+    """A movement; ``since`` is ``view`` or ``question``, for messages."""
     try:
         moved = MovementModel.model_validate(document)
     except ValidationError as error:
@@ -184,7 +185,8 @@ def _movement(document: dict[str, Any], name: str, since: str) -> Movement:
 
 
 def _read_crops(document: Any, name: str) -> tuple[Crop, ...]:
-    """Those with an embedding or a class; ``name`` is where they are, for messages."""
+    """The crops that have an embedding or a class; ``name`` is their path in the document, for
+    messages."""
     try:
         items = _crop_list(document)
     except QuestionError as error:

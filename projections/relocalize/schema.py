@@ -1,7 +1,7 @@
 """The JSON schema of questions, for people and generators of clients.
 
-It states all that `reading` checks, except what a schema cannot express: that embeddings are of the
-map's space and classes those of its Objects, and that `MAX_CROPS` counts the crops of all views
+It states all checks of `reading`, except those that a schema cannot express: that embeddings are of
+the map's space and classes those of its Objects, and that `MAX_CROPS` counts the crops of all views
 together.
 """
 

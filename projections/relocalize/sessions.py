@@ -1,10 +1,10 @@
-"""Session shifts: how much higher likenesses are within one session than between two, subtracted.
+"""Session shifts: subtract the excess of likenesses within one session over those between two.
 
 Light, lens and clutter of a session are in all of its embeddings, so a crop is more similar to what
 its own session has mapped than the same thing is on another day: by ``session_shift`` of
 `projections.evidence`. A map may hold a part of the lost robot's own session beside other runs.
-Each run therefore has a shift of its own: with the shift of one subtracted from all, the other
-runs' matches would look as if seen from behind.
+Each run therefore has a shift of its own: with one shift subtracted from all, the other runs'
+matches would be as dissimilar as views from behind.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,8 @@ _THIRD = 2
 def session_shifts(
     rows: Sequence[Sequence[Match]], likenesses: Sequence[Floats], usual: float, most: float
 ) -> dict[str, float]:
-    """By run, how much higher than ``usual`` its likenesses are, at most ``most``; mostly 0.
+    """The shift of each run: the excess of its likenesses over ``usual``, at most ``most``; mostly
+    0.
 
     Measured on a crop's third best match in the run, not the best, which is too similar if the very
     crop is in the map. A run with fewer matches of every crop has shift 0.

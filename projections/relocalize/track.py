@@ -1,4 +1,4 @@
-"""Tracking: where a robot is, from its questions one after the other and its odometry.
+"""Tracking: estimate a robot's pose from successive questions and its odometry.
 
 A particle filter, as in Monte Carlo localisation. Particles move with the odometry, which is taken
 to be off by a share of the way and of the turn. A question weighs them with the likelihood that its
@@ -43,14 +43,15 @@ _MOST_POSES: Final = 100
 _CARRIED: Final = 0.01
 """Probability that the robot was carried elsewhere between two questions."""
 _LEAST_LOST: Final = 0.005
-"""Look-alikes deceive several questions in a row, which their likelihoods do not know."""
+"""The least `lost`: look-alikes deceive several questions in a row, for which the likelihoods do
+not account."""
 _NEUTRAL: Final = 0.5
 """`known` of a question without evidence for it, as one of classes alone."""
 _LEAST_DOUBT: Final = 0.125
-"""One question whose things are not in the map makes the robot's being where it was taken to be at
-most so much less likely, as a ratio."""
+"""The least likelihood ratio, for the robot being where the particles are, of a question whose
+things are not in the map."""
 _ANYWHERE: Final = 1.0 / (1_000.0 * 2.0 * math.pi)
-"""Density of a robot that may be anywhere: 1,000 m², any heading."""
+"""Density of a robot's pose that may be anywhere: 1,000 m², any heading."""
 _SIGMA_M: Final = 0.4
 _SIGMA_RAD: Final = 0.35
 _HEIGHT: Final = 1.0 / ((2.0 * math.pi) ** 1.5 * _SIGMA_M**2 * _SIGMA_RAD)
@@ -115,7 +116,7 @@ class Track:
         confidence: float,
         known: float = _NEUTRAL,
     ) -> Tracked:
-        """One question: how the robot moved since the last one, and what it was answered with.
+        """Take in one question: the robot's movement since the last one, and the answer's poses.
 
         ``known`` is the probability that the map has the things shown; 0.5 is no evidence.
         """
@@ -137,7 +138,7 @@ class Track:
         return self._estimate()
 
     def _move(self, moved: Movement, random: np.random.Generator) -> None:
-        """Move the particles, each with slips of its own."""
+        """Move the particles, each with its own random slip."""
         dx, dy, dyaw = moved
         way, turn = math.hypot(dx, dy), abs(dyaw)
         self._moved += way / _INDEPENDENT_M + turn / _INDEPENDENT_RAD
@@ -193,7 +194,7 @@ class Track:
         return self._floors.index(floor)
 
     def _estimate(self) -> Tracked:
-        """The pose with most particles within 1 m, moved to their mean."""
+        """The estimate: the pose with most particles within 1 m, moved to their mean."""
         at = self.particles[:: max(1, len(self.particles) // _TRIED)]
         dx = at[:, 0][:, None] - self.particles[None, :, 0]
         dy = at[:, 1][:, None] - self.particles[None, :, 1]
@@ -217,7 +218,7 @@ class Track:
 
 
 def _known_ratio(known: float) -> float:
-    """How much likelier it is to see such things where the particles are than elsewhere.
+    """The ratio of the probabilities of seeing such things where the particles are and elsewhere.
 
     Things that the map has are seen all over the map, so they are no evidence for one spot in it.
     """
@@ -225,7 +226,8 @@ def _known_ratio(known: float) -> float:
 
 
 def movement_of(first: Movement, question: Question) -> Movement:
-    """How the robot moved up to the last view, if ``first`` is how it moved up to the first."""
+    """The movement up to a question's last view, with ``first`` as the movement up to its first
+    view."""
     x, y, yaw = first
     for view in question.views[1:]:
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -235,7 +237,7 @@ def movement_of(first: Movement, question: Question) -> Movement:
 
 
 def _likelihood(particles: Floats, poses: Floats, shares: Floats, sure: float) -> Floats:
-    """Density of what was seen, up to a factor: near the poses with probability ``sure``."""
+    """The density of the observation, up to a factor: near the poses with probability ``sure``."""
     dx = particles[:, 0][:, None] - poses[None, :, 0]
     dy = particles[:, 1][:, None] - poses[None, :, 1]
     turned = _wrapped(particles[:, 2][:, None] - poses[None, :, 2])
@@ -245,7 +247,7 @@ def _likelihood(particles: Floats, poses: Floats, shares: Floats, sure: float) -
 
 
 def _resampled(weights: Floats, count: int, random: np.random.Generator) -> NDArray[np.intp]:
-    """Systematic resampling: ``count`` indices, each as often as its weight says, give or take
+    """Systematic resampling: ``count`` indices, each in proportion to its weight, give or take
     one."""
     edges = np.cumsum(weights)
     places = (np.arange(count) + random.random()) / count * edges[-1]

@@ -1,4 +1,4 @@
-"""Triangulation: positions of things that look like a crop, where the map has no estimate of them.
+"""Triangulation: positions of things that look like a crop, where the map has no estimate.
 
 Matches of one crop show one thing or look-alikes of it, so they share one size (pixel metres, see
 `camera`). Given a size, each observation alone gives a point: bearing and depth from its pose. The
@@ -14,7 +14,7 @@ cross do not. Points from one spot, closer than 0.35 m, share their errors and c
 half. An error in the shared size moves all points outward together: by ``slide``, metres per unit
 of log size.
 
-No BLAS, and results depend on no order but the candidates'.
+BLAS is not used; of all orders only that of the candidates affects results.
 """
 
 import math
@@ -35,7 +35,7 @@ Indices = NDArray[np.intp]
 _LOG_DEPTHS: Final = np.linspace(np.log(0.5), np.log(9.0), 22)
 _DEPTHS: Final = np.exp(_LOG_DEPTHS)
 _FOR_DEPTH: Final = 40
-"""How many of the most similar matches are used to find the size; all pairs are compared."""
+"""The number of most similar matches used to find the size; all pairs are compared."""
 _AGREE_M: Final = 0.3
 _MOST_APART: Final = 80.0 * _AGREE_M**2
 """Pairs of points that are farther apart at every depth, in square metres, agree by less than
@@ -73,9 +73,10 @@ def triangulate(
     most: Sequence[int],
     evidence: EvidenceConstants,
 ) -> list[list[Triangulated]]:
-    """For each crop its landmarks, the densest first and at most ``most``. ``poses`` (n, 3) in
-    metres and radians and ``weight`` (n,), how much each counts, are of the observations, those of
-    one crop after the other from ``starts`` on, each crop's most similar first; all have some."""
+    """The landmarks of each crop, the densest first and at most ``most``. ``poses`` (n, 3) in
+    metres and radians, ``boxes`` and ``weight`` (n,) are of the observations, grouped by crop, the
+    most similar first; ``starts`` has the index of each crop's first. Each crop has at least
+    one."""
     counts = np.diff(starts, append=len(poses))
     cut = boxes.cut_x | boxes.cut_y | ~boxes.known
     weight = np.where(cut, _CUT_WEIGHT * weight, weight)
@@ -102,8 +103,8 @@ def triangulate(
 
 
 def _rays(poses: Floats, boxes: Views, starts: Indices, counts: Indices) -> Floats:
-    """Vectors (2, n) from pose to thing, for a box of its crop's median height at a depth of
-    1 m."""
+    """Vectors (2, n) from pose to thing, scaled so that a box of its crop's median height is at a
+    depth of 1 m."""
     heights = boxes.height_px
     medians = [
         _median(heights[start : start + count])
@@ -122,7 +123,7 @@ def _median(values: Floats) -> float:
 
 @lru_cache(maxsize=_FOR_DEPTH)
 def _pairs(count: int) -> tuple[Indices, Indices]:
-    """Each two of so many."""
+    """The indices of all pairs of ``count`` items."""
     return np.triu_indices(count, 1)
 
 
@@ -200,16 +201,16 @@ def _width(score: Floats) -> float:
 class Points:
     """n points with the rays to them from where they were seen, in metres, as ``rows`` (15, n).
 
-    ``sigma`` (2, n) are their standard errors in and square to the ray's direction, whose unit
-    vectors are ``direction`` (2, n). ``moments`` (7, n) are what weighted sums are made of: the
-    inverse of a point's covariance (xx, xy, yy), that times the point, and that times the ray.
+    ``sigma`` (2, n) are their standard errors along and perpendicular to the ray, whose unit
+    vectors are ``direction`` (2, n). ``moments`` (7, n) are the terms of weighted sums: the inverse
+    of a point's covariance (xx, xy, yy), that times the point, and that times the ray.
     """
 
     rows: Floats
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """The number of points."""
         return len(self.rows[0])
 
     @property
@@ -238,11 +239,11 @@ class Points:
         return self.rows[8:]
 
     def subset(self, index: Indices) -> "Points":
-        """Those at ``index``."""
+        """The points at ``index``."""
         return Points(self.rows.take(index, axis=1))
 
     def part(self, start: int, end: int) -> "Points":
-        """Those from ``start`` to ``end``."""
+        """The points from ``start`` to before ``end``."""
         return Points(self.rows[:, start:end])
 
 
@@ -301,7 +302,7 @@ def cluster_points(points: Points, weight: Floats, most: int) -> list[Indices]:
 
 @dataclass(frozen=True, slots=True)
 class Positions:
-    """Of n landmarks the positions ``xy`` (2, n) in metres, their covariances ``spread`` (3, n),
+    """The positions ``xy`` (2, n) of n landmarks in metres, their covariances ``spread`` (3, n),
     xx, xy and yy in m², and their slides (2, n)."""
 
     xy: Floats
@@ -310,8 +311,8 @@ class Positions:
 
 
 def estimate_positions(points: Points, starts: Indices) -> Positions:
-    """The positions of the things that ``points`` show, those of one thing after the other from
-    ``starts`` on; outliers have little weight."""
+    """The positions of the things that ``points`` show, which are grouped by thing from ``starts``
+    on; outliers have little weight."""
     counts = np.diff(starts, append=points.count)
     centre = np.array(_solve(*np.add.reduceat(points.moments[:5], starts, axis=1)))
     chi = _chi_squared(points, centre.repeat(counts, axis=1))
@@ -326,7 +327,7 @@ def estimate_positions(points: Points, starts: Indices) -> Positions:
 
 
 def _share_of_spot(origin: Floats, starts: Indices, counts: Indices) -> Floats:
-    """How much each point counts beside those of its thing from its spot."""
+    """The weight of each point among the points of its thing from the same spot."""
     others = counts.repeat(counts)
     begin = np.cumsum(others) - others
     first = np.arange(len(others)).repeat(others)
@@ -351,7 +352,7 @@ def _chi_squared(points: Points, to: Floats | tuple[float, float]) -> Floats:
 
 
 def _weighted_mean(points: Points, weight: Floats) -> tuple[float, float]:
-    """The mean position, weighted by information too."""
+    """The mean position, weighted by ``weight`` and by information."""
     return _solve(*(points.moments[:5] * weight).sum(1).tolist())
 
 
@@ -359,6 +360,7 @@ Number = TypeVar("Number", float, Floats)
 
 
 def _solve(xx: Number, xy: Number, yy: Number, x: Number, y: Number) -> tuple[Number, Number]:
-    """The vector that the symmetric matrix takes to (x, y); of many at once if they are arrays."""
+    """Solve a symmetric 2 × 2 system: the vector that the matrix maps to (x, y); arrays solve many
+    at once."""
     det = xx * yy - xy * xy
     return (yy * x - xy * y) / det, (xx * y - xy * x) / det

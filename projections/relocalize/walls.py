@@ -1,7 +1,7 @@
 """The walls of the occupancy map in re-localisation: poses inside them, and lines of sight.
 
-Walls are looked up in blocks of 8 cm or more (`projections.occupancy`), at points along a line that
-are a block apart. Both ends are left out: poses are a little off, and things stand at walls.
+Walls are looked up in blocks of 8 cm or more (`projections.occupancy`), at points a block apart
+along a line. Both ends are left out: poses have errors, and things stand at walls.
 """
 
 import math
@@ -18,13 +18,13 @@ from .camera import Floats
 _AT_POSE_M: Final = 0.3
 _AT_THING_M: Final = 0.5
 _MOST_POINTS: Final = 200
-"""On a line; a longer one is looked at in larger steps."""
+"""The most points on a line; a longer one is checked in larger steps."""
 
 Flags = NDArray[np.bool_]
 
 
 class Walls(Protocol):
-    """Walls, for many positions at once."""
+    """The interface of walls: look-ups for many positions at once."""
 
     def contains(self, xy: Floats) -> Flags:
         """Which positions (h, 2), in metres, are inside walls."""
@@ -35,7 +35,7 @@ class Walls(Protocol):
 
 
 class WallMap:
-    """The walls of a map."""
+    """The walls of an occupancy map as a grid of blocks."""
 
     def __init__(self, source: OccupancyMap) -> None:
         cells, blocks = wall_blocks(source)
