@@ -225,11 +225,11 @@ def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
 
 
 def _aligned(first: FoldResult, second: FoldResult) -> tuple[FoldResult, FoldResult]:
-    """Both with the keyframes and observations of either, in the order of the log.
+    """Both results over the union of their keyframes and observations, in the order of the log.
 
     Under other settings a log has the same ones; corrections leave some out. A keyframe is known by
-    its event, an observation by its event and det_id. One that a fold leaves out is in no place, or
-    of no object, there.
+    its event, an observation by its event and det_id. A keyframe that one fold left out is in no
+    place in its result, an observation of no object.
     """
     if (
         first.keyframe_offsets == second.keyframe_offsets
@@ -249,7 +249,7 @@ def _observations(result: FoldResult) -> list[tuple[int, DetId]]:
 def _with(
     result: FoldResult, keyframes: list[int], observations: list[tuple[int, DetId]]
 ) -> FoldResult:
-    """The result with these keyframes and observations, among them all of its own."""
+    """The result extended to these keyframes and observations, which include all of its own."""
     own = {offset: ordinal for ordinal, offset in enumerate(result.keyframe_offsets)}
     posed = {result.keyframe_offsets[ordinal] for ordinal in result.posed}
     seen = {key: ordinal for ordinal, key in enumerate(_observations(result))}
