@@ -155,7 +155,7 @@ def test_a_camera_over_zenoh(
     )
     detect.wait_for("detecting in robot/image")
     robot = start(
-        "simulate", *keys, "--fps", "0.2", "--speed", "0", "--connect", endpoint, "--json"
+        "simulate", *keys, "--fps", "0.1", "--speed", "0", "--connect", endpoint, "--json"
     )
     assert robot.wait() == 0, robot.lines
     sent = json.loads(robot.output())["pictures"]

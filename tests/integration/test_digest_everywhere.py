@@ -15,7 +15,7 @@ import pytest
 
 from tests.envelopes import detection, envelope, payload
 from tests.shared_data import shared_run
-from tests.thorough import mostly_slow, stride
+from tests.thorough import mostly_slow, rounds, stride
 
 KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
 PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
@@ -59,7 +59,7 @@ def _synthetic_run() -> list[bytes]:
     rng = np.random.default_rng(4)
     looks = rng.normal(size=(8, 512))
     payloads = []
-    for i in range(300):
+    for i in range(rounds(300, 120)):
         which = [int(w) for w in rng.choice(8, 2, replace=False)]
         seen = [
             detection(f"class {w % 3}", looks[w] + rng.normal(size=512) * 0.8, det_id=f"{i}-{w}")

@@ -184,7 +184,7 @@ def test_nothing_seen_leaves_every_prior() -> None:
 
 
 def test_the_numbers_of_things_do_not_matter() -> None:
-    rows = rows_of(Known(things=40))
+    rows = rows_of(Known(things=rounds(40, 16)))
     other = [row._replace(thing=997 - 7 * row.thing) for row in rows]
     assert read(sightings_of(rows), PRIOR, PRIOR) == read(sightings_of(other), PRIOR, PRIOR)
 

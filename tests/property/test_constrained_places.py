@@ -18,6 +18,7 @@ from projections.reducers.places import Places
 from tests.folds import near_matrix
 from tests.naive_constrained import NaiveConstrainedPlaces
 from tests.property.test_places_are_dbscan import EPS_UM, Point
+from tests.thorough import rounds
 
 Statements = list[tuple[tuple[int, int], bool]]
 
@@ -60,7 +61,7 @@ def worlds(draw: st.DrawFn) -> tuple[list[Point], Statements]:
 @pytest.mark.parametrize("least", [1, 2, 3, 4, 5])
 def test_many_worlds_equal_the_naive_rules(least: int) -> None:
     """Worlds where something is refused are one in two, and small ones take a millisecond."""
-    for seed in (315, *range(1000 * least, 1000 * least + 60)):
+    for seed in (315, *range(1000 * least, 1000 * least + rounds(60, 20))):
         check_plain_distance(*world_of(seed), least)
 
 

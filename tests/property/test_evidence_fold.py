@@ -43,7 +43,7 @@ from tests.folds import (
 )
 from tests.property.test_snapshots import _plain
 from tests.rooms_with_things import drive, drives, long_drive
-from tests.thorough import examples
+from tests.thorough import examples, mostly_slow
 
 EVIDENCE = Settings(fusion="evidence", eps_m=1.0)
 SLOW = settings(
@@ -319,7 +319,7 @@ def test_corrected_poses_give_the_map_of_those_poses_and_carry_positions_along(
         assert found.estimate.est_y == pytest.approx(mine[found.object_id].estimate.est_y, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", mostly_slow([0, 5]))
 def test_maps_of_things_carried_away_are_the_same_whichever_way_they_are_made(seed: int) -> None:
     """Recounted, out of snapshots, out of a history and as `why` tells them."""
     documents = long_drive(seed)
