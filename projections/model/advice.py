@@ -1,5 +1,5 @@
-"""Advice on settings: all poses are in one place, or hardly any is in one; nothing is in the space
-that they name."""
+"""Advice on settings, where all poses are in one place or hardly any is in one, or no vector is of
+the space that the settings name."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -11,7 +11,7 @@ from projections.settings import Settings
 from .view import MapView
 
 LEAST_POSES: Final = 20
-"""With fewer there is nothing to say yet."""
+"""The least number of posed keyframes for which advice is given."""
 _MOSTLY: Final = 0.8
 
 

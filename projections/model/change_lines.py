@@ -1,4 +1,4 @@
-"""What an event changed in the map, as lines for a person."""
+"""The changes of an event as lines of text."""
 
 from collections.abc import Iterable, Iterator
 
@@ -23,7 +23,8 @@ from .view import MapView
 
 
 def change_lines(view: MapView, deltas: Iterable[Delta]) -> Iterator[str]:
-    """A line for each change that a person would ask about; ``view`` has the deltas applied."""
+    """A line for each change of a place, an object's identity or a map; ``view`` has the deltas
+    applied."""
 
     def place(ordinal: PlaceOrdinal) -> str:
         return view.all_places[ordinal].place_id

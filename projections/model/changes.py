@@ -37,8 +37,8 @@ from projections.deltas import (
 from .view import MapView
 
 Embedded: TypeAlias = tuple[ObservationAdded, int]
-"""An observation that has an embedding of the map's space, and when its event was logged, in ns. A
-view that keeps no embeddings has neither."""
+"""An observation with an embedding of the map's space, and the log time of its event, in ns. There
+are none if the view keeps no embeddings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +146,8 @@ class ChangeTracker:
         self._places.add(delta.survivor)
         self._places.update(delta.absorbed)
         for place in delta.absorbed:
-            # Before the view applies it: afterwards they are members of the survivor. A place that
-            # this event has formed is not there yet; a command may join it at once.
+            # Read before the view applies the delta: afterwards they are members of the survivor. A
+            # place that this event has formed is not there yet; a command may join it at once.
             if place < len(self.view.all_places):
                 self._placed.update(self.view.all_places[place].unordered_members)
 

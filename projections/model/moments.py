@@ -1,8 +1,8 @@
 """Times of a timeline for the events of a log.
 
-The times of a timeline never run backwards. Those of a log may: a run of last week is imported
-today, a clock is set. So the time of an event here is the latest stamp of the robots' events up to
-it, which keeps the order of events. mapfold's own events have the time of the one before.
+The times of a timeline never run backwards. Those of a log may: an older run is imported later, or
+a clock is set. So the time of an event here is the latest stamp of the robots' events up to it,
+which keeps the order of events. mapfold's own events have the time of the one before.
 """
 
 from bisect import bisect_right
@@ -19,7 +19,7 @@ def format_of(event: Event) -> MessageFormat | None:
 
 
 class Moments:
-    """Times, ns since the Unix epoch, of the events of a log from its first one on."""
+    """The times of the events of a log, in ns since the Unix epoch; ``events`` are all of them."""
 
     def __init__(self, events: Iterable[Event]) -> None:
         topics: dict[tuple[str, MessageFormat | None], None] = {}
@@ -46,7 +46,7 @@ class Moments:
         return (self.times_ns[0], self.times_ns[-1]) if self.times_ns else (0, 0)
 
     def time_of(self, end: Offset) -> int:
-        """When the map after ``end`` events began to hold."""
+        """The time from which the map after ``end`` events is current."""
         return self.times_ns[end - 1] if end else self.span_ns[0]
 
     def offset_at(self, time_ns: int) -> Offset:

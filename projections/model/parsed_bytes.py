@@ -28,8 +28,8 @@ from .parsing import ParsedEvent, parse_events, parse_map
 
 
 class _Event(msgspec.Struct, array_like=True, gc=False):
-    """An event. A valid envelope, with what else `Accepted` has of it but its vectors; the bytes
-    of one on `MAP_KEY`; the reason of a refusal; nothing for one that a fold passes over."""
+    """An event: a valid envelope with the other fields of `Accepted` but its vectors; the bytes of
+    a map; the reason of a refusal; or nothing for an event that a fold skips."""
 
     offset: Offset
     logged_ns: int
@@ -54,7 +54,7 @@ _decode: Final = msgspec.msgpack.Decoder(list[_Stretch]).decode
 
 
 class Packed(NamedTuple):
-    """Where the part in MessagePack is; the arrays are before it."""
+    """The position of the part in MessagePack; the arrays precede it."""
 
     at: int
     length: int
@@ -87,7 +87,8 @@ def pack(stretches: Iterable[list[Event]], memory: memoryview) -> Packed:
 
 
 def unpack(packed: Packed, memory: memoryview) -> Iterator[list[ParsedEvent]]:
-    """What `pack` was given, parsed, in its stretches. Nothing refers to the memory afterwards."""
+    """The parsed events that `pack` wrote, in its stretches. Afterwards nothing refers to the
+    memory."""
     for stretch in _decode(memory[packed.at : packed.at + packed.length]):
         vectors, units = _read_arrays(stretch.dims, stretch.norms, memory, stretch.at)
         first, events = 0, []
@@ -102,7 +103,7 @@ def unpack(packed: Packed, memory: memoryview) -> Iterator[list[ParsedEvent]]:
 def _write_arrays(
     vectors: list[Vector | None], units: list[Units | None], memory: memoryview, at: int
 ) -> int:
-    """Write the arrays at ``at``; the place after them."""
+    """Write the arrays at ``at`` and return the position after them."""
     total = sum(len(vector) for vector in vectors if vector is not None)
     exact_at = at + 4 * total
     end = exact_at + 4 * total

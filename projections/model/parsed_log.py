@@ -1,10 +1,11 @@
 """The parsed events of a log for one fold, read in this process or ahead of it by other processes.
 
-Reading, checking sums, decompressing and parsing are half of the work of a rebuild and need nothing
-but the event. The fold needs the one before, so it stays in this process, which gets the parsed
-events in the order of the log. The result does not depend on the number of processes: every process
-parses an event alike, and this one reads again whatever another could not read or had not returned
-when it died. So damage is found at the same event, with the same message, as without processes.
+Reading, verifying checksums, decompressing and parsing are half of the work of a rebuild and are
+independent for each event. The fold is sequential, so it stays in this process, which gets the
+parsed events in the order of the log. The result does not depend on the number of processes: every
+process parses an event alike, and this one reads again every range that another could not read or
+had not returned when it died. So damage is reported at the same event, with the same message, as
+without processes.
 
 While the processes start, this one reads the first ranges itself.
 """
@@ -25,11 +26,12 @@ from .parsing_process import ParsingProcess
 
 MAX_WORKERS: Final = 64
 DEFAULT_WORKERS: Final = 4
-"""At most, by default: one is enough for a fold that takes longer than parsing."""
+"""The most processes by default: one is enough for a fold that takes longer than parsing."""
 MIN_EVENTS: Final = 10_000
-"""Of a log that is worth a process, which takes half a second of another processor to start."""
+"""Events of a log from which a further process pays; its start takes half a second of another
+processor."""
 EVENTS_PER_WORKER: Final = 5_000
-"""For each process that is started."""
+"""Events for each further process."""
 _RANGE_BYTES: Final = 768 * 1024
 
 
@@ -92,7 +94,7 @@ class ParsedLog:
         ranges: Iterator[tuple[Offset, Offset]],
         asked: deque[tuple[Offset, Offset, ParsingProcess]],
     ) -> None:
-        """Have the processes parse further ranges, those first that have least to do."""
+        """Assign further ranges to the processes, first to those with the fewest."""
         while free := [process for process in self._alive if self._can_take_more(process)]:
             following = next(ranges, None)
             if following is None:
@@ -126,6 +128,7 @@ class ParsedLog:
         self.lost += 1
 
     def _here(self, start: Offset, end: Offset) -> Iterator[list[ParsedEvent]]:
-        """Read and parse in this process. As if to the end of all, which messages of damage say."""
+        """Read and parse in this process. The reader's range ends at the end of the log, so that
+        messages of damage are the same as without processes."""
         events = self._reader.read(start, self._end)
         yield from parsed_stretches(islice(events, end - start))

@@ -1,6 +1,6 @@
 """Parsing events of a log for a fold: validate, decode vectors, and make unit vectors of them.
 
-Each event is parsed for itself, whatever came before it, so several processes can do it.
+Parsing an event does not depend on earlier ones, so several processes can share the work.
 """
 
 import sys

@@ -1,8 +1,8 @@
 """A process that parses ranges of a log for the process that folds it.
 
-It is asked for a range of offsets, parses it into one of the slots of a shared memory, and answers
-where in the slot. It writes nothing else anywhere, so it may be killed at any moment. If it cannot
-read a range, it says so and no more: who asked reads that range again and finds out why.
+It receives a range of offsets, parses it into one of the slots of a shared memory, and replies with
+the position in the slot. It writes nothing else, so it may be killed at any moment. If it cannot
+read a range, it only reports that; the folding process reads the range again and gets the error.
 """
 
 import contextlib
@@ -25,10 +25,10 @@ from .parsed_bytes import NoRoom, Packed, pack, unpack
 from .parsing import READ_AHEAD, ParsedEvent
 
 SLOTS: Final = 4
-"""Ranges that one process may be ahead."""
+"""The most ranges that a process has parsed ahead of the fold."""
 SLOT_BYTES: Final = 8 * 1024 * 1024
-"""Five times what a range takes if it is of detections with embeddings and nothing else. Memory is
-used only as far as it is written."""
+"""Bytes of a slot: five times those of a range of detections with embeddings only. Memory is used
+only as far as it is written."""
 PATIENCE_S: Final = 60.0
 """How long to wait for one range, of which an idle machine parses a hundred a second."""
 _PROGRAM: Final = (
@@ -56,7 +56,7 @@ class ParsingProcess(WorkerProcess):
 
     @property
     def waiting(self) -> int:
-        """How many ranges it has been asked for that have not been taken."""
+        """The number of ranges that were assigned and not yet taken."""
         return len(self._asked)
 
     def can_take_more(self) -> bool:
@@ -67,14 +67,14 @@ class ParsingProcess(WorkerProcess):
         return self._is_ready and bool(self._slots)
 
     def ask(self, start: Offset, end: Offset) -> None:
-        """Have it parse a range. Raises ProcessGone."""
+        """Assign a range. Raises ProcessGone."""
         slot = self._slots.popleft()
         self._asked.append(slot)
         self.send(_QUESTION.pack(slot, start, end))
 
     def take(self) -> Iterator[list[ParsedEvent]] | None:
-        """The range that was asked for first, to be read to its end before another is taken; None
-        if the process could not read it. Raises ProcessGone."""
+        """The events of the oldest assigned range, to be read to the end before the next call; None
+        if the process could not read them. Raises ProcessGone."""
         if not self.has_answer(PATIENCE_S):
             raise ProcessGone(f"no answer for {PATIENCE_S:.0f} s")
         packed = Packed(*_ANSWER.unpack(self.receive()))
@@ -119,7 +119,8 @@ def _parse(reader: LogReader, start: Offset, end: Offset, slot: memoryview) -> P
 
 
 def _in_order(events: Iterator[Event], start: Offset, end: Offset) -> Iterator[Event]:
-    """The events. Raises NoRoom where they are not all of them, as of a log that was cut."""
+    """Pass the events on. Raises NoRoom if some of the range are missing, as in a log that was
+    cut."""
     at: int = start
     for event in events:
         yield event

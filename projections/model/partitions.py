@@ -31,8 +31,8 @@ class Regrouping:
 
 @dataclass(frozen=True, slots=True)
 class PartitionComparison:
-    """``splits`` are groups of the first that fall apart in the second; ``joins`` are groups of the
-    second made of several of the first. Pieces come largest first. ``grouped_once`` counts the
+    """``splits`` are groups of the first that are divided in the second; ``joins`` are groups of
+    the second made of several of the first. Pieces come largest first. ``grouped_once`` counts the
     things that are in a group of one partition and in none of the other."""
 
     things: int

@@ -1,4 +1,4 @@
-"""How many Objects of each class are in each place, kept up to date with every change of an Object.
+"""Counts of Objects by place and class, updated with every change of an Object.
 
 An Object counts for the place that it is located in, by its class; one that was observed once is
 counted apart (`projections.place_types.ONCE`). ``touched`` are the places whose counts have changed
@@ -22,7 +22,7 @@ class PlaceContents:
         self.touched: set[PlaceOrdinal] = set()
 
     def update(self, found: ObjectRecord) -> None:
-        """The Object as it is now is counted instead of as it was."""
+        """Replace the Object's earlier count by its current one."""
         place = found.place
         now = None if place is None else (place, found.class_name, found.obs_count > 1)
         before = found.counted_as

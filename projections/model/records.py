@@ -119,7 +119,8 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where an Object stands, with its covariance in µm²; seen from ``spots`` places to stand."""
+    """An Object's estimated position with its covariance in µm²; it was seen from ``spots``
+    spots."""
 
     x_um: int
     y_um: int
@@ -157,7 +158,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Relocation:
-    """An Object stands elsewhere since ``observation``, of the event at ``offset``."""
+    """An Object was found at another position by ``observation``, of the event at ``offset``."""
 
     offset: Offset
     observation: ObservationOrdinal
@@ -172,9 +173,9 @@ class ObjectRecord:
     """A landmark. ``observations`` are ordinals in the order in which they were fused.
 
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
-    those of fusion by evidence: ``misses`` is in how many keyframes of a run it should have been
-    seen and was not, ``missing_in`` the run in which that was often enough to call it missing.
-    ``counted_as`` is how `PlaceContents` counts it.
+    those of fusion by evidence: ``misses`` is the number of keyframes of a run that should show it
+    and do not, ``missing_in`` the run by which it is missing. ``counted_as`` is how `PlaceContents`
+    counts it.
     """
 
     ordinal: ObjectOrdinal
@@ -195,7 +196,7 @@ class ObjectRecord:
 
     @property
     def spot(self) -> tuple[float, float]:
-        """Where it stands by estimate, metres; without one `mean_x` and `mean_y`."""
+        """The estimated position in metres; without an estimate `mean_x` and `mean_y`."""
         at = self.estimate
         return (self.mean_x, self.mean_y) if at is None else (at.est_x, at.est_y)
 

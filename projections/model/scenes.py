@@ -1,4 +1,4 @@
-"""A fold event by event, and after which events a recording of it shows the whole map."""
+"""A fold event by event, with the events after which a recording shows the whole map."""
 
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
@@ -15,12 +15,12 @@ from .space_vectors import new_map
 from .view import MapView
 
 SCENES: Final = 500
-"""Scenes of a recording unless ``every`` is given; each holds the whole map."""
+"""The default number of scenes of a recording; each holds the whole map."""
 
 
 class Step(NamedTuple):
-    """An event that was folded: its time on a timeline (`Moments`), what it changed, and whether a
-    scene is due after it."""
+    """A folded event: its time on a timeline (`Moments`), its deltas, and whether a scene is due
+    after it."""
 
     event: Event
     time_ns: int

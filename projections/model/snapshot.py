@@ -50,11 +50,12 @@ _ALWAYS_ALLOWED_BYTES = 64 * 1024 * 1024
 """A snapshot that decompresses to more than this, and to more than `_MAX_RATIO` times its size, is
 refused. Those measured decompress to four times their size."""
 _NONE = -1
-"""What the packed columns of a view hold for None."""
+"""The value for None in the packed columns of a view."""
 
 
 class MalformedSnapshot(ValueError):
-    """These bytes are no snapshot of this version, or a damaged one; the message says how."""
+    """Raised for bytes that are no snapshot of this version, or a damaged one; the message says
+    how."""
 
 
 def pack(values: State) -> bytes:
@@ -79,7 +80,7 @@ def pack(values: State) -> bytes:
 
 
 def unpack(data: bytes) -> State:
-    """What `pack` was given. Raises MalformedSnapshot."""
+    """The values of `pack`. Raises MalformedSnapshot."""
     head = len(MAGIC) + hashlib.sha256().digest_size
     if not data.startswith(MAGIC):
         raise MalformedSnapshot("it does not begin like a snapshot of this version")
@@ -140,7 +141,7 @@ def dump_view(view: MapView) -> State:
 
 
 def load_view(view: MapView, state: State) -> None:
-    """Fill a new view with what `dump_view` gave."""
+    """Fill a new view with the columns of `dump_view`."""
     view.next_offset = state["next_offset"]
     view.skipped = state["skipped"]
     view.runs = [RunRecord(RunOrdinal(i), *row) for i, row in enumerate(state["runs"])]
@@ -269,7 +270,7 @@ def _load_objects(view: MapView, state: State) -> None:
 
 
 def _dump_evidence(view: MapView) -> State:
-    """Facts of fusion by evidence about Objects; nothing under the page's rule."""
+    """Facts of fusion by evidence about Objects; nothing under ``fusion = "page"``."""
     if view.settings.fusion != "evidence":
         return {}
     return {
@@ -302,7 +303,7 @@ def _load_places(view: MapView, rows: list[list[Any]]) -> None:
 
 
 FOLD_VERSION = 5
-"""Raise it with every change of the reducers after which the same log gives another map."""
+"""To be raised with every change of the reducers that changes the map of some log."""
 
 
 def snapshot_fingerprint(settings: Settings, corrections: Corrections) -> str:

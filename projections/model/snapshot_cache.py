@@ -1,9 +1,9 @@
 """The cache of snapshots beside a log: ``<log>.snapshots/<fingerprint>-<offset>.map``.
 
-Files appear whole (written beside, then renamed) and are never changed. A failure of the cache is
+Files are written under another name and renamed, and never changed. A failure of the cache is
 reported as a note and makes the fold slower, but never fails it. A snapshot of events that the log
-has lost since, by recovery or deletion, is not used. For each set of settings and corrections a
-few snapshots are kept: the newest, and others spread out below it.
+has lost since, by recovery or deletion, is not used. For each set of settings and corrections a few
+snapshots are kept: the newest, and others spread out below it.
 """
 
 import os

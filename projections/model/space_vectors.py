@@ -1,5 +1,5 @@
-"""Embedding spaces of a log: the vectors that its ``reembed`` commands put into force, for the maps
-of their space, and how many detections have a vector of each space."""
+"""Embedding spaces of a log: the vectors added by its ``reembed`` commands, and the number of
+detections with a vector of each space."""
 
 import hashlib
 import sys

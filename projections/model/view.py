@@ -1,7 +1,7 @@
 """The map as data, built from deltas alone.
 
-A view knows no reducer: the same deltas, from a live fold, from a log or from a test's hand, give
-the same view. Applying a delta twice does no harm. A merge moves the smaller member list into the
+A view does not depend on reducers: the same deltas, from a live fold, a log or a test, give the
+same view. Applying a delta twice does no harm. A merge moves the smaller member list into the
 larger one and leaves keyframes with the place they joined; `KeyframeRecord.place` looks its
 survivor up, so a merge costs little however many keyframes move.
 """
@@ -38,13 +38,13 @@ class MapView:
     """A whole map state. Read its attributes; change it by `apply` and `advance` only.
 
     ``runs``, ``keyframes`` and ``observations`` are lists indexed by ordinal. ``places`` are those
-    not absorbed, by ordinal, ascending; ``all_places`` also the absorbed, and ``survivors`` what
-    these are part of now. So are ``objects``, ``all_objects`` and ``object_survivors``.
+    not absorbed, by ordinal, ascending; ``all_places`` also has the absorbed ones, whose survivors
+    ``survivors`` gives. Likewise ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
-    ``floors`` numbers the floors that have a name by their first keyframe. ``maps`` are the
-    last occupancy maps by the floor that they name, each with the offset of its event.
-    ``next_offset`` is the number of events that went into the view; ``corrections`` are those they
-    were folded under.
+    ``floors`` numbers the floors that have a name by their first keyframe. ``maps`` are the last
+    occupancy maps by the floor that they name, each with the offset of its event. ``next_offset``
+    is the number of events that went into the view; ``corrections`` are those they were folded
+    under.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class MapView:
         return None
 
     def keep_digest(self, digest: str) -> None:
-        """Keep the digest, if this view comes from where one can be kept."""
+        """Keep the digest, if the view has a cache for it; this one has none."""
 
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
@@ -349,8 +349,8 @@ class MapView:
     }
 
     def counts(self) -> dict[str, int]:
-        """How many of everything; the eight in capitals are the graph's edges by label. What
-        corrections leave out is counted at the end, where there is any."""
+        """Counts by name; the eight in capitals are of the graph's edges by label. Things that
+        corrections leave out are counted at the end, if there are any."""
         posed, fused, foreign = self._sums()
         placed = sum(p.keyframe_count for p in self.places.values())
         return {

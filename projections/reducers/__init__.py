@@ -5,7 +5,7 @@ from collections.abc import MutableSequence
 from typing import Any, Literal, TypeAlias
 
 State: TypeAlias = dict[str, Any]
-"""What a reducer hands to a snapshot: named values, each a numpy array or JSON."""
+"""The state of a reducer in a snapshot: named values, each a numpy array or JSON."""
 
 
 def packed(typecode: Literal["i", "q"], content: bytes = b"") -> MutableSequence[Any]:
@@ -20,6 +20,6 @@ def prefixed(name: str, state: State) -> State:
 
 
 def part(name: str, state: State) -> State:
-    """What `prefixed` put in under ``name``."""
+    """The values that `prefixed` stored under ``name``."""
     start = f"{name}."
     return {key.removeprefix(start): v for key, v in state.items() if key.startswith(start)}

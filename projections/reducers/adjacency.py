@@ -4,9 +4,9 @@
 keyframe_id order whatever order they arrived in and with noise skipped, whose places are A and B,
 A ≠ B, in either direction and by their *current* labels. So it always equals a recount:
 
-* a keyframe that gets a place comes between its two neighbours in the run: their own transition
-  goes, two new ones come;
-* when B is absorbed by A, A–B transitions are inside a place now and vanish; B–C become A–C.
+* a keyframe that gets a place is inserted between its two neighbours in the run: their transition
+  is replaced by two new ones;
+* when B is absorbed by A, A–B transitions are dropped (both ends are in A); B–C become A–C.
 """
 
 from array import array
@@ -25,7 +25,7 @@ _BLOCK = 2048
 
 
 class SortedKeys:
-    """Places by int64 key, sorted; adding a key gives the labels around it.
+    """A sorted map from int64 keys to places; adding a key returns the places of its neighbours.
 
     Blocks of at most 2,048 keys: adding in order appends to the last one, adding out of order moves
     at most one block's worth of memory. No key is ever added twice or removed.
@@ -39,7 +39,8 @@ class SortedKeys:
         self._firsts: list[int] = []
 
     def add(self, key: int, label: PlaceOrdinal) -> tuple[PlaceOrdinal | None, PlaceOrdinal | None]:
-        """Add a new key; the labels of the keys just before and after it, None at the ends."""
+        """Add a new key and return the labels of the keys just before and after it, None at the
+        ends."""
         if not self._keys:
             self._open_block(key, label)
             return None, None
@@ -57,7 +58,7 @@ class SortedKeys:
         return around
 
     def _append(self, key: int, label: PlaceOrdinal) -> PlaceOrdinal:
-        """Add a key above all others; the label of the one before."""
+        """Add a key above all others and return the label of the one before."""
         keys, labels = self._keys[-1], self._labels[-1]
         before = labels[-1]
         if len(keys) == _BLOCK:
@@ -113,7 +114,8 @@ class SortedKeys:
 
 
 class Adjacency:
-    """The reducer. Tell it of merges and placings in order; then `collect_changes`."""
+    """The reducer of adjacency. Merges and placings are reported to it in order, before
+    `collect_changes`."""
 
     def __init__(self) -> None:
         self.placed: dict[RunOrdinal, SortedKeys] = {}  # keyframe_id → place it joined
@@ -124,7 +126,7 @@ class Adjacency:
         self._before: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
 
     def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
-        """The absorbed places' transitions are the survivor's now."""
+        """Count the transitions of absorbed places for the survivor."""
         self.survivors.merge(survivor, absorbed)
         for place in absorbed:
             for other, count in sorted(self.edges.get(place, {}).items()):
@@ -136,7 +138,7 @@ class Adjacency:
     def keyframe_placed(
         self, run: RunOrdinal, keyframe_id: KeyframeId, place: PlaceOrdinal
     ) -> None:
-        """A keyframe that had no place, perhaps because it is new, has one."""
+        """Count the transitions of a keyframe that had no place until now."""
         placed = self.placed.get(run)
         if placed is None:
             placed = self.placed[run] = SortedKeys()
@@ -152,7 +154,7 @@ class Adjacency:
             self._add(place, after, 1)
 
     def collect_changes(self, offset: Offset) -> list[PlacesLinked]:
-        """The edges whose count differs from that at the last call, ascending."""
+        """The edges whose count changed since the last call, ascending."""
         if not self._before:
             return []
         linked = []
@@ -164,7 +166,7 @@ class Adjacency:
         return linked
 
     def dump(self) -> State:
-        """Everything, for a snapshot: the same for equal states, however they were reached."""
+        """The whole state, for a snapshot: the same for equal states, however they were reached."""
         columns = {run: placed.columns() for run, placed in sorted(self.placed.items())}
         edges = [[a, b, n] for a, row in self.edges.items() for b, n in row.items() if a < b]
         return {
@@ -176,7 +178,7 @@ class Adjacency:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         start = 0
         for run, count in state["placed"]:
             keys = array("q", state["keys"][start : start + count].tobytes())

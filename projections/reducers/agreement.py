@@ -1,7 +1,7 @@
-"""How much a sight and an estimate speak for one thing: the logarithm of a likelihood ratio.
+"""Agreement of a sight and an estimate: the log-likelihood ratio of their being of one thing.
 
-The numerator is the density of what the camera measured if the thing stands where the estimate
-says, with the errors of both; the denominator that for another thing somewhere in view. Four parts:
+The numerator is the density of the camera's measurement if the thing is at the estimate, with the
+errors of both; the denominator the density for another thing somewhere in view. Four parts:
 
 bearing     variance: the estimate's across the ray, bearing and pose error; another thing: anywhere
             in the picture
@@ -28,35 +28,36 @@ from .spots import LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 Floats = NDArray[np.float64]
 _WORST_CHI2 = 16.0
 _ANYWHERE = -1.5
-"""log(0.56 rad / √2π): in front of one another for a picture, things are not spread evenly."""
+"""log(0.56 rad / √2π), the density of another thing's bearing: things are not spread evenly over a
+picture."""
 _SIZE = 0.15
-"""A little more than in the estimate, where the error of a mean counts."""
+"""Standard deviation of log size; above that of the estimate, which is of a mean."""
 _OTHER_SIZES = 0.36
 _WORST_PART = -12.0
-"""Limit of the evidence of box height or elevation against a thing, times two."""
+"""The least that box height or elevation can add to a ratio, times two."""
 _SIZE_KNOWN = 0.3
 _BEHIND_M2 = 0.04
 _SLOPE_GUESS, _GUESS_PAIRS = 0.01, 10.0
 LEAST_AGREEMENT = -5.0
-"""Below it the sight alone rules a pair out."""
+"""A pair with a lower ratio is ruled out."""
 _FEW = 16
 _SEEN = 13
 _SLACK, _SLACK_CHI2, _SLACK_M2 = 1.001, 0.01, 1e-4
 
 
 class Slopes:
-    """How much the slopes of two boxes in one picture differ: the mean square."""
+    """The mean squared difference of the slopes of two boxes in one picture."""
 
     def __init__(self) -> None:
         self._sum, self._count = _SLOPE_GUESS * _GUESS_PAIRS, _GUESS_PAIRS
 
     @property
     def mean_square(self) -> float:
-        """A guess that ten pairs outweigh, at first."""
+        """The mean square; starts from a guess that weighs as much as ten pairs."""
         return self._sum / self._count
 
     def learn(self, sights: Sequence[Sight]) -> None:
-        """Take in a picture."""
+        """Count the pairs of boxes of a picture."""
         slopes = [sight.slope for sight in sights if sight.log_height is not None]
         for index, one in enumerate(slopes):
             for other in slopes[:index]:
@@ -64,11 +65,11 @@ class Slopes:
                 self._count += 1.0
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {"sums": [self._sum, self._count]}
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._sum, self._count = state["sums"]
 
 
@@ -96,8 +97,8 @@ class Agreement:
     def pairs(self, estimates: Floats, sights: Sequence[Sight], slopes: float) -> Pairs:
         """The pairs whose ratio is above `LEAST_AGREEMENT`; `is_ruled_out` may still rule some of
         them out. ``estimates`` has a row for each one; the sights are of one picture."""
-        # What speaks for a pair at most: twice its ratio, less χ² of the bearing and the logarithm
-        # of the variance of the bearing.
+        # Upper bound of twice a pair's ratio, without χ² of the bearing and the logarithm of its
+        # variance.
         most = 2.0 * (_ANYWHERE - LEAST_AGREEMENT)
         most_whole = most + log_of(1.0 + _OTHER_SIZES / (_SIZE * _SIZE))
         most_whole += log_of(1.0 + slopes / LEAST_ELEVATION_M2)
@@ -119,8 +120,8 @@ class Agreement:
         return Pairs(rows.take(kept), columns.take(kept).tolist(), ratios.take(kept).tolist())
 
     def is_ruled_out(self, estimate: Estimate, sight: Sight) -> bool:
-        """Whether the estimate is out of reach, or the bearing alone rules the pair out: what it is
-        at its best, if the estimate is as unsure in every direction as in all together."""
+        """Whether the estimate is out of reach, or the bearing alone rules the pair out even if the
+        estimate's variance across the ray were its total variance."""
         dx, dy = estimate[0] - sight[0], estimate[1] - sight[1]
         if dx * dx + dy * dy > self._reach_m2:
             return True
@@ -133,7 +134,7 @@ class Agreement:
         return ahead < 0.0 and ahead * ahead >= _WORST_CHI2 * (trace + _BEHIND_M2)
 
     def _row_of(self, sight: Sight, most: float, most_whole: float) -> tuple[float, ...]:
-        """What is compared of a sight: `_SEEN` numbers for `_ratios`, then those for `_sieve`."""
+        """A sight as a row: `_SEEN` numbers for `ratios`, then those for `_sieve`."""
         x, y, cos, sin, per_m2, least, height, slope, *_ = sight
         if height is None:
             height, slope, whole = 0.0, 0.0, 0.0
@@ -151,8 +152,8 @@ class Agreement:
         )
 
     def _sieve(self, estimates: Floats, seen: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The pairs whose ratio is above `LEAST_AGREEMENT` and that are within reach, and some
-        more; quick, since most pairs are far from it.
+        """A quick filter: all pairs within reach whose ratio is above `LEAST_AGREEMENT`, and some
+        more.
 
         A product of matrices gives, for each pair, the distance ahead, that across, and the most χ²
         that a pair can have times the estimate's variance across. The slack is far above its
@@ -175,7 +176,7 @@ class Agreement:
         return rows, columns
 
     def ratio(self, estimate: Sequence[float], seen: Sequence[float], slopes: float) -> float:
-        """`ratios` of one pair, to the last bit; quicker for few."""
+        """`ratios` of one pair, equal to the last bit; quicker for few pairs."""
         x, y, xx, xy, yy, size, size_x, size_y, size_variance, *elevation = estimate
         px, py, cos, sin, cc, twice_cs, ss, _, per_m2, least, height, slope, whole = seen[:_SEEN]
         dx, dy = x - px, y - py

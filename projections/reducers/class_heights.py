@@ -1,10 +1,9 @@
-"""How tall the things of a class are and how high they stand, learned from the map.
+"""Heights of the things of a class, and of their centres above the camera, learned from the map.
 
 A thing whose estimate is sure gives its class the logarithm of its size and its elevation. The next
-thing of the class starts from their mean, so that one box that is not cut tells how far away it
-stands. The sums are integers, and a thing's older values are taken out before it gives new ones:
-the result depends on what the things say now and not on the order in which they said it.
-Elevations are metres above the camera.
+thing of the class starts from their mean, so that one uncut box gives its distance. The sums are
+integers, and a thing's older values are subtracted before new ones are added: the result depends on
+the latest values only, not on their order. Elevations are metres above the camera.
 """
 
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from projections.reducers import State
 
 _UNIT = 1 << 16
 _UNKNOWN = 3.0
-"""How many things the prior spread counts for."""
+"""The number of things that the prior spread weighs as much as."""
 _SPREAD = 0.3
 _SURE_M2 = 0.15
 _SURE_SIZE = 0.1
@@ -31,7 +30,7 @@ class HeightPrior(NamedTuple):
 
 
 Given = tuple[str, int, int]
-"""What a thing gave: class name, log size and elevation in units of 2⁻¹⁶."""
+"""The values that a thing added: class name, log size and elevation in units of 2⁻¹⁶."""
 UNKNOWN_CLASS = HeightPrior(-0.4, 2.0, 0.0, 0.25)
 
 
@@ -47,7 +46,7 @@ class ClassHeights:
         self._sums: dict[str, list[int]] = {}
 
     def prior(self, class_name: str) -> HeightPrior:
-        """What is known of a thing of this class before it is looked at."""
+        """The prior of a thing of this class."""
         stated = self._stated.get(class_name, UNKNOWN_CLASS)
         sums = self._sums.get(class_name)
         if sums is None or sums[0] == 0:
@@ -72,7 +71,8 @@ class ClassHeights:
         variance_m2: float,
         spots: int,
     ) -> Given | None:
-        """Replace what a thing gave before; nothing if it is not sure enough now."""
+        """Replace the values that a thing added before; by nothing if its estimate is not sure
+        enough."""
         if spots < 2 or variance_m2 >= _SURE_M2 or size_variance >= _SURE_SIZE:
             if before is not None:
                 self._add(before, -1)
@@ -85,7 +85,7 @@ class ClassHeights:
         return given
 
     def remove(self, given: Given) -> None:
-        """Remove what a thing gave."""
+        """Subtract the values that a thing added."""
         self._add(given, -1)
 
     def _add(self, given: Given, sign: int) -> None:
@@ -100,11 +100,11 @@ class ClassHeights:
         sums[4] += sign * elevation * elevation
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {"sums": sorted([name, *sums] for name, sums in self._sums.items())}
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._sums = {name: list(sums) for name, *sums in state["sums"]}
 
 

@@ -72,7 +72,7 @@ class ConstrainedObjects(Objects):
         return deltas
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return super().dump() | {
             "other_classes": [[*o.other_classes] for o in self.sums],
             "object_of": sorted(map(list, self._object_of.items())),
@@ -80,7 +80,7 @@ class ConstrainedObjects(Objects):
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         super().load(state)
         for index, classes in enumerate(state["other_classes"]):
             for class_name in classes:
@@ -131,7 +131,7 @@ class ConstrainedObjects(Objects):
         )
 
     def _add_class(self, ordinal: ObjectOrdinal, class_name: str) -> None:
-        """The Object has a member of this class."""
+        """Add a class of which the Object has a member."""
         sums = self.sums[ordinal]
         if class_name not in (sums.class_name, *sums.other_classes):
             self._unlist(ordinal, sums)

@@ -1,6 +1,6 @@
 """Places under ``keep-apart``, ``undo-merge`` and ``join``: constrained online DBSCAN.
 
-The rules of `projections.reducers.places` hold, which these places take the code of, and besides:
+The rules of `projections.reducers.places` hold, whose code is reused, and further:
 
 7.  *Anchors* are the keyframes that the commands name. An anchor is in the place that it belongs to
     by the rules. Places with anchors that are kept apart *conflict*; they are never merged. Which
@@ -72,7 +72,8 @@ class Refusal(NamedTuple):
 
 
 class ConstrainedPlaces(Places):
-    """The reducer under pairs of anchors. Tell it of an anchor's keyframe before it is folded."""
+    """The reducer of places under pairs of anchors. `add_anchor` precedes `fold` of the anchor's
+    keyframe."""
 
     def __init__(self, core_index: CoreIndex, groups: PairGroups[Keyframe]) -> None:
         super().__init__(core_index)
@@ -85,7 +86,7 @@ class ConstrainedPlaces(Places):
         self._undecided: list[int] = []  # anchors that are not core and could join a place
 
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
-        """A keyframe that may be an anchor."""
+        """Register a keyframe as an anchor, if it is one."""
         self._anchors.add(keyframe, anchor)
 
     def fold(self, posed: PosedKeyframe) -> list[Delta]:
@@ -97,11 +98,11 @@ class ConstrainedPlaces(Places):
         return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um))
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return super().dump() | self._anchors.dump()
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         super().load(state)
         self._anchors.load(state, self.place_of)
 
@@ -173,11 +174,11 @@ class ConstrainedPlaces(Places):
             yield from self._split(fresh)
         elif len(parts) == 1:
             yield parts[0]
-        else:  # each must see what the one before has merged
+        else:  # lazily: each uses the merges of the one before
             yield from super()._parts(newcomer, fresh)
 
     def _has_conflict(self, fresh: list[int], parts: list[Part]) -> bool:
-        """Whether any two things that the fresh core points touch may not come together."""
+        """Whether any two places or anchors that the fresh core points touch are kept apart."""
         touched = {place for part in parts for place in part.touched}
         sides = [inside for place in touched if (inside := self._anchors.inside(place))]
         sides += [self._own(p) for p in fresh if self._is_new_anchor(p)]
@@ -209,8 +210,8 @@ class ConstrainedPlaces(Places):
         return self._parts_of(forest, ranks, links, fresh)
 
     def _fresh_cells(self, fresh: list[int]) -> dict[int, Rank]:
-        """The ranks of the cells with fresh core points. The first core point of a fresh one that
-        has a place already is made one of that place."""
+        """The ranks of the cells with fresh core points. In a fresh cell with points of a place, a
+        point of that place is made the first core point."""
         cells: dict[int, list[int]] = {}
         for point in fresh:
             cells.setdefault(self.core_index.first_core(point), []).append(point)
@@ -229,7 +230,7 @@ class ConstrainedPlaces(Places):
         return ranks
 
     def _cell_links(self, fresh: list[int], ranks: dict[int, Rank]) -> Iterator[CellLink]:
-        """The links that fresh core points make between cells, one for each two cells."""
+        """The links that fresh core points make between cells, one for each pair of cells."""
         index, seen = self.core_index, set[tuple[int, int]]()
         for core in fresh:
             own = index.first_core(core)
@@ -320,7 +321,7 @@ class ConstrainedPlaces(Places):
         return self.keyframes[point] in self._anchors and self.joined[point] == NOISE
 
     def _own(self, point: int) -> Inside:
-        """What a place of this anchor alone has inside."""
+        """The anchors in a place that holds only this anchor."""
         return self._anchors.own(self.keyframes[point])
 
     def _enter_point(self, point: int, place: PlaceOrdinal) -> None:
@@ -332,7 +333,7 @@ def _both_ways(link: CellLink) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 class _Forest:
-    """What was linked so far, as union-find by rank; a root is the earliest. ``inside`` are the
+    """The links so far, as union-find by rank; a root is the earliest member. ``inside`` are the
     anchors below each root."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Incremental core-point index for plain distance: which points are core, and which clusters touch.
+"""Incremental index of core points under Euclidean distance, and of which clusters touch.
 
 Points live in the cells of a grid. The cells are so small that all points of one are neighbours:
 two points of a half-open integer cell of side s differ by at most s - 1 in each axis, so with
@@ -42,7 +42,7 @@ def cell_side_um(eps_um: int) -> int:
 
 _SCAN_POINTS = 4096
 _NUMPY_FROM = 24
-"""Points; with fewer, a loop is quicker than four numpy calls."""
+"""The number of points below which a loop is quicker than four numpy calls."""
 _NO_POINT = -1
 
 
@@ -51,7 +51,7 @@ class Cell:
 
     ``near`` are the existing cells that may hold neighbours; ``unlinked`` those of them that are
     not known to be one cluster with this cell, see `CoreIndex.mark_one_cluster`. ``sides`` are the
-    reach indexes of a dense cell, made when asked for.
+    reach indexes of a dense cell, made on first use.
     """
 
     __slots__ = (
@@ -95,7 +95,7 @@ class CoreIndex:
         self._newest: Cell | None = None  # where the last point went
 
     def insert(self, x_um: int, y_um: int) -> list[int]:
-        """Add a point; the indices of the points that became core by it, ascending."""
+        """Add a point and return the indices of the points that it made core, ascending."""
         point = len(self.x)
         self.x.append(x_um)
         self.y.append(y_um)
@@ -131,8 +131,8 @@ class CoreIndex:
         return cell.core
 
     def enclosing_core_beside(self, point: int, settled: Container[tuple[int, int]]) -> int | None:
-        """As `enclosing_core`, but other clusters may be near: out of the point's reach, or by
-        ``settled``, pairs of first core points of cells that will never be one cluster."""
+        """As `enclosing_core`, but other clusters may be near if they are out of the point's reach
+        or in ``settled``: pairs of first core points of cells that will never be one cluster."""
         cell = self._cell_of(point)
         if cell.core in (point, _NO_POINT) or cell.non_core:
             return None
@@ -154,11 +154,11 @@ class CoreIndex:
         return self.squared_distance(a, b) <= self._eps2
 
     def first_core(self, core: int) -> int:
-        """The first core point of a core point's cell, which stands for the cell."""
+        """The first core point of a core point's cell, which represents the cell."""
         return self._cell_of(core).core
 
     def put_first(self, core: int) -> None:
-        """Let a core point stand for its cell."""
+        """Make a core point the representative of its cell."""
         self._cell_of(core).core = core
 
     def cores_around(self, point: int) -> list[tuple[int, Cell | None]]:
@@ -176,8 +176,8 @@ class CoreIndex:
         return around
 
     def mark_one_cluster(self, point: int, cell: Cell) -> None:
-        """``cell`` and the core point's own cell are one cluster, and stay so: leave ``cell`` out
-        of `cores_around` from now on."""
+        """Record that ``cell`` and the core point's own cell are one cluster for good:
+        `cores_around` leaves ``cell`` out from now on."""
         own = self._cell_of(point)
         if cell in own.unlinked:
             own.unlinked.remove(cell)
@@ -201,7 +201,7 @@ class CoreIndex:
         return around
 
     def dump(self) -> State:
-        """Everything, for a snapshot. Cells come in the order in which they were made."""
+        """The whole state, for a snapshot. Cells come in the order in which they were made."""
         cells = self._cells.values()
         sparse = [point for cell in cells for point in cell.cores]
         return {
@@ -214,7 +214,7 @@ class CoreIndex:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave. Links between cells and reach indexes are computed again."""
+        """Restore the state of `dump`. Links between cells and reach indexes are computed again."""
         self.x = array("q", state["x"].tobytes())
         self.y = array("q", state["y"].tobytes())
         self._counts = dict(zip(state["loose"].tolist(), state["counts"].tolist(), strict=True))
@@ -252,8 +252,8 @@ class CoreIndex:
         return cell
 
     def _count_for_near(self, cell: Cell, x_um: int, y_um: int) -> list[int]:
-        """Count the newcomer as a neighbour of non-core points in the near cells; those that
-        became core by it."""
+        """Count the newcomer as a neighbour of non-core points in the near cells; return those it
+        made core."""
         fresh = []
         for near in cell.near:
             if near.non_core:
@@ -281,7 +281,7 @@ class CoreIndex:
             cell.core = promoted[0]
 
     def _make_dense(self, cell: Cell) -> list[int]:
-        """Make all points of the cell core; those that were not, without the newest."""
+        """Make all points of the cell core; return those that were not, without the newest."""
         fresh = cell.non_core
         for point in fresh:
             del self._counts[point]
@@ -293,8 +293,8 @@ class CoreIndex:
         return fresh
 
     def _insert_sparse(self, cell: Cell, point: int) -> list[int]:
-        """Count the neighbours of the newcomer, the last of ``cell.points``, and add it to those of
-        its cell's non-core points; the points that became core by it."""
+        """Count the neighbours of the newcomer, the last of ``cell.points``, and count it for its
+        cell's non-core points; return the points that it made core."""
         fresh = [other for other in cell.non_core if self._add_neighbour(other)]
         count = len(cell.points)
         for near in cell.near:
@@ -310,7 +310,7 @@ class CoreIndex:
         return fresh
 
     def _count_within(self, cell: Cell, x_um: int, y_um: int, limit: int) -> int:
-        """How many points of the cell are within ε; may stop at ``limit``.
+        """The number of points of the cell within ε; counting may stop at ``limit``.
 
         Exact in int64: neighbours' cells bound both differences by 3·side, so the sum of squares
         is below 9·ε² ≤ 9·10¹⁸ for the largest ε that settings allow.

@@ -1,10 +1,10 @@
 """The occupancy maps in force: of each floor the last one given, from its offset on.
 
-A second map of a floor replaces the first; one with the same grid changes nothing. What was folded
-before a map keeps its place: a fold never looks back. Two poses are judged by the map in force when
-the later of them is folded.
+A second map of a floor replaces the first; one with the same grid changes nothing. Keyframes folded
+before a map keep their places: a fold never revises them. For two poses the map in force when the
+later one is folded counts.
 
-A map that names no floor is of the floor that the log is of first, unless another names that one.
+A map without a floor name is of the log's first floor, unless another map names that floor.
 """
 
 from collections.abc import Mapping
@@ -26,8 +26,8 @@ from .floors import Floors, shift_um
 def map_in_force(
     given: Mapping[str | None, MapGiven], floor: str | None, *, is_first: bool
 ) -> MapGiven | None:
-    """The map on ``floor``, of those ``given`` by the floor that they name. One that names none is
-    of the floor that the log is of first, unless another names that one."""
+    """The map on ``floor``, of those ``given`` by the floor that they name. One without a floor
+    name is of the log's first floor, unless another names that floor."""
     named = None if floor is None else given.get(floor)
     return given.get(None) if named is None and is_first else named
 
@@ -35,19 +35,19 @@ def map_in_force(
 class CurrentMap:
     """The reducer. ``given`` are the maps by the floor that they name.
 
-    Walls are worked out when the first pose on their floor is folded after the map, as that takes a
-    second or two for a large one: maps that are replaced before cost nothing.
+    Walls are computed when the first pose on their floor is folded after the map, because that
+    takes a second or two for a large map: maps replaced before that cost nothing.
     """
 
     def __init__(self, settings: Settings, floors: Floors) -> None:
         self._uses_walls = settings.places == "rooms"
         self._floors = floors
         self.given: dict[str | None, MapGiven] = {}
-        # By number of the floor; what is not there has not been asked for.
+        # By number of the floor; only those already computed.
         self._ways: dict[int, StraightWay | None] = {}
 
     def fold(self, offset: Offset, given: OccupancyMap) -> MapGiven | None:
-        """Take over a map; None if it changes nothing."""
+        """Put a map into force and return its delta; None if it changes nothing."""
         before = self.given.get(given.floor)
         if before is not None and before.map.digest() == given.digest():
             return None
@@ -57,11 +57,11 @@ class CurrentMap:
 
     @property
     def has_walls(self) -> bool:
-        """Whether places go by the walls of any map."""
+        """Whether the places use the walls of any map."""
         return self._uses_walls and bool(self.given)
 
     def way_at(self, at: Point) -> StraightWay | None:
-        """How to tell the straight ways on the floor of a position, laid out beside the others
+        """The function that measures straight ways on the floor of a laid-out position
         (`projections.reducers.floors`); None where the floor has no map."""
         number = self._floors.number_at(*at)
         if number not in self._ways:
@@ -76,7 +76,7 @@ class CurrentMap:
         return partial(_moved_back, way, *shift_um(number)) if number else way
 
     def dump(self) -> State:
-        """Everything, for a snapshot; nothing without a map."""
+        """The whole state, for a snapshot; nothing without a map."""
         parts: State = {}
         for number, (offset, given) in enumerate(
             (delta.offset, delta.map) for delta in self.given.values()
@@ -94,7 +94,7 @@ class CurrentMap:
         return {"maps": len(self.given), **parts} if parts else {}
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         for number in range(state.get("maps", 0)):
             fields = part(str(number), state)
             x, y, yaw = fields["origin"]

@@ -1,8 +1,8 @@
-"""Cells about centres, and how far the robot drives from one to another, up to a reach.
+"""Cells around centres, and the driven distances between them, up to a reach.
 
 A pose farther than ``cell_um`` from all centres becomes the centre of a new cell; every other
 belongs to the cell of the nearest centre, of equally near ones to the earliest. Centres never move.
-Where walls are known, only centres count that a straight way leads to.
+Where walls are known, only centres count to which there is a straight way.
 
 Two cells with one pose after the other in some run are *linked*, at the distance of their centres.
 Where walls are known, it is how far the straight way between them counts as, and cells whose
@@ -29,14 +29,15 @@ from projections.exact import distance_um
 from projections.reducers import State
 
 StraightWay: TypeAlias = Callable[[tuple[int, int], tuple[int, int]], int | None]
-"""How far the straight way between two positions counts as, all in µm; None where walls bar it."""
+"""A function that returns the length of the straight way between two positions, all in µm; None
+where walls are in between."""
 WayAt: TypeAlias = Callable[[tuple[int, int]], StraightWay | None]
 """The straight ways on the floor of a position; None where no walls are known on that floor."""
 
 
 class Nearer(NamedTuple):
-    """Two cells came within ``distance_um``; ``before_um`` was their distance, at most the
-    reach."""
+    """The driven distance of two cells fell from ``before_um``, at most the reach, to
+    ``distance_um``."""
 
     a: int
     b: int
@@ -45,7 +46,7 @@ class Nearer(NamedTuple):
 
 
 class DrivenCells:
-    """Cells are numbered as they are made."""
+    """The cells and their driven distances; cells are numbered in the order of creation."""
 
     def __init__(self, cell_um: int, reach_um: int, way_at: WayAt | None = None) -> None:
         self._cell_um = cell_um
@@ -98,13 +99,13 @@ class DrivenCells:
         return cell
 
     def is_linked(self, a: int, b: int) -> bool:
-        """Whether the robot has gone from one to the other, or they are one."""
+        """Whether two cells are linked or the same."""
         return a == b or b in self._linked[a]
 
     def link(self, a: int, b: int) -> Iterator[Nearer]:
-        """Link two cells; the pairs that come nearer by it, each once, in no order.
+        """Link two cells; yields the pairs that come nearer by it, each once, in no order.
 
-        A link that walls bar is made too, and brings nothing nearer.
+        A link with walls in between is recorded, too, and brings nothing nearer.
         """
         self._linked[a].add(b)
         self._linked[b].add(a)
@@ -153,7 +154,7 @@ class DrivenCells:
         return (x - at[0]) ** 2 + (y - at[1]) ** 2 <= 4 * self._cell2
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         links = [(a, b) for a, linked in enumerate(self._linked) for b in sorted(linked) if a < b]
         near = [(a, b, d) for a, each in enumerate(self.near) for b, d in sorted(each.items())]
         return {
@@ -163,7 +164,7 @@ class DrivenCells:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         for x, y in state["anchors"]:
             self.add(x, y)
         for a, b in state["links"].tolist():

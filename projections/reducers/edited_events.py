@@ -2,8 +2,8 @@
 
 An event is corrected before it is folded, so the map is that of a log with the corrected events:
 without forgotten keyframes, without dropped detections, with the corrected poses written in. A
-position of a detection is of the pose that the robot had, so it moves and turns with that pose; in
-a keyframe that had none it is left out.
+detection's position was computed from the recorded pose, so it moves and turns with that pose; in a
+keyframe without a pose it is left out.
 """
 
 import math
@@ -90,7 +90,7 @@ def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> 
 
 
 def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tuple[Detection, ...]:
-    """The detections, their positions moved as the pose is."""
+    """The detections, with positions moved as the pose is."""
     old_x, old_y, old_yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
     if old_x is None or old_y is None or old_yaw is None:
         return tuple(d.model_copy(update={"position": None}) for d in envelope.detections)
@@ -124,6 +124,6 @@ def _turned_covariance(envelope: Envelope, yaw: float) -> tuple[float, ...] | No
 
 
 def is_in_bounds(pose: tuple[float, float, float]) -> bool:
-    """Whether a map has room for a pose."""
+    """Whether a pose is within the bounds of a map."""
     x, y, yaw = pose
     return abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)

@@ -1,5 +1,5 @@
-"""The map's embedding space: which vectors are compared with each other, and vectors of that space
-that detections were given later."""
+"""The map's embedding space, which decides which vectors are compared, and vectors of that space
+that ``reembed`` commands added to detections."""
 
 from collections.abc import Sequence
 
@@ -15,9 +15,9 @@ from projections.settings import Settings
 class Space:
     """The map's embedding space, a model and a dimension; open until it is decided.
 
-    What the settings leave open is decided by the first embedded detection that agrees with them. A
-    vector of another space is *foreign*: it is counted, but neither fused nor searched. A detection
-    that names no model is of the unnamed model, which is a model like any other.
+    Parts that the settings leave open are fixed by the first embedded detection that matches the
+    settings. A vector of another space is *foreign*: it is counted, but neither fused nor searched.
+    A detection that names no model is of the unnamed model, which is a model like any other.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -32,7 +32,8 @@ class Space:
         self.is_decided, self.model, self.dim = True, model, dim
 
     def has(self, model: str | None, dim: int) -> bool:
-        """True when a vector of this model and dimension is in the map; the first one decides."""
+        """Whether vectors of this model and dimension are in the map; the first one fixes an open
+        space."""
         if model == self.model and dim == self.dim:
             return True
         if not self.is_decided:
@@ -57,7 +58,8 @@ class Reembedded:
     def applied(
         self, accepted: Accepted, units: Sequence[Units | None]
     ) -> tuple[Accepted, Sequence[Units | None]]:
-        """An envelope, and ``units`` of its vectors, with what is known of its detections."""
+        """The envelope and its ``units``, with the vectors of this space added to its
+        detections."""
         envelope, rows = accepted.envelope, self._vectors
         models = [detection.embedding_model for detection in envelope.detections]
         given = {

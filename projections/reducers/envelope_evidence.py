@@ -20,13 +20,13 @@ _DEPTH_SIGMA_SHARE = 0.05
 _LEAST_DEPTH_SIGMA_M = 0.05
 _POSITION_SIGMA_M = 0.1
 MOST_OF_A_PICTURE = 256
-"""Observations of one picture that fuse, the first ones: what they cost grows with the square."""
+"""The most observations of one picture that are fused; the cost grows with the square."""
 _MANY_TURNS = 1e6
 _TURN = 2.0 * math.pi
 
 
 def camera_of(envelope: Envelope, otherwise: Camera) -> Camera:
-    """The camera that an envelope states."""
+    """The camera that an envelope states, else ``otherwise``."""
     stated = envelope.camera
     if stated is None:
         return otherwise
@@ -59,7 +59,7 @@ def small_angle(angle: float) -> float:
 
 
 def with_small_yaw(pose: Pose) -> Pose:
-    """The pose with a heading of which the cosine can be computed."""
+    """The pose with its heading reduced by `small_angle`."""
     yaw = small_angle(pose.yaw_rad)
     return pose if yaw == pose.yaw_rad else Pose(pose.x_um, pose.y_um, yaw)
 

@@ -1,4 +1,4 @@
-"""Fusion by evidence: Objects, which of them are missing, and which stand elsewhere now."""
+"""Fusion by evidence: runs the reducers of Objects, of presence and of relocations."""
 
 from collections.abc import Container, Sequence
 from typing import TypeAlias
@@ -45,7 +45,8 @@ class EvidenceFusion:
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
     ) -> list[FusionDelta]:
-        """Fuse the observations of one picture; look for what it does not show."""
+        """Fuse the observations of one picture, then count Objects that it should show and does
+        not."""
         fused = self._objects.fold(offset, run, timestamp, pose, camera, sightings, error)
         missing = self._presence.fold(offset, run, pose, camera, fused)
         moved = self._relocations.fold(fused)
@@ -59,7 +60,7 @@ class EvidenceFusion:
         return [*_in_order(fused, {pair.new for pair in moved}), *left]
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return (
             prefixed("landmarks", self._objects.dump())
             | prefixed("presence", self._presence.dump())
@@ -67,7 +68,7 @@ class EvidenceFusion:
         )
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._objects.load(part("landmarks", state))
         self._presence.load(part("presence", state))
         self._relocations.load(part("relocations", state))

@@ -1,4 +1,4 @@
-"""Which Object each observation of a picture is of: rules 1 to 3 of `evidence_objects`.
+"""Matching: assign an Object to each observation of a picture (rules 1 to 3 of `evidence_objects`).
 
 Where several observations want the same Object, `assign` makes the choice with the largest sum of
 evidence. Observations that want no Object in common do not depend on each other. Of those that do,
@@ -23,7 +23,7 @@ from .thing_index import ThingIndex
 from .things import Thing
 
 Match: TypeAlias = tuple[float, ObjectOrdinal, float]
-"""How much speaks for an Object, which one, and the cosine of the best pair of looks."""
+"""The evidence for an Object, its ordinal, and the cosine of the best pair of looks."""
 _MOST = 32
 
 
@@ -32,8 +32,8 @@ def _value(match: Match) -> float:
 
 
 def assign(wanted: Sequence[Sequence[Match]]) -> list[Match | None]:
-    """The match that each observation takes, of those it wants, all above 0; None for none. Each
-    Object is taken once. Of equal choices always the same one, the first where there is one."""
+    """The match assigned to each observation, among its ``wanted`` ones, all with evidence above 0;
+    None for none. Each Object is assigned at most once. Ties are broken deterministically."""
     taken = [max(matches, key=_value) if matches else None for matches in wanted]
     ordinals = [match[1] for match in taken if match is not None]
     if len(set(ordinals)) == len(ordinals):
@@ -204,7 +204,7 @@ class Matching:
         sightings: Sequence[Sighting],
         object_of: Mapping[int, ObjectOrdinal],
     ) -> list[list[Match]]:
-        """What each observation may be of, by ordinal."""
+        """The matches of each observation, by ordinal of the Object."""
         matches: list[list[Match]] = [[] for _ in sights]
         index = self._index
         listed = index.listed(pose.x_um / 1e6, pose.y_um / 1e6)
@@ -259,8 +259,8 @@ class Matching:
 
 
 class _Second:
-    """What is left to an observation that has to leave the Object it takes: the best of those that
-    no observation takes, one that is freed, or none."""
+    """The second choice of an observation that has to give up its Object: the best Object assigned
+    to no observation, one that is freed, or none."""
 
     def __init__(
         self, own: list[Match], taken: Match | None, holders: Mapping[ObjectOrdinal, int]

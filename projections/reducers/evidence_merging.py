@@ -29,16 +29,16 @@ _LOG_AREA = log(9.0) - 1.8378770664093453
 _WORST_CHI2 = 40.0
 _LEAST_GEOMETRY = -3.0
 _FARTHEST_CHI2 = 2.0 * (_LOG_AREA - _LEAST_GEOMETRY) - 2.0 * log(2.0 * COMMON_M2) + 0.1
-"""Above χ² of every pair of estimates that speaks enough: the variance of their difference is at
-least twice the common one in every direction."""
+"""An upper bound of χ² for pairs of estimates with enough evidence: the variance of their
+difference is at least twice the common one in every direction."""
 _SHARE_OF_PICTURES = 10
 _MOST_PER_PAIR = 6.0
 _UNIT = 1 << 20
 
 
 class _Candidate(NamedTuple):
-    """An Object that may be the same; in how many pictures both are, how much the estimates speak
-    for one thing, and their squared distance in m²."""
+    """An Object that may be the same thing: the number of pictures with both, the evidence of the
+    estimates, and their squared distance in m²."""
 
     ordinal: ObjectOrdinal
     thing: Thing
@@ -65,8 +65,8 @@ class Merging:
         self._groups = groups
 
     def partner_of(self, ordinal: ObjectOrdinal) -> tuple[ObjectOrdinal, MergeEvidence] | None:
-        """The Object that is the same, and why; None if there is none. Call it where the Object has
-        as many observations as its ``checked``, or more."""
+        """The Object to merge with, and the evidence; None if there is none. To be called when the
+        Object has ``checked`` observations or more."""
         thing = self._index.thing(ordinal)
         thing.checked = thing.count + 1 + thing.count // 2
         candidates: list[_Candidate] = []
@@ -100,7 +100,7 @@ class Merging:
         return None if best is None else best[1:]
 
     def _around(self, thing: Thing) -> list[ObjectOrdinal]:
-        """The Objects within reach that are not too far for χ², at its best, and some more."""
+        """A superset of the Objects within reach that could pass the test of χ²."""
         x, y, xx, _, yy, *_ = thing.where()
         listed = self._index.listed(x, y)
         estimates = self._index.estimates.take(listed, axis=0).T
@@ -112,9 +112,9 @@ class Merging:
         return around
 
     def _looks(self, one: Thing, others: list[Thing]) -> list[float]:
-        """How much the looks of a thing and each of several others speak for one, as the logarithm
-        of a ratio of two likelihoods: the mean over pairs of exemplars, and the labels. The others'
-        exemplars are columns of one matrix."""
+        """The log-likelihood ratio that a thing and each of several others are one, by looks (the
+        mean over pairs of exemplars) and labels. The others' exemplars are columns of one
+        matrix."""
         counts = [len(other.marks) for other in others]
         agree = [o.class_name in one.classes or one.class_name in o.classes for o in others]
         a = np.array(one.by_row())
@@ -150,7 +150,8 @@ class Merging:
 
 
 def _geometry(thing: Thing, other: Thing) -> tuple[float, float]:
-    """How much two estimates speak for one thing, and their squared distance in m²."""
+    """The log-likelihood ratio of two estimates being of one thing, and their squared distance in
+    m²."""
     x, y, xx, xy, yy, *_ = thing.where()
     other_x, other_y, a, b, c, *_ = other.where()
     dx, dy, a, b, c = other_x - x, other_y - y, a + xx, b + xy, c + yy

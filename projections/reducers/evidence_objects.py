@@ -1,4 +1,4 @@
-"""Observations fused into Objects where they stand: the rule of `fusion = "evidence"`.
+"""Observations fused into Objects with an estimated position: the rule of `fusion = "evidence"`.
 
 The rules, for the observations of one picture:
 
@@ -193,8 +193,8 @@ class EvidenceObjects:
         return self._index.thing(ordinal).count
 
     def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
-        """The log-likelihood ratio of the looks of an Object and of each of several others, however
-        they stand (`turned_looks`); None where a command keeps them apart."""
+        """The log-likelihood ratio of the looks of an Object and of each of several others,
+        whatever their headings (`turned_looks`); None where a command keeps them apart."""
         thing, things = self._index.thing(one), [self._index.thing(other) for other in others]
         looks = turned_looks(thing, things, self._look_ratios, self._scale)
         groups = self._groups
@@ -206,8 +206,8 @@ class EvidenceObjects:
         ]
 
     def relocate(self, offset: Offset, moved: Moved) -> list[ObjectDelta]:
-        """Make an Object found elsewhere one with the one that stood here before, and estimate it
-        from the later observations only."""
+        """Merge an Object with the one found at its new position, and estimate it from the later
+        observations only."""
         thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
         before, after = thing.where()[:2], later.where()[:2]
         dx, dy = after[0] - before[0], after[1] - before[1]
@@ -231,7 +231,7 @@ class EvidenceObjects:
         return [*deltas, self._index.estimated(offset, moved.old)]
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return (
             {"object_of": sorted(map(list, self._object_of.items()))}
             | prefixed("scale", self._scale.dump())
@@ -241,7 +241,7 @@ class EvidenceObjects:
         )
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._object_of = {group: ObjectOrdinal(ordinal) for group, ordinal in state["object_of"]}
         self._scale.load(part("scale", state))
         self._slopes.load(part("slopes", state))

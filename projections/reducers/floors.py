@@ -1,4 +1,5 @@
-"""Floors: which one a pose is on, and how reducers that know only x and y keep them apart.
+"""Floors: the floor of a pose, and positions laid out so that reducers of x and y keep floors
+apart.
 
 An envelope names its floor (``floor``), or its height ``map_z`` gives it: floor n is nearest to
 n × ``floor_height_m``, a height half-way belongs to the upper one. So 2.8 m is floor "1" at 3 m a
@@ -41,7 +42,7 @@ _THING = TypeVar("_THING", bound=tuple[object, ...] | str)
 
 
 def floor_name(envelope: Envelope, height_um: int) -> str | None:
-    """The floor of an envelope with a pose; None if it tells none."""
+    """The floor of an envelope with a pose; None if the envelope has neither name nor height."""
     if envelope.floor is not None:
         return envelope.floor
     if envelope.map_z is None:
@@ -50,12 +51,12 @@ def floor_name(envelope: Envelope, height_um: int) -> str | None:
 
 
 def shift_um(ordinal: int) -> tuple[int, int]:
-    """How far the floor of this number is moved, in x and y."""
+    """The shift of the floor of this number, in x and y."""
     return ordinal % _FLOORS_A_ROW * STEP_UM, ordinal // _FLOORS_A_ROW * STEP_UM
 
 
 def shift_of_sum(sum_x_um: int, sum_y_um: int, count: int) -> tuple[int, int]:
-    """How far a floor is moved by the sums of positions of ``count`` things on it."""
+    """The shift of the floor that ``count`` things are on, from the sums of their positions."""
     step = STEP_UM * max(count, 1)
     return (
         (2 * sum_x_um + step) // (2 * step) * STEP_UM,
@@ -71,7 +72,7 @@ class Floors:
         self._height_um = metres_to_um(floor_height_m)
         self.ordinals: dict[str | None, int] = {}
         self.names: list[str | None] = []
-        # By what is one by command and the group's number, the floor it is on.
+        # The floor of each group of things joined by command, by kind and number of the group.
         self._homes: dict[tuple[str, int], int] = {}
 
     def enter(self, envelope: Envelope) -> tuple[str | None, int]:
@@ -94,7 +95,7 @@ class Floors:
             del groups.group_of[thing]
 
     def laid_out(self, pose: Pose, ordinal: int) -> Pose:
-        """The pose as the reducers are given it."""
+        """The pose laid out, as reducers get it."""
         dx, dy = shift_um(ordinal)
         return Pose(pose.x_um + dx, pose.y_um + dy, pose.yaw_rad) if ordinal else pose
 
@@ -117,12 +118,12 @@ class Floors:
         return [_put_back(delta) for delta in deltas] if len(self.ordinals) > 1 else deltas
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         homes = [[kind, group, floor] for (kind, group), floor in sorted(self._homes.items())]
         return {"names": self.names, "homes": homes}
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave; older snapshots have nothing, their maps one floor."""
+        """Restore the state of `dump`; older snapshots have nothing, their maps one floor."""
         self.names = list(state.get("names", [None]))
         self.ordinals = {name: ordinal for ordinal, name in enumerate(self.names)}
         self._homes = {(kind, group): floor for kind, group, floor in state.get("homes", ())}

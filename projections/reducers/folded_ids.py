@@ -1,8 +1,8 @@
 """Ids folded so far: runs, keyframes with a digest of their content, det_ids.
 
 A ``(run_id, keyframe_id)`` met again is a *duplicate* if its content is the same and a *conflict*
-if not. Content is what an envelope says, not how: key order, white space and unknown fields do not
-matter, an id written out and the same id by default are the same.
+if not. Content is compared after parsing: key order, white space and unknown fields do not matter,
+and an id written out equals the same id by default.
 """
 
 import hashlib
@@ -118,7 +118,7 @@ class FoldedIds:
         return bytes(self.digests[start : start + _DIGEST_BYTES])
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {
             "runs": list(self.runs),
             "started": self.started,
@@ -131,7 +131,7 @@ class FoldedIds:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self.runs = {run_id: RunOrdinal(run) for run, run_id in enumerate(state["runs"])}
         self.started = state["started"]
         self.keyframe_ids = packed("q", state["keyframe_ids"].tobytes())

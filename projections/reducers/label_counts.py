@@ -8,9 +8,10 @@ from .agreement import log_of
 from .things import Thing
 
 LABEL_WEIGHT = 0.5
-"""What counts of a label's log-likelihood ratio: the labels of one thing err together."""
+"""The share of a label's log-likelihood ratio that counts, since errors in the labels of one thing
+are correlated."""
 _DOUBT = 0.3
-"""How many observations of the labels' usual mix are added to those of a thing."""
+"""The number of observations with the usual mix of labels that are added to those of a thing."""
 
 
 class LabelCounts:
@@ -21,7 +22,7 @@ class LabelCounts:
         self._total = 0
 
     def learn(self, labels: Iterable[str]) -> None:
-        """Take in a picture."""
+        """Count the labels of a picture."""
         for label in labels:
             self._counts[label] = self._counts.get(label, 0) + 1
             self._total += 1
@@ -36,10 +37,10 @@ class LabelCounts:
         return (self._counts.get(label, 0) + 1.0) / (self._total + 10.0)
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {"counts": sorted(map(list, self._counts.items()))}
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._counts = dict(state["counts"])
         self._total = sum(self._counts.values())

@@ -2,8 +2,8 @@
 
 One observation is one vote for the place of its keyframe, as labelled now; noise does not vote, and
 votes once it is promoted. Ties go to the place founded first. An Object none of whose observations
-has a place is nowhere. The votes of an absorbed Object are its survivor's. An Object that turns out
-to stand where another was found, and absorbs that, has the votes of that one only.
+has a place is nowhere. The votes of an absorbed Object are its survivor's. An Object that was
+relocated to where another was found, and absorbs that, has only the votes of the absorbed one.
 """
 
 from eventsrc.envelope import Offset
@@ -14,7 +14,8 @@ from .survivors import ObjectSurvivors
 
 
 class LocatedIn:
-    """The reducer. Tell it of merges, placings and sightings in order; then `collect_moves`."""
+    """The reducer of located-in. Merges, placings and sightings are reported to it in order, before
+    `collect_moves`."""
 
     def __init__(self) -> None:
         self.votes: list[dict[PlaceOrdinal, int]] = []  # per Object: place → observations there
@@ -27,7 +28,7 @@ class LocatedIn:
         self._touched: dict[ObjectOrdinal, None] = {}
 
     def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
-        """The votes for the absorbed places are votes for the survivor now."""
+        """Count the votes for absorbed places for the survivor."""
         for place in absorbed:
             voters = self.voters.pop(place, {})
             for ordinal in voters:
@@ -38,7 +39,7 @@ class LocatedIn:
                 self.voters.setdefault(survivor, {}).update(voters)
 
     def objects_merged(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
-        """The absorbed Object's votes, those to come too, are votes of the survivor now."""
+        """Count the absorbed Object's votes, later ones too, for the survivor."""
         self.survivors.merge(survivor, (absorbed,))
         votes, others = self.votes[survivor], self.votes[absorbed]
         self.votes[absorbed], self.located[absorbed] = {}, None
@@ -51,14 +52,15 @@ class LocatedIn:
             self._touched[survivor] = None
 
     def keyframe_placed(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
-        """A keyframe that had no place has one: what it saw can vote."""
+        """Count the votes of the Objects seen by a keyframe that had no place until now."""
         for ordinal in self.waiting.pop(keyframe, ()):
             self._vote(self.survivors.find(ordinal), place)
 
     def object_seen(
         self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
-        """The Object was observed from a keyframe, which is in ``place`` or, so far, in none."""
+        """Count a vote of an Object observed from a keyframe that is in ``place``, or so far in
+        none."""
         if ordinal == len(self.votes):
             self.votes.append({})
             self.located.append(None)
@@ -68,8 +70,8 @@ class LocatedIn:
             self._vote(ordinal, place)
 
     def object_left(self, ordinal: ObjectOrdinal) -> None:
-        """The Object is not where it was seen: its votes until now are void, those to come of
-        keyframes until now too."""
+        """Drop the votes of an Object that was relocated, also pending ones of earlier
+        keyframes."""
         for voted in self.votes[ordinal]:
             del self.voters[voted][ordinal]
         self.votes[ordinal] = {}
@@ -82,7 +84,7 @@ class LocatedIn:
                 del self.waiting[keyframe]
 
     def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
-        """Recount the Objects whose votes changed; those that moved, ascending."""
+        """Recount the Objects whose votes changed; returns those that moved, ascending."""
         if not self._touched:
             return []
         moved = []
@@ -95,7 +97,7 @@ class LocatedIn:
         return moved
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {
             "votes": [list(map(list, votes.items())) for votes in self.votes],
             "located": self.located,
@@ -106,7 +108,7 @@ class LocatedIn:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self.votes = [dict(votes) for votes in state["votes"]]
         self.located = state["located"]
         self.waiting = dict(state["waiting"])
@@ -118,7 +120,7 @@ class LocatedIn:
         votes = self.votes[ordinal]
         votes[place] = votes.get(place, 0) + 1
         if self.located[ordinal] == place and ordinal not in self._touched:
-            return  # it is there already, and one more vote for it cannot change that
+            return  # one more vote for its own place cannot move it
         self.voters.setdefault(place, {})[ordinal] = None
         self._touched[ordinal] = None
 

@@ -1,4 +1,4 @@
-"""How much two looks speak for one thing: the ratio of two likelihoods, as a logarithm.
+"""Looks: the log-likelihood ratio that two embeddings are of one thing.
 
 Cosines are taken as relative likeness u (`projections.evidence`). For one thing u is normal about
 a mean that falls with the change of side and between runs,
@@ -35,13 +35,14 @@ _STEPS = 32
 _WORST = 8.0
 _LOOK_ALIKE = 0.05
 _SHARES = (0.02, 0.1, 0.88), (0.15, 0.85, 0.1)
-"""Of look-alikes, others of the class, others, among two things whose labels differ or agree."""
+"""Shares of look-alikes, others of the class and others, for two things whose labels differ, and
+agree."""
 _LEAST_LIKENESS, _PER_LIKENESS, _LIKENESSES = -1.0, 128.0, 289
 _OF_ONE_RUN = (_STEPS + 1) * _LIKENESSES
-"""Numbers of the table for labels that agree, or do not, and one run or two."""
+"""Indices of the table by whether the labels agree and the runs differ."""
 _BEST = 4
 _MISSING = 0.125
-"""Of the exemplars the best four count; each that is missing costs an eighth."""
+"""The number of exemplars that count, the best ones; each missing one costs an eighth."""
 _RECENT = 8
 _ENOUGH_PAIRS = 3_000
 _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
@@ -152,14 +153,14 @@ class LookScale:
         self._recent: list[tuple[str, Looks]] = []
 
     def different(self) -> float:
-        """The mean cosine; a guess that a single pair outweighs, at first."""
+        """The mean cosine; starts from a guess that a single pair outweighs."""
         if self._stated is not None:
             return self._stated
         total = self._sum / (LOOK_UNIT * LOOK_UNIT) + _FIRST_GUESS * _GUESS_WEIGHT
         return total / (self._count + _GUESS_WEIGHT)
 
     def learn(self, labels: Sequence[str], looks: Looks) -> None:
-        """Take in a picture."""
+        """Count the pairs of a picture with different labels."""
         if self._stated is not None or self._count >= _ENOUGH_PAIRS:
             return
         rows = list(zip(labels, looks, strict=True))
@@ -174,7 +175,7 @@ class LookScale:
         self._recent = both[-_RECENT:]
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {
             "sum": self._sum,
             "count": self._count,
@@ -183,7 +184,7 @@ class LookScale:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._sum, self._count = state["sum"], state["count"]
         rows = state["looks"].astype(np.float32)
         self._recent = list(zip(state["labels"], rows, strict=True))

@@ -48,7 +48,7 @@ Bucket = tuple[str, int, int]
 class ObjectSums:
     """An Object's sums over its observations: of positions, µm, and of unit vectors, integers in
     float64, shape (dim,). ``column`` and ``row`` are the grid cell of its mean position;
-    ``other_classes`` those of members that a command made part of it."""
+    ``other_classes`` are the classes of members that a command joined to it."""
 
     class_name: str
     vector_sum: NDArray[np.float64]
@@ -89,8 +89,8 @@ class Objects:
     ) -> list[ObjectFound | ObjectSeen]:
         """Fuse one observation, seen from (x, y).
 
-        ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object that
-        is taken if none of them will do, a new one by default.
+        ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object to
+        fuse with if none of them qualifies, a new one by default.
         """
         observation, det_id, class_name, vector, norm2 = seen
         radius_um, objects = self._radius_um, self.sums
@@ -141,7 +141,7 @@ class Objects:
         return self._near.get((class_name, x_um // radius_um, y_um // radius_um), ())
 
     def dump(self) -> State:
-        """Everything, for a snapshot. The vectors' sums are one matrix, a row for each Object."""
+        """The whole state, for a snapshot; the sums of vectors are one matrix, a row an Object."""
         objects = self.sums
         return {
             "classes": [o.class_name for o in objects],
@@ -155,7 +155,7 @@ class Objects:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         for index, (first, last) in enumerate(state["seen"].tolist()):
             sums = ObjectSums(
                 state["classes"][index],

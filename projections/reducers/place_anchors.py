@@ -1,7 +1,7 @@
-"""Anchors: the keyframes that ``join`` and ``keep-apart`` name, and which places they are in.
+"""Anchors: the keyframes named by ``join`` and ``keep-apart``, and their places.
 
-Anchors that are one by command are a group. Places with anchors of groups that are kept apart
-*conflict*: they are never merged. A refusal is reported once for each pair of places.
+Anchors joined by command are a group. Places with anchors of groups that are kept apart *conflict*:
+they are never merged. A refusal is reported once for each pair of places.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +19,7 @@ Apart: TypeAlias = tuple[KeyframeOrdinal, KeyframeOrdinal]
 
 
 class PlaceAnchors:
-    """The anchors that have come, and those in each place."""
+    """The anchors folded so far, and those in each place."""
 
     def __init__(self, groups: PairGroups[Keyframe]) -> None:
         self._groups = groups
@@ -28,21 +28,21 @@ class PlaceAnchors:
         self._refused: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
 
     def add(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
-        """A keyframe that may be an anchor."""
+        """Register a keyframe as an anchor, if it is one."""
         group = self._groups.group_of.get(anchor)
         if group is not None:
             self._group_of[keyframe] = group
 
     @property
     def have_come(self) -> bool:
-        """Whether any has."""
+        """Whether any anchor has been folded."""
         return bool(self._group_of)
 
     def __contains__(self, keyframe: KeyframeOrdinal) -> bool:
         return keyframe in self._group_of
 
     def own(self, keyframe: KeyframeOrdinal) -> Inside:
-        """What a place of this anchor alone has inside; nothing if it is none."""
+        """The anchors in a place that holds only this keyframe; empty if it is no anchor."""
         return {self._group_of[keyframe]: keyframe} if keyframe in self._group_of else {}
 
     def inside(self, place: PlaceOrdinal) -> Inside:
@@ -50,13 +50,13 @@ class PlaceAnchors:
         return self._inside.get(place, {})
 
     def enter(self, place: PlaceOrdinal, inside: Inside) -> None:
-        """Anchors are in a place from now on."""
+        """Add anchors to a place."""
         own = self._inside.setdefault(place, {})
         for group, keyframe in inside.items():
             own[group] = min(keyframe, own.get(group, keyframe))
 
     def merge(self, survivor: PlaceOrdinal, absorbed: Iterable[PlaceOrdinal]) -> None:
-        """The anchors of ``absorbed`` are in ``survivor`` from now on."""
+        """Move the anchors of ``absorbed`` to ``survivor``."""
         for place in absorbed:
             if place in self._inside:
                 self.enter(survivor, self._inside.pop(place))
@@ -73,14 +73,14 @@ class PlaceAnchors:
             yield place, self._inside[place][group]
 
     def refuses(self, a: PlaceOrdinal, b: PlaceOrdinal) -> bool:
-        """Note a refusal; whether it is the first of these places."""
+        """Record a refusal; returns whether it is the first for these two places."""
         pair = min(a, b), max(a, b)
         is_news = pair not in self._refused
         self._refused.add(pair)
         return is_news
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {
             "anchors": [[keyframe, group] for keyframe, group in self._group_of.items()],
             "refused": sorted(map(list, self._refused)),
@@ -89,7 +89,7 @@ class PlaceAnchors:
     def load(
         self, state: State, place_of: Callable[[KeyframeOrdinal], PlaceOrdinal | None]
     ) -> None:
-        """Take over what `dump` gave; ``place_of`` tells the place of a keyframe."""
+        """Restore the state of `dump`; ``place_of`` returns the place of a keyframe."""
         self._group_of = dict(state["anchors"])
         for keyframe in self._group_of:
             place = place_of(keyframe)

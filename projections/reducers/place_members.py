@@ -1,4 +1,5 @@
-"""Which keyframe joined which place, and each place's members: what every rule of places keeps.
+"""The place that each keyframe joined, and each place's members: state that all rules of places
+share.
 
 Points are numbered by arrival among the keyframes that have a pose. Places only grow or merge. A
 place is named by the run of its founder and a counter of that run, and numbered in founding order;
@@ -24,11 +25,11 @@ from projections.reducers import State, packed
 from .survivors import PlaceSurvivors
 
 NOISE = PlaceOrdinal(-1)
-"""What the packed array of places holds for a point in none."""
+"""The value for a point in no place, in the packed array of places."""
 
 
 class PosedKeyframe(NamedTuple):
-    """A keyframe with a pose, as the reducers of places are given it; ``offset`` is its event."""
+    """A keyframe with a pose, the input of the reducers of places; ``offset`` is its event."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -39,7 +40,7 @@ class PosedKeyframe(NamedTuple):
 
 
 class PlaceMembers:
-    """The state that rules of places share, and what changes it."""
+    """The state that rules of places share, and the operations on it."""
 
     def __init__(self) -> None:
         # Per point: the place it joined, as of then; its keyframe; its run.
@@ -56,7 +57,7 @@ class PlaceMembers:
         self.sums_y_um: list[int] = []
 
     def add_point(self, keyframe: KeyframeOrdinal, run: RunOrdinal, run_id: RunId) -> int:
-        """A keyframe with a pose, in no place yet; its point."""
+        """Add a keyframe with a pose, in no place yet, and return its point."""
         self.joined.append(NOISE)
         self.keyframes.append(keyframe)
         self.runs.append(run)
@@ -75,11 +76,11 @@ class PlaceMembers:
         return self.label(point) if is_there else None
 
     def point_of(self, keyframe: KeyframeOrdinal) -> int:
-        """A keyframe's point; of one without a pose, that of the next."""
+        """A keyframe's point; for one without a pose the point of the next."""
         return bisect_left(self.keyframes, keyframe)
 
     def form_place(self, offset: Offset, founder: int) -> PlaceFormed:
-        """A new place without members, founded by a point."""
+        """Add a place without members, founded by a point."""
         place, run = PlaceOrdinal(len(self.member_counts)), self.runs[founder]
         counter = self.founded.get(run, 0)
         self.founded[run] = counter + 1
@@ -90,14 +91,14 @@ class PlaceMembers:
         return PlaceFormed(offset, place, place_id, self.keyframes[founder])
 
     def join_place(self, point: int, place: PlaceOrdinal, x_um: int, y_um: int) -> None:
-        """A point at (x, y) is in a place from now on."""
+        """Add a point at (x, y) to a place."""
         self.joined[point] = place
         self.member_counts[place] += 1
         self.sums_x_um[place] += x_um
         self.sums_y_um[place] += y_um
 
     def absorb(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
-        """Members of ``absorbed`` are members of ``survivor`` from now on."""
+        """Move the members of ``absorbed`` to ``survivor``."""
         self.survivors.merge(survivor, absorbed)
         for place in absorbed:
             self.member_counts[survivor] += self.member_counts[place]
@@ -105,7 +106,7 @@ class PlaceMembers:
             self.sums_y_um[survivor] += self.sums_y_um[place]
 
     def place_changed(self, offset: Offset, place: PlaceOrdinal) -> PlaceChanged:
-        """The members of a place as they are."""
+        """The delta with the current size and sums of a place."""
         return PlaceChanged(
             offset,
             place,
@@ -115,7 +116,7 @@ class PlaceMembers:
         )
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         absorbed_by, places = self.survivors.absorbed_by, range(len(self.member_counts))
         return {
             "joined": np.array(self.joined, np.int32),
@@ -130,7 +131,7 @@ class PlaceMembers:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self.joined = packed("i", state["joined"].tobytes())
         self.keyframes = packed("i", state["keyframes"].tobytes())
         self.runs = packed("i", state["runs"].tobytes())

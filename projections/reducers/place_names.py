@@ -1,7 +1,7 @@
 """Names of places: a name belongs to the place that its anchor, a keyframe, is in.
 
 Of several names in one place the newest command's counts; so a name survives merges. An anchor that
-is in no place, or has not come yet, names nothing so far.
+is in no place, or was not folded yet, names nothing.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,7 @@ from projections.deltas import (
 
 
 class PlaceNames:
-    """The reducer. Tell it the keyframe of each anchor, then what places changed.
+    """The reducer of place names. `add_anchor` precedes `fold` of the event of an anchor.
 
     ``names`` are in the order of their commands; ``given`` is which of them each place has.
     """
@@ -31,13 +31,13 @@ class PlaceNames:
         self._anchors: dict[KeyframeOrdinal, int] = {}
 
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
-        """A keyframe that may be an anchor."""
+        """Register a keyframe as an anchor, if it is one."""
         index = self.newest.get(anchor)
         if index is not None:
             self._anchors[keyframe] = index
 
     def fold(self, offset: Offset, changes: Iterable[Delta]) -> list[PlaceNamed]:
-        """Take over an event's changes of places; the names that follow, by place."""
+        """Apply an event's changes of places and return the resulting names, by place."""
         given, before = self.given, dict[PlaceOrdinal, int | None]()
         for delta in changes:
             if type(delta) is PlacesMerged:
@@ -53,7 +53,7 @@ class PlaceNames:
         ]
 
     def changes_from(self, older: "PlaceNames", offset: Offset) -> list[PlaceNamed]:
-        """What changes where these names replace ``older``, by place."""
+        """The deltas, by place, of replacing the names of ``older`` by these."""
         named = []
         for place in sorted(self.given.keys() | older.given.keys()):
             now = self.named(offset, place)
@@ -62,7 +62,7 @@ class PlaceNames:
         return named
 
     def give(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
-        """An anchor is in a place."""
+        """Give a place the name of an anchor in it."""
         self._give(place, self._anchors[keyframe], {})
 
     def _give(

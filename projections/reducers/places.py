@@ -56,7 +56,7 @@ class Places(PlaceMembers):
         self.core_index = core_index
 
     def fold(self, posed: PosedKeyframe) -> list[Delta]:
-        """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
+        """Add a keyframe with a pose; returns the deltas in the order of `projections.deltas`."""
         offset, keyframe, run, run_id, x_um, y_um = posed
         point = self.add_point(keyframe, run, run_id)
         fresh = self.core_index.insert(x_um, y_um)
@@ -67,7 +67,7 @@ class Places(PlaceMembers):
         return self._fold_changes(offset, point, fresh)
 
     def _fold_changes(self, offset: Offset, newcomer: int, fresh: list[int]) -> list[Delta]:
-        """What a new point that made ``fresh`` core points changes."""
+        """The deltas of a new point that made ``fresh`` points core."""
         deltas: list[Delta] = []
         joining = self._joining(offset, newcomer, fresh, deltas)
         find = self.survivors.find
@@ -81,18 +81,18 @@ class Places(PlaceMembers):
         return deltas
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return super().dump() | prefixed("crowd", self.core_index.dump())
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         super().load(state)
         self.core_index.load(part("crowd", state))
 
     def _joining(
         self, offset: Offset, newcomer: int, fresh: list[int], deltas: list[Delta]
     ) -> dict[int, PlaceOrdinal]:
-        """Change places and append the deltas; by point, the place that it joins."""
+        """Change places, append the deltas, and return the place that each point joins."""
         joining = self._cluster(offset, newcomer, fresh, deltas) if fresh else {}
         if newcomer not in joining:
             earliest = self._earliest_in_reach(newcomer)
@@ -130,7 +130,8 @@ class Places(PlaceMembers):
         return joining
 
     def _parts(self, newcomer: int, fresh: list[int]) -> Iterator[Part]:
-        """The connected groups of fresh core points; each sees what was merged for the last."""
+        """The connected groups of fresh core points, lazily: each uses the merges of the one
+        before."""
         for group in self._connected_groups(newcomer, fresh):
             yield Part(group, self._places_touched(group, fresh))
 

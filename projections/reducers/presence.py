@@ -1,18 +1,18 @@
-"""Presence: which Objects are not where they should be seen.
+"""Presence: detect Objects that are not seen where they should be.
 
 A keyframe *looks for* an Object when its pose is in a cell of the grid next to a pose that the
 Object was seen from, along a similar line of sight and from a similar distance, and the Object's
-estimate lies well inside the picture. A look is a *hit* or a *miss*. Walls, furniture and the
-detector's habits are in the record of hits and misses: from such a place such a thing is seen so
-often. What hides a thing hides it from all poses nearby, so of one run and one cell of the grid the
-first miss counts whole, the second half, others not; so do hits.
+estimate lies well inside the picture. A look is a *hit* or a *miss*. Hits and misses include the
+effects of walls, furniture and the detector: they are the rate at which a thing is seen from there.
+An obstacle hides a thing from all poses nearby, so of one run and one cell of the grid the first
+miss counts whole, the second half, others not; so do hits.
 
-An Object's *odds* are how likely the looks of a run are if it is still there, over how likely they
-are if it is gone. In its home run, the one that found it, it is there. In another run every miss
-multiplies them by its share of misses so far (of `_PRIOR` looks at the map's rate and its own), one
-that counts half by the root of it, and every sighting by `_SEEN`, within bounds: sightings of
-something else that took its place are assigned to it now and then, so one alone does not outweigh
-many misses. A new run starts with what was left, or with 1 if it was surely there.
+An Object's *odds* are the likelihood ratio of a run's looks: that it is still there over that it is
+gone. In its home run, the one that found it, it is there. In another run every miss multiplies them
+by its share of misses so far (of `_PRIOR` looks at the map's rate and its own), one that counts
+half by the root of it, and every sighting by `_SEEN`, within bounds: sightings of another thing in
+its place are assigned to it now and then, so one sighting does not outweigh many misses. A new run
+starts with the odds of the last one, or with 1 if the Object was surely there.
 
 It is *missing* when the odds fall below `_MISSING` with `_LEAST_MISSES` misses in the run, and no
 longer when they rise above that.
@@ -48,14 +48,15 @@ _CELL_UM = 750_000
 _NEAR_M2 = 1.1 * 1.1
 _LEAST_AHEAD_M = 0.3
 _INNER = 0.84
-"""Share of half the picture's width in which it should be."""
+"""The inner share of half the picture's width within which an Object should be seen."""
 _DISTANCES2 = 1.6 * 1.6
 """Square of the ratio of two distances up to which they are similar."""
 _TURN2 = 0.87 * 0.87
 """Square of the least cosine between similar lines of sight, 30°."""
 _PRIOR = 8.0
 _WEIGHTS = 2, 1, 0
-"""Of the first, the second and each other look from one cell in one run, in halves of a look."""
+"""Weights of the first, the second and each other look from one cell in one run, in halves of a
+look."""
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
 _MISSING = 0.1
 _LEAST_MISSES, _LEAST_HITS = 2, 2
@@ -64,11 +65,11 @@ _Cell = tuple[int, int]
 
 @dataclass(slots=True, eq=False)
 class Attendance:
-    """What is known of one Object. ``hits`` and ``misses`` are those of all looks while it was not
+    """The record of one Object. ``hits`` and ``misses`` are those of all looks while it was not
     missing, in halves; ``odds`` and ``run_misses`` (keyframes) those of ``run``, the last run that
-    saw or missed it. ``confirmed`` is the last run before ``run`` that it surely was there in,
-    ``seen`` the last that has seen it. ``estimate`` is its position, metres, and the entries xx,
-    xy, yy of the covariance, m². ``looks`` are hits and misses by cell in ``looks_run``."""
+    saw or missed it. ``confirmed`` is the last run before ``run`` in which it surely was there,
+    ``seen`` the last that saw it. ``estimate`` is its position, metres, and the entries xx, xy, yy
+    of the covariance, m². ``looks`` are hits and misses by cell in ``looks_run``."""
 
     home: RunOrdinal
     run: RunOrdinal
@@ -85,7 +86,7 @@ class Attendance:
     cells: set[_Cell] = field(default_factory=set)
 
     def weight(self, run: RunOrdinal, cell: _Cell, is_hit: bool) -> int:
-        """What a look from a cell counts, in halves; counted as one more."""
+        """Count a look from a cell and return its weight, in halves of a look."""
         if run != self.looks_run:
             self.looks_run = run
             self.looks.clear()
@@ -96,7 +97,7 @@ class Attendance:
         return _WEIGHTS[before]
 
     def enter(self, run: RunOrdinal) -> None:
-        """What follows is of this run."""
+        """Begin a run, unless it is the current one. Odds above 1 are reset to 1."""
         if run != self.run:
             if self.odds >= 1.0:
                 self.confirmed, self.odds = self.run, 1.0
@@ -140,8 +141,8 @@ class Presence:
         ]
 
     def relocate(self, old: ObjectOrdinal, new: ObjectOrdinal) -> None:
-        """The Object ``old`` stands where ``new`` was found, which is absorbed: forget from where
-        it was seen before."""
+        """Forget the vantages of ``old``, which was relocated to where ``new``, now absorbed, was
+        found."""
         self._unlist(old)
         self._unlist(new, old)
         known = self.attendance.pop(new)
@@ -149,7 +150,7 @@ class Presence:
         self.attendance[old] = known
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         known = sorted(self.attendance.items())
         vantages = sorted(
             (*c, o, *at) for c, near in self._vantages.items() for o, at in near.items()
@@ -172,7 +173,7 @@ class Presence:
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._hits, self._misses = state["looks"]
         numbers = state["numbers"].tolist()
         for (ordinal, *known), (*estimate, odds) in zip(state["objects"], numbers, strict=True):
@@ -188,7 +189,7 @@ class Presence:
             self._list(ordinal, (column, row), (at[0], at[1]))
 
     def _apply(self, run: RunOrdinal, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
-        """Bring estimates and merges up to date; the Objects seen, ascending."""
+        """Apply estimates and merges; returns the Objects seen, ascending."""
         attendance, seen = self.attendance, set[ObjectOrdinal]()
         for delta in fused:
             if type(delta) is ObjectSeen:
@@ -208,7 +209,8 @@ class Presence:
         return sorted(seen)
 
     def _merge(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
-        """Hits, misses and vantages are of both. A part found in another run was there then."""
+        """Add up hits, misses and vantages. An Object was there in the runs that found either
+        part."""
         known, other = self.attendance[survivor], self.attendance[absorbed]
         known.hits += other.hits
         known.misses += other.misses
@@ -222,7 +224,7 @@ class Presence:
     def _look(
         self, run: RunOrdinal, pose: Pose, camera: Camera, seen: Sequence[ObjectOrdinal]
     ) -> list[ObjectOrdinal]:
-        """Count hits and misses; the Objects that are missing now."""
+        """Count hits and misses; returns the Objects that became missing."""
         self.missed = []
         cell = pose.x_um // _CELL_UM, pose.y_um // _CELL_UM
         near = self._vantages.get(cell)
@@ -286,7 +288,7 @@ class Presence:
         self._vantages.setdefault(cell, {})[ordinal] = at
 
     def _unlist(self, ordinal: ObjectOrdinal, heir: ObjectOrdinal | None = None) -> None:
-        """Take an Object's vantages away; an heir gets those in cells where it has none."""
+        """Remove an Object's vantages; ``heir`` gets those in cells where it has none."""
         known = self.attendance[ordinal]
         for cell in known.cells:
             at = self._vantages[cell].pop(ordinal)

@@ -1,14 +1,14 @@
-"""Finds a point of a dense cell within ε of a point beyond one of its sides, in O(log n), exactly.
+"""Find a point of a dense cell within ε of a point beyond one of its sides, exactly, in O(log n).
 
-A cell that a robot visits for a year holds ten thousand points, and a keyframe in a nearby cell
-needs this answer. Seen from the left of the cell, each point of it covers a region between the left
-arc of its ε-circle and the cell's far side. The left boundaries of two such regions have one point
-in common (the slope of the lower centre's arc is the greater one everywhere): their arcs cross, or
-one arc meets the edge of the other's region. So along the envelope of all regions the centres
-ascend, and each is on it for one interval of heights. A new centre is kept if it has an interval,
-and removes the neighbours that have none any more; a query finds the centre at its height by
-bisection and compares one distance (the "unit-spherical emptiness checking with line separation" of
-Gan and Tao 2015).
+A cell that a robot visits for a year holds ten thousand points, and each keyframe in a nearby cell
+needs this look-up. Seen from the left of the cell, each point of it covers a region between the
+left arc of its ε-circle and the cell's far side. The left boundaries of two such regions have one
+point in common (the slope of the lower centre's arc is the greater one everywhere): their arcs
+cross, or one arc meets the edge of the other's region. So along the envelope of all regions the
+centres ascend, and each is on it for one interval of heights. A new centre is kept if it has an
+interval, and removes the neighbours that have none any more; a query finds the centre at its height
+by bisection and compares one distance (the "unit-spherical emptiness checking with line separation"
+of Gan and Tao 2015).
 
 All arithmetic is on integers. The height where two arcs cross has a square root in it; to compare
 it with another height, signs are compared, then squares.
@@ -41,7 +41,7 @@ def _exceeds(a: int, p: int, b: int, q: int) -> bool:
 class ReachIndex:
     """The envelope of a cell's points towards one side.
 
-    ``added`` is how many of the cell's points are in; the caller adds the rest, in their order,
+    ``added`` is the number of the cell's points added so far; the caller adds the rest in order
     before a query.
     """
 

@@ -1,11 +1,11 @@
-"""Relocations: which new Object is one that stood elsewhere in an earlier run.
+"""Relocations: find new Objects that are older ones moved since an earlier run.
 
-A *newcomer* is an Object with `_LEAST_NEW` observations or more. Whatever another run found before
-it, of the same class and at least a metre away, may be the same thing, unless it was surely seen in
-that run where it stands: its odds to be still there (`presence`) are above `_STILL`. The evidence
-is
+A *newcomer* is an Object with `_LEAST_NEW` observations or more. Any Object of the same class that
+another run found before, at least a metre away, may be the same thing, unless the newcomer's run
+surely saw it at its old position: its odds to be still there (`presence`) are above `_STILL`. The
+evidence is
 
-    the log-likelihood ratio of their looks, however they stand (`turned_looks`), at least
+    the log-likelihood ratio of their looks, whatever their headings (`turned_looks`), at least
     `_LEAST_LOOK`;
     less the largest such ratio, if above 0, of one of them and a third Object: of the newcomer and
     another older one, or of the older one and another that was seen since the newcomer's run began.
@@ -41,14 +41,14 @@ _LEAST_NEW, _LEAST_RIVAL = 3, 2
 """Fewest observations of a newcomer, and of a third Object."""
 _APART_M2, _APART_CHI2 = 1.0, 16.0
 _ONE_FLOOR_M2 = 5e7 * 5e7
-"""Farther apart are only Objects on two floors, which are laid out beside each other."""
+"""Objects farther apart are on two floors, which are laid out beside each other."""
 _LEAST_LOOK, _ENOUGH, _GONE = 2.0, 2.0, 0.5
 _STILL = 8.0
 _MOST = 128
 
 
 class Comparing(Protocol):
-    """What is asked of the reducer of Objects."""
+    """The interface of the reducer of Objects that relocations need."""
 
     def class_of(self, ordinal: ObjectOrdinal) -> str:
         """The class of most of an Object's observations."""
@@ -93,9 +93,9 @@ class Relocations:
         self._by_class: dict[str, dict[ObjectOrdinal, None]] = {}
 
     def fold(self, fused: Iterable[Delta]) -> list[Moved]:
-        """The Objects that turn out to stand elsewhere; the caller makes the two of each one.
+        """The Objects found to be relocated; the caller merges the two of each.
 
-        ``fused`` are the deltas of fusion; `Presence` must have taken them in.
+        ``fused`` are the deltas of fusion; `Presence` must have applied them.
         """
         pairs: list[Moved] = []
         due = self._apply(fused)
@@ -113,14 +113,14 @@ class Relocations:
         return pairs
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         return {
             "newcomers": [[ordinal, *newcomer] for ordinal, newcomer in self._newcomers.items()],
             "classes": [[name, list(own)] for name, own in sorted(self._by_class.items())],
         }
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         for ordinal, first, due_at in state["newcomers"]:
             self._newcomers[ordinal] = _Newcomer(first, due_at)
         for name, ordinals in state["classes"]:
@@ -149,8 +149,8 @@ class Relocations:
         return [ordinal for ordinal in due if ordinal in self._newcomers]
 
     def _newcomer_like(self, old: ObjectOrdinal) -> list[ObjectOrdinal]:
-        """The newcomer that looks most like an Object, of equal ones the latest; none if it does
-        not look like it enough."""
+        """The newcomer that looks most like an Object, of equal ones the latest; none if its ratio
+        is too low."""
         own = self._by_class.get(self._objects.class_of(old), {})
         newcomers = [
             ordinal
@@ -164,7 +164,7 @@ class Relocations:
         return [max(alike)[1]] if alike else []
 
     def _best(self, newcomer: ObjectOrdinal) -> _Candidate | None:
-        """The Object that the newcomer is, if it is one."""
+        """The older Object that the newcomer is; None if it is none."""
         own = self._by_class.get(self._objects.class_of(newcomer), {})
         observations_of = self._objects.observations_of
         mates = [o for o in own if o != newcomer]
@@ -189,7 +189,7 @@ class Relocations:
         return best if best.value - max(rival, 0.0) >= _ENOUGH else None
 
     def _could_be(self, old: ObjectOrdinal, newcomer: ObjectOrdinal) -> bool:
-        """Whether they can be one thing, whatever they look like."""
+        """Whether the two can be one thing, apart from their looks."""
         before, now = self._presence.attendance[old], self._presence.attendance[newcomer]
         pairs = zip(now.estimate, before.estimate, strict=True)
         (x, before_x), (y, before_y), *variances = pairs

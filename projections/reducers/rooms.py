@@ -1,8 +1,8 @@
 """Places by rooms (``places = "rooms"``): clusters by the mean distance driven between cells.
 
-The rules (docs/places.md says what they were chosen among):
+The rules (docs/places.md lists the alternatives):
 
-1.  A keyframe belongs to a *cell*, the ground about the first pose there, and a cell to a place
+1.  A keyframe belongs to a *cell*, the area around the first pose there, and a cell to a place
     (`projections.reducers.driven_cells`). So every keyframe with a pose has a place on arrival.
 2.  The *mean drive* of two places is the mean driven distance between the cells of one and those of
     the other; pairs of cells that are twice ``drive_um`` or more apart count as that far.
@@ -21,7 +21,7 @@ pair of cells or more. These sums are integers, kept for places within reach, an
 the pairs that come nearer.
 
 A place has a bounded number of cells: at least half of them are within reach of the cell that it
-takes in. So what a keyframe costs is bounded by what is near.
+takes in. So the cost of a keyframe is bounded by the number of cells near it.
 """
 
 from collections.abc import Iterable
@@ -59,7 +59,7 @@ class Pair(NamedTuple):
 
 
 class Rooms(PlaceMembers):
-    """The reducer. Tell it of an anchor's keyframe before it is folded."""
+    """The reducer of places by rooms. `add_anchor` precedes `fold` of the anchor's keyframe."""
 
     def __init__(
         self,
@@ -83,22 +83,22 @@ class Rooms(PlaceMembers):
         self._positions: dict[KeyframeOrdinal, tuple[int, int]] = {}
 
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
-        """A keyframe that may be an anchor."""
+        """Register a keyframe as an anchor, if it is one."""
         self._anchors.add(keyframe, anchor)
 
     def use_walls(self, way_at: WayAt | None) -> None:
-        """From now on cells and links are made by these walls; what was made stays as it is."""
+        """Use these walls for cells and links from now on; existing ones stay."""
         self._cells.way_at = way_at
 
     def fold(self, posed: PosedKeyframe) -> list[Delta]:
-        """Add a keyframe with a pose; what it changed, in the order of the delta contract."""
+        """Add a keyframe with a pose; returns the deltas in the order of `projections.deltas`."""
         offset, keyframe, run, run_id, x_um, y_um = posed
         point = self.add_point(keyframe, run, run_id)
         cell, last = self._cells.find(x_um, y_um), self._last_cells.get(run)
         is_anchor = keyframe in self._anchors
         if cell is not None and (not is_anchor or self._may_enter(keyframe, cell)):
             deltas = list[Delta]()
-            if is_anchor:  # what its place merges with now must suit it
+            if is_anchor:  # the anchors of its place affect the merges that follow
                 self._anchors.enter(self._place_of_cell(cell), self._anchors.own(keyframe))
             if last is not None and not self._cells.is_linked(last, cell):
                 deltas = self._merge_all(offset, keyframe, self._link(last, cell))
@@ -122,7 +122,7 @@ class Rooms(PlaceMembers):
         return deltas
 
     def dump(self) -> State:
-        """Everything, for a snapshot."""
+        """The whole state, for a snapshot."""
         own = {
             "cell_places": list(self._cell_places),
             "cell_founders": list(self._founders),
@@ -133,7 +133,7 @@ class Rooms(PlaceMembers):
         return super().dump() | own | parts
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave. Closeness is added up again."""
+        """Restore the state of `dump`. Closeness is added up again."""
         super().load(state)
         self._cells.load(part("cells", state))
         self._anchors.load(part("anchors", state), self.place_of)
@@ -158,7 +158,7 @@ class Rooms(PlaceMembers):
         return self.survivors.find(self._cell_places[cell])
 
     def _link(self, a: int, b: int) -> set[Pair]:
-        """Link two cells of places; the pairs of places that come closer."""
+        """Link two cells of places; returns the pairs of places that come closer."""
         closer = set[Pair]()
         for one, other, before_um, distance in self._cells.link(a, b):
             pair = self._come_closer(one, other, before_um - distance)
@@ -167,7 +167,7 @@ class Rooms(PlaceMembers):
         return closer
 
     def _come_closer(self, one: int, other: int, by_um: int) -> Pair | None:
-        """Two cells are closer; their places if these are two."""
+        """Add to the closeness of two cells' places; returns the pair if there are two places."""
         a, b = self._place_of_cell(one), self._place_of_cell(other)
         if a == b:
             return None
@@ -176,7 +176,7 @@ class Rooms(PlaceMembers):
         return Pair(min(a, b), max(a, b))
 
     def _give_place(self, offset: Offset, founder: int, cell: int, last: int | None) -> list[Delta]:
-        """Give a new cell its place (rule 3), and merge what comes closer by it."""
+        """Give a new cell its place (rule 3), and merge places that come closer by it."""
         closer = set[Pair]()
         around = self._cells.with_a_way_to(cell)
         for other in around if last is None else (last, *around):
@@ -260,11 +260,11 @@ class Rooms(PlaceMembers):
         return len(self._own_cells[place])
 
     def _pairs_of(self, place: PlaceOrdinal) -> set[Pair]:
-        """The place with each that is within reach."""
+        """The pairs of a place and each place within reach."""
         return {Pair(min(place, other), max(place, other)) for other in self._closeness[place]}
 
     def _of_survivors(self, pairs: Iterable[Pair]) -> set[Pair]:
-        """The pairs of the places that these are parts of now."""
+        """The pairs of the survivors of these places."""
         find = self.survivors.find
         both = ((find(a), find(b)) for a, b in pairs)
         return {Pair(min(each), max(each)) for each in both if each[0] != each[1]}
@@ -277,7 +277,7 @@ class Rooms(PlaceMembers):
         link: PlaceLink,
         drive: MeanDrive | None,
     ) -> PlacesMerged:
-        """Make the two one; without a mean drive, because a command joins them."""
+        """Merge a pair; ``drive`` is None if a command joins them."""
         survivor, absorbed = pair
         counts = self.member_counts
         delta = PlacesMerged(
@@ -304,8 +304,8 @@ class Rooms(PlaceMembers):
         return delta
 
     def _link_of(self, pair: Pair) -> PlaceLink:
-        """The founders of the two places' cells that are the shortest drive apart, and how far
-        that is; of several the earliest. There are such: places without are not close."""
+        """The founders of the two places' cells that are the shortest drive apart, and how far that
+        is; of several the earliest. Places that merge always have some within reach."""
         distance, cell, other = min(
             (distance, cell, other)
             for cell in self._own_cells[pair.a]

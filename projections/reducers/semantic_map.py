@@ -8,10 +8,10 @@ Per keyframe, in this order:
 2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
-    to Objects: one by one under the page's rule, all together under fusion by evidence. A keyframe
-    without a pose is only kept. Floors are laid out beside each other (`floors`).
-4.  Names of places, located-in and adjacency are given the changes of places and Objects, in order,
-    and give the deltas that follow from them.
+    to Objects: one by one under `fusion = "page"`, all together under fusion by evidence. A
+    keyframe without a pose is only added. Floors are laid out beside each other (`floors`).
+4.  Names of places, located-in and adjacency get the changes of places and Objects, in order, and
+    return the deltas that follow from them.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
 """
@@ -115,7 +115,7 @@ class SemanticMap:
         self._has_vectors = bool(corrections.reembedded_for(settings))
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
-        """Take over an occupancy map, which holds for the events after it; what changed."""
+        """Put an occupancy map into force for the events after it; returns the deltas."""
         self.next_offset = Offset(offset + 1)
         given_map = self.current_map.fold(offset, given)
         self._use_walls()
@@ -132,7 +132,7 @@ class SemanticMap:
     def fold(
         self, offset: Offset, accepted: Accepted, units: Sequence[Units | None] | None = None
     ) -> list[Delta]:
-        """Fold one envelope; what it changed, in the order `projections.deltas` states.
+        """Fold one envelope; returns the deltas in the order of `projections.deltas`.
 
         ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand. Raises
         FoldError where a correction cannot be applied; the map is as before the event then.
@@ -207,7 +207,8 @@ class SemanticMap:
         return self.floors.put_back(deltas)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
-        """Replace the names of places, as if they had been known from the start; what changes.
+        """Replace the names of places, as if they had been known from the start; returns the
+        deltas.
 
         In everything else ``corrections`` must be those of the map: ValueError if they are not.
         """
@@ -238,7 +239,7 @@ class SemanticMap:
         return reduce(or_, parts, own)
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave, into a map that has folded nothing yet; `use_names` gives the
+        """Restore the state of `dump` in a map that has folded nothing yet; `use_names` adds the
         names."""
         self.next_offset = state["next_offset"]
         self.observation_count = state["observation_count"]
@@ -279,7 +280,7 @@ class SemanticMap:
         units: Sequence[Units | None],
         deltas: list[Delta],
     ) -> list[FusibleObservation]:
-        """Add the observations; those with a vector in the map's space."""
+        """Add the observations; returns those with a vector in the map's space."""
         envelope, det_ids = accepted.envelope, self.folded_ids.det_ids
         run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
         fusible: list[FusibleObservation] = []
@@ -337,7 +338,8 @@ class SemanticMap:
         pose: Pose,
         deltas: list[Delta],
     ) -> PlaceOrdinal | None:
-        """Run places and tell located-in and adjacency; the keyframe's own place."""
+        """Run places, report the changes to located-in and adjacency, and return the keyframe's
+        place."""
         folded_ids, place = self.folded_ids, None
         changes = self.places.fold(
             PosedKeyframe(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
@@ -371,7 +373,7 @@ class SemanticMap:
         timestamp: float,
         deltas: list[Delta],
     ) -> None:
-        """Run the fusion of the page's rule and tell located-in."""
+        """Run `fusion = "page"` and report the sightings to located-in."""
         x_um, y_um = pose.x_um, pose.y_um
         if isinstance(objects, ConstrainedObjects):
             for seen in fusible:
@@ -387,7 +389,7 @@ class SemanticMap:
     def _locate(
         self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
-        """Tell located-in what was seen, what became one and what stands elsewhere."""
+        """Report sightings, merges and relocations of Objects to located-in."""
         for number, delta in enumerate(fused, start=1):
             if type(delta) is ObjectSeen:
                 self.located_in.object_seen(delta.object, keyframe, place)

@@ -2,15 +2,15 @@
 
 A sight is a ray from the camera. Its bearing comes from the box's centre in a level pinhole camera,
 f = width / 2 / tan(hfov / 2); a box that the picture's border cuts at a side has a larger bearing
-error. The error of the mapped pose is in it too, so at the distance a the variance across the ray
-is (bearing error · a)² + (pose error)².
+error. The error of the pose is added, so at the distance a the variance across the ray is (bearing
+error · a)² + (pose error)².
 
 An envelope may state its own pose's covariance. Then the variance across the ray is that of the
 position in the direction across it, and the bearing error is at least that of the heading.
 
 The box's height and its centre's height above the horizon, where the border cuts it neither at top
-nor at bottom, tell about the distance once they are compared (`spots`). A measured depth or
-position of the detection gives it directly.
+nor at bottom, are evidence of the distance once boxes are compared (`spots`). A measured depth or
+position of the detection gives the distance directly.
 """
 
 import math
@@ -32,11 +32,11 @@ _HALF_DEGREE = 0.008726646259971648
 _LEAST_M = 0.05
 _LEAST_ERROR_M = 0.001
 _MOST_BEARING_RAD2 = 10.0
-"""A heading of which nothing is known."""
+"""The variance of an unknown heading."""
 _FAR_PX = 1e6
 _LEAST_PX = 0.5
 _STEEPEST = 10.0
-"""Greatest slope of a line of sight, up or down, at which a box tells a height: 84°."""
+"""The greatest slope of a line of sight, up or down, at which a box gives a height: 84°."""
 
 
 @lru_cache(maxsize=64)
@@ -75,11 +75,11 @@ class PoseError(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """From (x, y) along the unit vector (cos, sin). The variance across the ray at the distance a
-    is ``a² · across_per_m2 + across_m2``. ``log_height`` is the logarithm of the box's height over
-    the focal length, along the ray: + log(distance) is that of the thing's height in metres; None
-    where the border cuts it. (side_cos, side_sin) is the direction that tells from which side
-    the thing is seen, by line of sight or heading. ``measured`` is a distance and its variance."""
+    """A ray from (x, y) along the unit vector (cos, sin). The variance across the ray at the
+    distance a is ``a² · across_per_m2 + across_m2``. ``log_height`` is the logarithm of the box's
+    height over the focal length, along the ray: + log(distance) is that of the thing's height in
+    metres; None where the border cuts it. (side_cos, side_sin) is the direction from which the
+    thing is seen, by line of sight or heading. ``measured`` is a distance and its variance."""
 
     x: float
     y: float

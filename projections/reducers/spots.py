@@ -1,9 +1,9 @@
-"""Where a thing stands: the estimate from its sights, and how sure it is.
+"""Estimate a thing's position and its covariance from sights.
 
 Sights from one spot (closer than `SPOT_M`) share their errors: twelve views from one pose are no
 triangulation. So a spot keeps the mean of its sights, and they weigh min(n, 1.5) together; a sight
-that may be of another thing counts as its probability. Of all spots, what is known beforehand about
-the range is shared too and weighs 1.5 spots together.
+that may be of another thing counts as its probability. The range prior is shared by all spots, too,
+and weighs as much as 1.5 spots.
 
 The unknowns are the position p, the logarithm z of the thing's height, and its elevation e above
 the camera. At the distance a from a spot,
@@ -14,16 +14,16 @@ the camera. At the distance a from a spot,
     its centre  a · slope = e                    (SLOPE · a)² + (2 cm)²; a level camera
     measured    a = depth                        that of the depth or position
 
-z and e start from what their class is like (`class_heights`). Driving towards a thing, its growing
-box tells its distance as a change of bearing does. Gauss-Newton in information form; z and e are
+z and e have their class's priors (`class_heights`). On a drive towards a thing, its growing box
+determines the distance, as a change of bearing does. Gauss-Newton in information form; z and e are
 eliminated (Schur's complement). A residual beyond about two standard errors weighs less (Cauchy).
 
 Each spot's part of the normal equations is kept, linearised where the estimate was; a sight changes
 the part of its spot alone. All are computed again once the estimate has moved by more than
 `_MOVED_M` since. +, −, ×, ÷, √ in one fixed order: the same bits on every machine.
 
-What all poses have in common (a session's drift, a box whose centre is not the thing's) does not
-fade with their number: `COMMON_M2` is added to the variance of the estimate.
+Errors common to all poses (a session's drift, a box whose centre is not the thing's) do not average
+out: `COMMON_M2` is added to the variance of the estimate.
 """
 
 import math
@@ -41,12 +41,13 @@ SIZE = 0.12
 SLOPE = 0.02
 LEAST_ELEVATION_M2 = 0.0004
 VIEWS_OF_A_SPOT = 1.5
-"""As many independent views all those of one spot count together."""
+"""The number of independent views that all views of one spot count as."""
 _TAIL = 4.0
 _MORE_ROUNDS = 1
 _MOVED_M = 0.2
 _LEAST_DET, _FARTHEST_M, _MOST_VARIANCE_M2 = 1e-13, 1e5, 1e7
-"""Beyond these a solution is none; no sane picture of a level camera comes near them."""
+"""Solutions beyond these bounds are refused; no plausible picture of a level camera comes near
+them."""
 COMMON_M2 = 0.02
 """(0.14 m)²."""
 _WEIGHT, _COUNT, _HEIGHT, _HEIGHTS, _SLOPED, _DEPTH, _DEPTH_WEIGHT = range(6, 13)
@@ -95,7 +96,7 @@ class Spots:
         self.seen_from = 0
 
     def add(self, sight: Sight, share: float) -> int:
-        """Take in a sight; the index of its spot, whose part is out of date then."""
+        """Add a sight and return the index of its spot, whose part is then out of date."""
         x, y, cos, sin, per_m2, least, height, slope, _, _, measured = sight
         weight, heights, depth, depth_weight = share / (per_m2 + least), share, 0.0, 0.0
         if height is None:
@@ -106,8 +107,7 @@ class Spots:
         return self._add_spot([*numbers, depth, depth_weight])
 
     def add_all(self, other: "Spots") -> None:
-        """Add the spots of another thing, which has turned out to be the same. All parts are
-        out of date then."""
+        """Add the spots of an absorbed thing. All parts are then out of date."""
         for spot in other.spots:
             self._add_spot(spot)
 

@@ -1,4 +1,4 @@
-"""Which place or Object lives on after merges: union-find with path halving."""
+"""Survivors of merged places and Objects: union-find with path halving."""
 
 from collections.abc import Iterable
 from typing import Generic, TypeVar
@@ -11,8 +11,8 @@ _Ordinal = TypeVar("_Ordinal", bound=int)
 class Survivors(Generic[_Ordinal]):
     """Absorbed things and their survivors; `merge` is called for every merge, in order.
 
-    ``absorbed_by`` maps each absorbed thing to one that took it over, which may have been absorbed
-    itself; `find` shortens these chains.
+    ``absorbed_by`` maps each absorbed thing to its absorber, which may have been absorbed itself;
+    `find` shortens these chains.
     """
 
     __slots__ = ("absorbed_by",)
@@ -21,12 +21,12 @@ class Survivors(Generic[_Ordinal]):
         self.absorbed_by: dict[_Ordinal, _Ordinal] = {}
 
     def merge(self, survivor: _Ordinal, absorbed: Iterable[_Ordinal]) -> None:
-        """``absorbed`` are parts of ``survivor`` from now on."""
+        """Record that ``survivor`` absorbed each of ``absorbed``."""
         for each in absorbed:
             self.absorbed_by[each] = survivor
 
     def find(self, each: _Ordinal) -> _Ordinal:
-        """What stands for ``each`` now; itself unless it was absorbed."""
+        """The survivor of ``each``; itself unless it was absorbed."""
         absorbed_by = self.absorbed_by
         while (parent := absorbed_by.get(each)) is not None:
             grandparent = absorbed_by.get(parent)
@@ -37,12 +37,12 @@ class Survivors(Generic[_Ordinal]):
 
 
 class PlaceSurvivors(Survivors[PlaceOrdinal]):
-    """Of places."""
+    """Survivors of places."""
 
     __slots__ = ()
 
 
 class ObjectSurvivors(Survivors[ObjectOrdinal]):
-    """Of Objects."""
+    """Survivors of Objects."""
 
     __slots__ = ()

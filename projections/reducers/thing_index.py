@@ -1,4 +1,4 @@
-"""All Objects of fusion by evidence, found by where they stand.
+"""Index of all Objects of fusion by evidence, by estimated position.
 
 An Object is within reach of a point at most ``reach_m`` from its estimate. Each is listed in the
 nine cells of that side around its estimate, so one look-up finds all that are within reach.
@@ -50,7 +50,7 @@ class ThingIndex:
         return thing
 
     def survivor_of(self, ordinal: ObjectOrdinal) -> ObjectOrdinal:
-        """The Object that it is part of now."""
+        """The Object's survivor after all merges."""
         while ordinal in self._survivors:
             ordinal = self._survivors[ordinal]
         return ordinal
@@ -63,7 +63,8 @@ class ThingIndex:
         return ordinal
 
     def solve(self, ordinal: ObjectOrdinal, thing: Thing, spot: int | None = None) -> None:
-        """Estimate where an Object stands, and list it there; one spot has changed, or all."""
+        """Estimate an Object's position after one spot changed, or all (None), and list it
+        there."""
         prior = self._heights.prior(thing.class_name)
         before = thing.estimate
         if before is None:
@@ -89,7 +90,8 @@ class ThingIndex:
         )
 
     def listed(self, x: float, y: float) -> NDArray[np.int64]:
-        """The Objects within reach of a point and some around, ascending; kept until it changes."""
+        """The Objects within reach of a point and some more, ascending; cached until the index
+        changes."""
         cell = int(x // self.reach_m), int(y // self.reach_m)
         ordinals = self._sorted.get(cell)
         if ordinals is None:
@@ -97,7 +99,7 @@ class ThingIndex:
         return ordinals
 
     def count_meetings(self, seen: list[ObjectOrdinal]) -> None:
-        """One picture shows them all."""
+        """Count a picture that shows all of these Objects."""
         things = [self.thing(ordinal).met for ordinal in seen]
         for index, (one, met) in enumerate(zip(seen, things, strict=True)):
             for other, met_too in zip(seen[:index], things, strict=False):
@@ -152,7 +154,7 @@ class ThingIndex:
             self._sorted.pop(around, None)
 
     def dump(self) -> State:
-        """Everything, for a snapshot. The looks are one matrix, a row for each exemplar."""
+        """The whole state, for a snapshot. The looks are one matrix, a row for each exemplar."""
         alive = [(o, thing) for o, thing in enumerate(self._things) if thing is not None]
         things = [thing for _, thing in alive]
         looks = [thing.looks[[mark[ROW] for mark in thing.marks]] for thing in things]
@@ -180,7 +182,7 @@ class ThingIndex:
         } | prefixed("heights", self._heights.dump())
 
     def load(self, state: State) -> None:
-        """Take over what `dump` gave."""
+        """Restore the state of `dump`."""
         self._things = [None] * state["size"]
         self._survivors = {ObjectOrdinal(a): ObjectOrdinal(b) for a, b in state["survivors"]}
         self._heights.load(part("heights", state))

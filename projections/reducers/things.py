@@ -53,7 +53,7 @@ class Thing:
     def keep(
         self, look: NDArray[np.float32], inverse: float, cos: float, sin: float, run: int
     ) -> None:
-        """Make a look an exemplar."""
+        """Add a look as an exemplar."""
         kind = run * 8 + (cos > 0.0) * 4 + (sin > 0.0) * 2 + (abs(cos) > abs(sin))
         marks = self.marks
         row = len(marks)
@@ -72,13 +72,14 @@ class Thing:
         return sorted(self.marks, key=itemgetter(ROW))
 
     def where(self) -> Estimate:
-        """The estimate, which every thing has that is in the index."""
+        """The estimate, which every thing in the index has."""
         if self.estimate is None:
             raise ValueError("this thing was never estimated")
         return self.estimate
 
     def count_label(self, label: str) -> None:
-        """Count an observation's label. As `reclassify`, without a look at all classes."""
+        """Count an observation's label and update the class as `reclassify` does, without comparing
+        all classes."""
         count = self.classes.get(label, 0) + 1
         self.classes[label] = count
         most = self.classes[self.class_name]
@@ -89,11 +90,11 @@ class Thing:
             self.class_name = next(name for name in self.classes if name in both)
 
     def reclassify(self) -> None:
-        """Take the class of most observations, the one seen first where two tie."""
+        """Set the class to that of most observations; of several the one seen first."""
         self.class_name = max(self.classes, key=self.classes.__getitem__)
 
     def absorb(self, other: "Thing") -> None:
-        """Take over all that another thing has."""
+        """Add all observations, spots and exemplars of another thing."""
         self.count += other.count
         self.sum_x_um += other.sum_x_um
         self.sum_y_um += other.sum_y_um

@@ -1,11 +1,11 @@
-"""How much the looks of two things speak for one that was turned by an unknown angle.
+"""The log-likelihood ratio of the looks of two things that may be one, turned by an unknown angle.
 
-A thing that was carried elsewhere stands turned there, so from which sides its pictures are is
-known for each position only. Of two things the ratio of likelihoods (`looks`) is taken for
-`_TURNS` angles between them: the mean of the logarithms over all pairs of exemplars, each within
-±`_MOST_PER_PAIR`, times √(m · n) for m and n exemplars, since pairs of few exemplars are no
-independent evidence. The likelihoods of all angles are averaged. A pair that is less alike than
-things of different classes counts as those.
+A thing that was moved may also be turned, so the sides seen at one position cannot be compared with
+those at the other. Of two things the ratio of likelihoods (`looks`) is taken for `_TURNS` angles
+between them: the mean of the logarithms over all pairs of exemplars, each within ±`_MOST_PER_PAIR`,
+times √(m · n) for m and n exemplars, since pairs of few exemplars are no independent evidence. The
+likelihoods of all angles are averaged. A pair that is less alike than things of different classes
+counts as those.
 
 The mean is that of integers; √ and +, −, ×, ÷ in one order make the rest bit-exact.
 """
