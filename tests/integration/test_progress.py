@@ -111,7 +111,7 @@ def names() -> list[str]:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log L with a command in it."""
-    log = write_log(tmp_path_factory.mktemp("progress") / "L", walk(60, detections=3))
+    log = write_log(tmp_path_factory.mktemp("progress") / "L", walk(30, detections=3))
     append_command(log, name_place(3, "hall"))
     return log
 

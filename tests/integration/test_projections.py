@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import psycopg
@@ -26,12 +27,33 @@ SETTINGS = Settings()
 LOADERS: list[LoaderName] = ["copy", "insert"]
 
 
-@pytest.fixture
-def log(tmp_path: Path) -> Path:
+def log_in(folder: Path) -> Path:
     """Two runs with merges, duplicates, noise, odd names, keyframes without pose."""
     documents = walk(120) + walk(60, run_id="x'}) DETACH DELETE r //", seed=2)
     documents += walk(5) + list(bridge()) + walk(40, run_id="run-c", seed=3)
-    return write_log(tmp_path / "log", documents)
+    return write_log(folder / "log", documents)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return log_in(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def replayed_log(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Path:
+    """The log whose map ``module_database`` has, for tests that only read."""
+    log = log_in(tmp_path_factory.mktemp("replayed"))
+    rebuild(log, module_database, SETTINGS)
+    return log
+
+
+@pytest.fixture
+def replayed(replayed_log: Path, module_database: Targets) -> Iterator[psycopg.Connection]:
+    """A session of a user who asks what has been replayed."""
+    with psycopg.connect(module_database.graph_url, autocommit=True) as connection:
+        connection.execute("LOAD 'age'")
+        connection.execute('SET search_path = ag_catalog, "$user", public')
+        yield connection
 
 
 def view_of(log: Path, until: int | None = None, settings: Settings = SETTINGS) -> MapView:
@@ -121,11 +143,10 @@ def test_each_sink_alone_has_its_own_checkpoint(log: Path, two_databases: Target
 
 
 def test_the_table_has_the_columns_of_the_design(
-    log: Path, one_database: Targets, pg: psycopg.Connection
+    replayed_log: Path, module_database: Targets, replayed: psycopg.Connection
 ) -> None:
-    rebuild(log, one_database, SETTINGS)
-    view = view_of(log)
-    columns = pg.execute(
+    view = view_of(replayed_log)
+    columns = replayed.execute(
         "SELECT attname::text, format_type(atttypid, atttypmod) FROM pg_attribute"
         " WHERE attrelid = 'detection_embeddings'::regclass AND attnum > 0 ORDER BY attnum"
     ).fetchall()
@@ -136,11 +157,11 @@ def test_the_table_has_the_columns_of_the_design(
         "map_y", "map_yaw", "embedding_model", "embedding", "ingested_at",
     ]  # fmt: skip
     searchable = [o for o in view.observations if o.embedding_crc is not None]
-    rows = vector_rows(one_database.vector_url)
+    rows = vector_rows(module_database.vector_url)
     assert [row[0] for row in rows] == [o.ordinal + 1 for o in searchable]
     assert [row[2] for row in rows] == [o.det_id for o in searchable]
     assert {row[4] for row in rows} == set(WEIRD)
-    with LogReader(log) as reader:
+    with LogReader(replayed_log) as reader:
         logged = {e.offset: e.logged_ns for e in reader.read()}
     for row, observation in zip(rows, searchable, strict=True):
         offset = view.keyframes[observation.keyframe].offset
@@ -148,16 +169,15 @@ def test_the_table_has_the_columns_of_the_design(
 
 
 def test_both_queries_of_the_design_work_verbatim(
-    log: Path, one_database: Targets, pg: psycopg.Connection
+    replayed_log: Path, replayed: psycopg.Connection
 ) -> None:
-    rebuild(log, one_database, SETTINGS)
-    view = view_of(log)
+    view = view_of(replayed_log)
     target = next(o for o in view.observations if o.object is not None)
-    row = pg.execute(
+    row = replayed.execute(
         "SELECT embedding::text FROM detection_embeddings WHERE det_id = %s", [target.det_id]
     ).fetchone()
     assert row is not None
-    nearest = pg.execute(
+    nearest = replayed.execute(
         "SELECT det_id, embedding <=> %s AS distance"
         " FROM detection_embeddings ORDER BY distance LIMIT 10",
         row,
@@ -167,7 +187,7 @@ def test_both_queries_of_the_design_work_verbatim(
     assert len(nearest) == 10
     for observation in [o for o in view.observations if o.object is not None][:40]:
         assert observation.object is not None
-        found = pg.execute(
+        found = replayed.execute(
             "SELECT * FROM cypher('semantic_map', $q$"
             " MATCH (obs:Observation {det_id: '" + observation.det_id.replace("'", "\\'") + "'})"
             "-[:OBSERVES]->(obj:Object)-[:LOCATED_IN]->(p:Place)"
@@ -248,11 +268,12 @@ def test_other_settings_are_refused_with_the_difference(log: Path, one_database:
     assert tail(log, one_database, other, once=True).events == 0
 
 
-def test_another_log_is_refused(log: Path, tmp_path: Path, one_database: Targets) -> None:
-    rebuild(log, one_database, SETTINGS)
+def test_another_log_is_refused(
+    replayed_log: Path, tmp_path: Path, module_database: Targets
+) -> None:
     other = write_log(tmp_path / "other", walk(200))
     with pytest.raises(ProjectionMismatch, match=r"made from log .* mapfold replay"):
-        tail(other, one_database, SETTINGS, once=True)
+        tail(other, module_database, SETTINGS, once=True)
 
 
 def test_a_log_that_was_cut_or_continued_differently_is_refused(

@@ -47,9 +47,9 @@ def test_simulate_without_a_subscriber_is_one_line(
 
 def test_a_file_is_written_with_its_numbers(tmp_path: Path) -> None:
     out = tmp_path / "run.jsonl.gz"
-    done = _mapfold("simulate", "--run", "c", "--out", str(out), "--json")
+    done = _mapfold("simulate", "--run", "b", "--out", str(out), "--json")
     numbers = json.loads(done.out)
-    run = simulated(run="c")
+    run = simulated(run="b")
     assert numbers["run_id"] == run.run_id
     assert numbers["keyframes"] == len(run.envelopes)
     assert Path(numbers["out"]).exists()
