@@ -156,11 +156,13 @@ def _call(request: Mapping[str, Any]) -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()  # while modules are imported, of which nothing is freed
     for module in MODULES:
         importlib.import_module(module)
     pydantic.create_model("First")  # has pydantic look for its plugins
     gc.collect()
     gc.freeze()
+    gc.enable()
     _use_huge_pages()
     with socket.socket(fileno=int(sys.argv[1])) as accepting:
         _request = _serve(accepting)

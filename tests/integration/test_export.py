@@ -4,7 +4,6 @@ import csv
 import json
 from pathlib import Path
 
-import networkx
 import pytest
 import yaml
 
@@ -42,6 +41,8 @@ def written(folder: Path) -> dict[str, bytes]:
 
 
 def test_all_formats_at_once_hold_the_map_of_state(mapfold: Commands, log: Path) -> None:
+    import networkx
+
     said = mapfold("export", log, *ALL, "m.yaml").err
     assert said == (
         "wrote m.graphml, m.dot, m.json, m.yaml, t/places.csv, t/objects.csv, t/keyframes.csv,"
@@ -118,6 +119,8 @@ def test_an_output_that_cannot_be_written_is_an_error(
 
 
 def test_an_empty_log_gives_empty_files(mapfold: Commands, tmp_path: Path) -> None:
+    import networkx
+
     write_log(tmp_path / "log", [])
     mapfold("export", "log", *ALL, "m.yaml")
     assert yaml.safe_load((tmp_path / "m.yaml").read_text()) == {"waypoints": {}}

@@ -5,14 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cyclonedds.core import InstanceState as State
-from cyclonedds.core import ReadCondition, SampleState, ViewState, WaitSet
-from cyclonedds.sub import DataReader
-from cyclonedds.util import duration
 
 from eventsrc.log import VerbatimEvent
 from eventsrc.transport.session import Session
-from tests import dds, ros2dds
+from tests import ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.ros2dds_drive import KINDS, drive
@@ -33,6 +29,8 @@ WRITER = "from tests.dds import main; main()"
 
 @pytest.mark.parametrize("number", range(4))
 def test_cyclone_and_rosbags_make_the_same_cdr(number: int) -> None:
+    from tests import dds
+
     for _, message in drive(number + 1):
         own = TYPES.encode(message, message.__msgtype__)
         assert dds.to_idl(message).serialize(use_version_2=False) == own
@@ -46,6 +44,13 @@ def test_a_drive_over_dds_and_a_bridge(
     connected: Callable[[], Session],
     start_code: Callable[..., Program],
 ) -> None:
+    from cyclonedds.core import InstanceState as State
+    from cyclonedds.core import ReadCondition, SampleState, ViewState, WaitSet
+    from cyclonedds.sub import DataReader
+    from cyclonedds.util import duration
+
+    from tests import dds
+
     sent = drive(KEYFRAMES)
     tag = uuid.uuid4().hex
     with dds.participant(tag) as own:

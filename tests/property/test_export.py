@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import networkx
 import numpy as np
 import pytest
 import yaml
@@ -57,6 +56,8 @@ def stands(view: MapView, found: Any) -> tuple[float, float]:
 
 @given(maps())
 def test_graphml_read_by_networkx_has_every_place_object_and_edge(view: MapView) -> None:
+    import networkx
+
     graph = networkx.parse_graphml(graphml(view))
     places = [node for node, v in graph.nodes(data=True) if v["label"] == "Place"]
     objects = {node: v for node, v in graph.nodes(data=True) if v["label"] == "Object"}
