@@ -34,6 +34,7 @@ from typer.core import TyperGroup
 
 from eventsrc.errors import MapfoldError
 
+from . import COMMANDS, SECTIONS
 from .in_force import remember_running
 from .presets import add_presets
 from .reading_bar import ReadingBar
@@ -266,6 +267,22 @@ class Program(TyperGroup):
         """As typer does it."""
         with _exceptions_passed_on():
             return super().invoke(ctx)
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 (click calls it so)
+        """The names of the commands, in the order of their sections."""
+        return [name for name in COMMANDS if name in self.commands]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 (as above)
+        """Write the list of commands for ``--help``, by section."""
+        longest = max(map(len, self.commands), default=0)
+        width = formatter.width - 6 - longest
+        for title, modules in SECTIONS.items():
+            commands = [(name, self.commands[name]) for name in modules if name in self.commands]
+            if commands:
+                with formatter.section(title):
+                    formatter.write_dl(
+                        [(f"{k:{longest}}", v.get_short_help_str(width)) for k, v in commands]
+                    )
 
 
 def run_app(app: Callable[..., Any]) -> NoReturn:

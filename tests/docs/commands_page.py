@@ -44,8 +44,8 @@ def _leaves(name: str, command: Any) -> Iterator[tuple[str, Any]]:
         return
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     start = " ".join([name, *map(_usage, arguments)])
-    for child_name, child in children.items():
-        yield from _leaves(f"{start} {child_name}", child)
+    for child_name in command.list_commands(None):
+        yield from _leaves(f"{start} {child_name}", children[child_name])
 
 
 def page() -> str:

@@ -1,12 +1,15 @@
 """What a shell asks of the program: help, version, completions, a man page."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
-from projections.cli.program import _needed
+from projections.cli import SECTIONS, command_line
+from projections.cli.program import Program, _needed
 from tests.commands import Commands
 from tests.prefork import folder_with_mapfold
 from tests.thorough import rounds
@@ -23,6 +26,20 @@ def test_help_is_found_in_each_usual_way(mapfold: Commands) -> None:
         assert mapfold(*path, "-h").out == said == mapfold("help", *path).out
     refused = mapfold("help", "nope", code=2).err
     assert "No such command 'nope'" in refused
+
+
+def test_help_lists_every_command_in_its_section() -> None:
+    program = get_command(command_line())
+    said = program.make_context("mapfold", [], resilient_parsing=True).get_help()
+    listed: dict[str, list[str]] = {}
+    for line in said.split("Options:")[1].splitlines():
+        if line.endswith(":"):
+            listed[line.removesuffix(":")] = names = []
+        elif found := re.match(r"  (\w+) ", line):
+            names.append(found[1])
+    assert listed == {title: list(commands) for title, commands in SECTIONS.items()}
+    assert isinstance(program, Program)
+    assert set(program.commands) == {name for names in listed.values() for name in names}
 
 
 def test_the_version_is_printed(mapfold: Commands) -> None:
