@@ -85,7 +85,7 @@ def test_a_merge_shows_in_state_from_the_next_offset_on(mapfold: InProcess) -> N
         assert len(state["places"]) == places
 
 
-@pytest.mark.parametrize("suffix", ["png", "svg"])
+@pytest.mark.parametrize("suffix", mostly_slow(["png", "svg"]))
 def test_a_merge_is_drawn(mapfold: InProcess, suffix: str) -> None:
     said = mapfold("merges", "log", *RULES, "--draw", "1", "--out", f"merge.{suffix}")
     assert said.err == f"wrote merge.{suffix}: merge 1, before and after\n"

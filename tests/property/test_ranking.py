@@ -12,7 +12,7 @@ from projections.relocalize import Answer, Candidates, Crop, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of
-from tests.thorough import examples
+from tests.thorough import examples, mostly_slow
 
 SEEDS = (20, 21)
 
@@ -69,7 +69,7 @@ def test_asking_twice_gives_the_same_answer_to_the_last_bit(seed: int, data: st.
     assert rank(crops, mapped.search(crops)) == rank(crops, again.search(crops))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_one_more_consistent_crop_never_lowers_the_true_place(seed: int) -> None:
     """Noise-free: the crops are the map's own observations of one keyframe."""
     mapped = room_map(seed)
@@ -94,7 +94,7 @@ def test_one_more_consistent_crop_never_lowers_the_true_place(seed: int) -> None
 
 
 @pytest.mark.parametrize("boxes", [True, False], ids=["boxes", "no boxes"])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_scores_are_shares_and_confidence_a_probability(seed: int, boxes: bool) -> None:
     mapped = room_map(seed)
     for keyframe in other_session(seed)[::5]:
@@ -127,7 +127,7 @@ def median_error(seed: int, count: int, *, plain: bool) -> float:
     return sorted(errors)[len(errors) // 2]
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", mostly_slow(SEEDS))
 def test_the_pose_is_twice_as_near_as_the_rooms_centre(seed: int) -> None:
     assert 2.0 * median_error(seed, 3, plain=False) <= median_error(seed, 3, plain=True)
 

@@ -13,6 +13,7 @@ from projections.model.snapshot import restore, snapshot
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
+from tests.thorough import mostly_slow
 
 SETTINGS = Settings(fusion="evidence")
 FOCAL = 320 / math.tan(math.radians(69.4 / 2))
@@ -132,7 +133,7 @@ def test_no_object_is_missing_where_none_was_carried_away():
     assert len(folded.view.objects) == 4
 
 
-@pytest.mark.parametrize("cut", [96, 120, 150, 185])
+@pytest.mark.parametrize("cut", mostly_slow([96, 185, 120, 150], 2))
 @pytest.mark.seconds
 def test_a_fold_goes_on_from_a_snapshot_between(cut):
     documents = run("a", ROOM) + run("b", ROOM | {"chair": (7.0, 2.0)})
