@@ -32,7 +32,7 @@ def ask_sites(
     camera: Camera | None,
     jobs: int,
 ) -> FleetAnswer:
-    """Ask each site; one that cannot be asked counts neither for nor against the others."""
+    """Ask each site; one that cannot be asked does not affect the ranking of the others."""
     with ThreadPoolExecutor(jobs, "ask") as threads:  # it mostly waits for the databases
         answers = threads.map(
             lambda site: _ask(site, databases[site.name], question, top=top, camera=camera), sites
@@ -47,7 +47,7 @@ def ask_sites(
 def _ask(
     site: Site, databases: SiteDatabases, question: Question, *, top: int, camera: Camera | None
 ) -> Answer | str:
-    """The answer of one site's map, or why there is none."""
+    """The answer of one site's map, or the reason why there is none."""
     try:
         for url in databases.urls:
             if exists(url) is False:

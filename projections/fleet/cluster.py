@@ -102,7 +102,7 @@ class DaskCluster:
             )
 
     def _watch(self, away_since: float | None, left: int, total: int) -> float | None:
-        """Since when the scheduler is away; raises ClusterError when that is too long."""
+        """The time since which the scheduler is away; raises ClusterError when that is too long."""
         if self._client.status == "running":
             return None
         away_since = time.monotonic() if away_since is None else away_since

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, TypeAlias
 
 RETRIES: Final = 2
-"""How often the task of a killed worker is started again."""
+"""The most times that the task of a killed worker is started again."""
 
 Progress: TypeAlias = Callable[[int], None]
-"""Receives how many events of its site a task has done."""
+"""A function that receives the number of events that a task has processed."""
 Task: TypeAlias = Callable[[Any, Progress], Any]
-"""A module-level function, which workers import; request and result are pickled. Errors of the
-site's log or database are in its result and not raised."""
+"""A task is a module-level function, which workers import; request and result are pickled. Errors
+of the site's log or database are in the result, not raised."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
     """The outcome of the request with this index: a result, or ``error`` when its workers were
     killed `RETRIES` + 1 times or the task raised. ``attempts`` counts its starts, as far as the
-    engine knows them."""
+    engine can count them."""
 
     index: int
     result: Any

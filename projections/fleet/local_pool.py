@@ -1,6 +1,6 @@
 """Run tasks in worker processes on this machine.
 
-Each worker is a pool of one process (`concurrent.futures`). When one is killed only its own pool
+Each worker is a pool of one process (`concurrent.futures`). When one is killed, only its pool
 breaks, which identifies the interrupted site; the site is started again in a new process, at most
 `RETRIES` times, and the others go on.
 
@@ -121,7 +121,7 @@ class LocalPool:
 
 
 _done: Any = None
-"""In a worker: how many events of each request are done."""
+"""In a worker: the number of processed events by request."""
 
 
 def _prepare(alive: Connection, done: Any) -> None:

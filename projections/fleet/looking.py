@@ -20,7 +20,7 @@ from .task_errors import advice_for, os_error_text
 
 @dataclass(frozen=True, slots=True)
 class StatusRequest:
-    """A site whose status is wanted."""
+    """A request for the status of a site."""
 
     site: Site
     databases: SiteDatabases
@@ -83,14 +83,14 @@ def _databases(request: StatusRequest, info: LogInfo) -> Status:
 
 @dataclass(frozen=True, slots=True)
 class SiteVerification:
-    """What ``log verify`` found; ``error`` where the log could not be read at all."""
+    """The report of ``log verify`` for a site; ``error`` where the log could not be read at all."""
 
     found: Verification | None = None
     error: str | None = None
 
     @property
     def sound(self) -> bool:
-        """Whether nothing was found."""
+        """Whether the verification found no fault."""
         return self.found is not None and not self.found.findings
 
 

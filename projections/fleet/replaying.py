@@ -49,7 +49,7 @@ class ChosenSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequest:
-    """A site to replay. ``again`` rebuilds it also when it is up to date; ``replace`` also over the
+    """A site to replay. ``again`` rebuilds it even if it is up to date; ``replace`` even over the
     map of another log."""
 
     site: Site
@@ -112,8 +112,8 @@ def _replay(request: ReplayRequest, progress: Progress) -> SiteReplay:
 
 
 def _outcome_before(request: ReplayRequest) -> Outcome | None:
-    """What makes a rebuild needless; None when it is needed. Raises ProjectionMismatch for the map
-    of another log that is not to be replaced."""
+    """The outcome if no rebuild is needed; None if one is. Raises ProjectionMismatch for the map of
+    another log that is not to be replaced."""
     found = projection_status(request.site.log, request.databases.targets, request.settings.of)
     for sink in found.sinks:
         if sink.condition == "unreachable":

@@ -34,10 +34,10 @@ from .sites import Site
 
 PLACEHOLDER: Final = "{site}"
 MAX_BYTES: Final = 63
-"""Of a database's name; PostgreSQL would cut a longer one."""
+"""Most bytes of a database's name; PostgreSQL would truncate a longer one."""
 _RESERVED: Final = frozenset({"template0", "template1"})
 _MARK: Final = "mapfoldsitemark"
-"""Stands for a site's name while a template is checked."""
+"""The placeholder of a site's name while a template is checked."""
 _EXAMPLE: Final = f"postgresql://host/{PLACEHOLDER}, or postgresql://host/map_{PLACEHOLDER}"
 Template = tuple[str, str]
 """A URL with ``{site}``, and what messages call it."""
@@ -66,8 +66,8 @@ def site_databases(
     sites: Sequence[Site], db: str | None, vector_db: str | None
 ) -> Iterator[dict[str, SiteDatabases]]:
     """The databases of each site, by its name. The embedded server, if needed, runs while the
-    context is open. Raises MisuseError for a template or a name that cannot be, and where two sites
-    would have one database."""
+    context is open. Raises MisuseError for an invalid template or name, and where two sites would
+    share a database."""
     graph = template_of(db, "--db", "MAPFOLD_DB")
     vectors = template_of(vector_db, "--vector-db", "MAPFOLD_VECTOR_DB") or graph
     if graph is not None and vectors is not None:
@@ -151,7 +151,7 @@ def _databases(
 
 
 def exists(url: str) -> bool | None:
-    """Whether a database exists; None where no server answers that question."""
+    """Whether a database exists; None where no server answers."""
     with _maintenance(url) as connection:
         if connection is None:
             return None
@@ -165,7 +165,7 @@ def check_server(url: str) -> None:
 
 
 def create_if_missing(url: str) -> bool:
-    """Create the database of a URL; False if it exists, or no server answers whether it does.
+    """Create the database of a URL; False if it exists or no server answers.
 
     Raises DatabaseError when it may not be created.
     """

@@ -12,7 +12,8 @@ from eventsrc.text import counted, visible
 
 MAX_LIST_BYTES: Final = 16 * 1024 * 1024
 MAX_NAME_BYTES: Final = 255
-"""What a file system allows for a folder's name. A database's name has fewer (`site_databases`)."""
+"""Most bytes of a folder's name in a file system. A database's name has fewer
+(`site_databases`)."""
 _SHOWN: Final = 8
 _SHOWN_OF_NAME: Final = 60
 
@@ -129,8 +130,8 @@ def _sites_of(lines: list[str], file: Path) -> Iterator[tuple[int, Site]]:
 
 
 def check_name(name: str, where: str) -> None:
-    """Raise MisuseError for what cannot be a site's name: a path, control characters, bytes that
-    are no text."""
+    """Raise MisuseError for an invalid name of a site: a path, control characters, bytes that are
+    no text."""
     size = len(name.encode("utf-8", "surrogateescape"))
     if (
         not name.isprintable()
@@ -146,5 +147,5 @@ def check_name(name: str, where: str) -> None:
 
 
 def _excerpt(name: str) -> str:
-    """``name``, or the beginning of a long one, as of a file that is no list at all."""
+    """``name``, or the beginning of a long one, such as a line of a file that is no list."""
     return visible(name if len(name) <= _SHOWN_OF_NAME else f"{name[:_SHOWN_OF_NAME]}…")

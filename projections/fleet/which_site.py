@@ -1,10 +1,10 @@
-"""Which of several maps a question is from: the probability of each, and of none. Pure.
+"""Find the map that a question is from: the probability of each of several maps, and of none. Pure.
 
 Scores of places cannot be compared across maps: they are shares of one map's poses. The two
 probabilities of an answer can, as each map calibrates them: `known`, that it has the things shown,
 and `confidence`, that the pose found is right. Their logits are the evidence for a map against
-"none of them" (docs/decisions/which-building.md). All sites are equally likely before; the prior of
-"none" is that of the questions the weights were fitted on.
+"none of them" (docs/decisions/which-building.md). The prior is equal for all sites; that of "none"
+is its share in the questions that the weights were fitted on.
 """
 
 import math
@@ -22,12 +22,12 @@ INTERCEPT: Final = -0.568
 sites each, one of them the right one for about half of the questions."""
 FITTED_SITES: Final = 6
 _LEAST: Final = 1e-6
-"""Probabilities are clipped to this distance from 0 and 1, so that no map decides alone."""
+"""Least distance of clipped probabilities from 0 and 1, so that no single map decides."""
 
 
 @dataclass(frozen=True, slots=True)
 class RankedSite:
-    """A site, how likely the robot is there, and the answer of its map."""
+    """A site, the probability that the robot is there, and the answer of its map."""
 
     name: str
     probability: float
@@ -40,7 +40,7 @@ class RankedSite:
 
 @dataclass(frozen=True, slots=True)
 class WhichSite:
-    """The sites, likeliest first, and how likely the robot is at none of them."""
+    """The sites, likeliest first, and the probability that the robot is at none of them."""
 
     sites: tuple[RankedSite, ...]
     none: float

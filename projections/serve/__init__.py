@@ -1,4 +1,4 @@
-"""Re-localisation as a service: over Zenoh, and over HTTP with the extra ``[serve]``."""
+"""Re-localisation as a service over Zenoh, and over HTTP with the extra ``[serve]``."""
 
 from .answering import Answerer
 from .fair_queue import FairQueue

@@ -1,6 +1,6 @@
-"""Answers to questions over any transport: JSON in, JSON out, rate limited, errors as replies.
+"""Answer questions of any transport: JSON in, JSON out, rate limited, errors as replies.
 
-A question is what ``mapfold relocalize`` takes; an object may also have ``top``, ``method`` and
+A question has the form of ``mapfold relocalize``; an object may also have ``top``, ``method`` and
 ``session``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in
 ``_KINDS``.
 """
@@ -56,7 +56,7 @@ class TokenBucket:
         self._tokens, self._filled = self._size, now()
 
     def take_token(self) -> None:
-        """Raises TooMuchError when there is none."""
+        """Take a token. Raises TooMuchError when there is none."""
         with self._lock:
             now = self._now()
             self._tokens = min(self._size, self._tokens + (now - self._filled) * self._rate)
@@ -112,8 +112,8 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (DatabaseError, "database", 503, "the database cannot be asked; see the service's stderr"),
     (MapfoldError, "failed", 500, "failed; see the service's stderr"),
 )
-"""Error, kind, HTTP status and the message for others; None: the error's own. Messages that name
-databases and paths only go to the service's stderr (`Answerer`)."""
+"""Error, kind, HTTP status and the message in the reply (None: the error's own). Messages that name
+databases and paths go only to the service's stderr (`Answerer`)."""
 
 
 class Answerer:
@@ -139,7 +139,7 @@ class Answerer:
         self._sessions = Sessions()
         self.max_bytes = max_bytes
         self.database_up = True
-        """Whether the database could be asked when it was last tried."""
+        """Whether the last query of the database succeeded."""
 
     def relocalize(self, payload: bytes, options: Mapping[str, str]) -> dict[str, Any]:
         """The answer to a question, as ``relocalize --json`` gives it."""
@@ -194,7 +194,7 @@ class Answerer:
 
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
-    """An HTTP status and the error as JSON."""
+    """The HTTP status and the JSON form of an error."""
     for kind, name, status, text in _KINDS:
         if isinstance(error, kind):
             return status, {"error": {"kind": name, "message": text or str(error)}}
@@ -217,7 +217,7 @@ class _Asked(NamedTuple):
 def _read(payload: bytes, options: Mapping[str, str]) -> _Asked:
     document = parse_json(payload)
     fields = document if isinstance(document, dict) else {}
-    # What the question says is checked also where an option takes its place.
+    # A value in the question is checked even if an option overrides it.
     top = _top(fields.get("top", 3))
     method = _method(fields.get("method", "joint"))
     session = session_name(fields.get("session"))

@@ -49,7 +49,7 @@ class Connections:
 
     def admit(self, newcomer: "Connection") -> bool:
         """Add a new connection, if need be in place of another; False when all others are being
-        answered and no peer has more of them than the new one's."""
+        answered and no peer has more connections than the newcomer's."""
         if len(self._open) >= self._most:
             self._evict(newcomer.peer)
         if len(self._open) >= self._most:
@@ -122,7 +122,8 @@ def _refuse_chunks(event: Any) -> None:
 
 
 class Connection(H11Protocol):
-    """One connection. ``waits_since`` is since when it waits for its peer; None while we work."""
+    """One connection. ``waits_since`` is the time since which it waits for its peer; None while a
+    request is being answered."""
 
     def __init__(
         self, config: Config, state: ServerState, connections: Connections, accepted: socket.socket

@@ -1,4 +1,4 @@
-"""The description at ``/openapi.json``, questions with examples and every refusal, and its page at
+"""The OpenAPI description at ``/openapi.json``, with examples and all refusals, and its page at
 ``/docs``: Swagger UI, with nothing loaded from other servers.
 
 The files of Swagger UI are those of the package fastapi-offline, which only this module imports. By
@@ -58,7 +58,7 @@ _OPTIONS: Final = {
         "description": "Track the questions of this name.",
     },
 }
-"""What the service reads of a question beside what every question has."""
+"""Options of a question that the service reads beside the common fields."""
 QUESTION: Final = {
     "requestBody": {
         "required": True,
@@ -146,7 +146,8 @@ _SENDING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
 
 
 def refusals(*, asking: bool = False, sending: bool = False) -> dict[int | str, dict[str, Any]]:
-    """The refusals of a path; ``asking`` one that asks the database, ``sending`` a body."""
+    """The refusals of a path; ``asking`` for a path that queries the database, ``sending`` for one
+    with a body."""
     known = _EVERYWHERE + (_ASKING if asking else ()) + (_SENDING if sending else ())
     return {
         status: {"model": Refusal, "description": text} | ({"headers": headers} if headers else {})

@@ -80,7 +80,7 @@ class FairQueue:
         return job.future
 
     def __len__(self) -> int:
-        """How many wait."""
+        """The number of waiting questions."""
         with self._changed:
             return sum(map(len, self._queued.values()))
 

@@ -1,6 +1,6 @@
 """The service over HTTP: an ASGI app with its description at ``/openapi.json`` and ``/docs``.
 
-Answers are described by the models in `models` and sent as they are, without a pass through these.
+Answers are described by the models in `models` and sent without validation by them.
 
 Needs the extra ``mapfold[serve]`` (fastapi, uvicorn). The event loop only reads requests; the
 threads of the `FairQueue` answer them, because database access is synchronous.
@@ -171,8 +171,8 @@ def add_openapi(app: FastAPI, parameters: Any) -> None:
 
 
 def _complete_description(app: FastAPI) -> None:
-    """Correct what FastAPI describes otherwise than it is: refusals with 422, which are 400 here,
-    parameters of a query that are null, and examples, out of which it leaves what is null."""
+    """Correct FastAPI's description: refusals have status 400 instead of 422, query parameters
+    cannot be null, and examples keep their nulls."""
     described = app.openapi
 
     def openapi() -> dict[str, Any]:

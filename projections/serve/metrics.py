@@ -19,7 +19,7 @@ _QUESTIONS: Final = frozenset({"relocalize", "places", "objects", "health"})
 
 
 class ServiceMetrics:
-    """For any thread."""
+    """The service's metrics; for any thread."""
 
     def __init__(self, answerer: Answerer, queue: FairQueue) -> None:
         self._answerer, self._queue = answerer, queue
@@ -41,7 +41,7 @@ class ServiceMetrics:
         self.text = instruments.text
 
     def watch(self, transport: str, question: str, answer: "Future[Any]") -> None:
-        """Count a question, which has just come, when its answer is there."""
+        """Count a question when its ``answer`` is done; called when the question arrives."""
         began = time.perf_counter()
 
         def done(answer: "Future[Any]") -> None:

@@ -1,8 +1,7 @@
 """The shapes of answers, for the description at ``/openapi.json``.
 
-Answers are written as they are, not through these: tests check that every answer sent has the shape
-that is described. A key that is not required is absent where there is nothing to say, never null.
-Later versions may add keys.
+Answers are not validated by these models; tests check that every answer sent has the described
+shape. A key that is not required is absent rather than null. Later versions may add keys.
 """
 
 from typing import Annotated, Literal, NotRequired

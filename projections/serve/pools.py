@@ -34,8 +34,8 @@ OUTAGE_TIMEOUT_S: Final = 10.0
 
 
 class Outage:
-    """Begins with the first failure and ends with the first success; one line for people each. For
-    many threads."""
+    """An outage begins with the first failure and ends with the first success; ``tell`` gets one
+    line at each. For many threads."""
 
     def __init__(self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic):
         self._tell, self._now, self._lock = tell, now, threading.Lock()
@@ -62,7 +62,7 @@ class Outage:
 
     @property
     def worth_waiting(self) -> bool:
-        """Whether it is so new that a question waits for its end."""
+        """Whether the outage is so new that a question waits for its end."""
         until = self._until
         return until is not None and self._now() < until
 

@@ -2,8 +2,8 @@
 
 At most ``MOST`` are kept. One without a question for ``SILENT_S`` is removed, and when there are
 more, the one that asked longest ago. If it asks again, a new session begins, and the answer has
-``questions`` 1. A question that cannot be answered does not count: the robot's next
-movement is since the last one that was.
+``questions`` 1. A question that cannot be answered does not count: the robot's next movement is
+since the last answered one.
 """
 
 import threading
@@ -21,7 +21,8 @@ MAX_NAME: Final = 128
 
 
 class Sessions:
-    """For many threads; questions of one session are taken in as their answers come."""
+    """The sessions; for many threads. Questions of one session are applied in the order of their
+    answers."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic, most: int = MOST) -> None:
         self._now, self._most, self._lock = now, most, threading.Lock()

@@ -1,9 +1,9 @@
-"""Queries of the map's state: Places or Objects, near a position or all of them by pages.
+"""Queries of the map's state: Places or Objects near a position, or all of them in pages.
 
 Near a position they come nearest first. Without one they come in the order in which they were
-founded, at most `MAX_PAGE` at a time. A page's ``next`` is the number of its last one: the next
-page has those with greater numbers. So while the map changes, one that is there all the time comes
-exactly once; what is founded meanwhile comes last.
+founded, at most `MAX_PAGE` at a time. A page's ``next`` is the number of its last item: the next
+page has those with greater numbers. So while the map changes, an item that exists all the time is
+listed exactly once, and new ones come last.
 """
 
 import math
@@ -46,7 +46,7 @@ _STATES: Final = {
 
 
 def refuse_unknown(options: Iterable[str], names: Sequence[str]) -> None:
-    """Raise QuestionError for an option that is none of ``names``, a misspelt one for example."""
+    """Raise QuestionError for an option that is not in ``names``, such as a misspelt one."""
     for name in options:
         if name not in names:
             known = ", ".join(names) or "none"
@@ -54,7 +54,8 @@ def refuse_unknown(options: Iterable[str], names: Sequence[str]) -> None:
 
 
 def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], dict[str, Any]]:
-    """The read that answers a question. Raises QuestionError for what is none."""
+    """The read that answers a question about ``what``. Raises QuestionError for an unknown state or
+    option."""
     reads = _STATES.get(what)
     if reads is None:
         raise QuestionError(

@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class ZenohService:
-    """Answers on a session until closed; the queue still answers what it has by then.
+    """Answers queries on a Zenoh session until closed; questions queued by then are still answered.
 
     ``watch`` gets ``zenoh``, what is asked and the future answer of each question, to count it.
     """

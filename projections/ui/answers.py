@@ -43,8 +43,8 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 
 
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The digest at W, under the commands known at W or at ``known_at``, as ``state --at W``; and
-    what kind of room each place is."""
+    """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``, and
+    the type of each place."""
     moment = Moment.of(shown, query)
     view = moment.known.at(moment.end)
     return {
@@ -56,8 +56,8 @@ def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 
 def _types(view: MapView) -> list[dict[str, Any]]:
-    """For each place whose type there is evidence of: the type, None where unsure, its probability,
-    and the likeliest types."""
+    """For each place with evidence of its type: the type (None where unsure), its probability, and
+    the likeliest types."""
     found = ((place.place_id, view.type_of(place.ordinal)) for place in view.places.values())
     return [
         {

@@ -106,8 +106,8 @@ def _only(*names: str) -> Any:
 
 
 def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = None) -> FastAPI:
-    """The ASGI application. The caller closes the service and the watch. `TokenGate` guards what
-    the ``editor`` may do."""
+    """The ASGI application. The caller closes the service and the watch. `TokenGate` controls
+    access to the ``editor``."""
     app = FastAPI(
         title="mapfold ui", openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False
     )

@@ -1,10 +1,10 @@
-"""A map's whole history as columns, from which a browser computes the map at any offset.
+"""A map's whole history as columns, from which the page computes the map at any offset.
 
 The columns are read from a `History`, which one fold has filled; nothing is folded here. Ordinals
 of keyframes, places and objects are those of the fold: rows 0, 1, 2 … of ``kf_``, ``pf_`` and
-``of_``. Of objects there is a row for each event that changed one, with all values of the object
-after it. A ``start`` leaves out what events before it did; numbers stay the same, so that rows from
-``start`` on are appended to those a client has.
+``of_``. Objects have a row for each event that changed one, with all values of the object after it.
+With a ``start``, rows of earlier events are left out; numbers stay the same, so that a client can
+append the rows to those it has.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,8 +30,8 @@ _UM2_PER_M2: Final = float(UM_PER_M) ** 2
 class ObjectRow(NamedTuple):
     """An object after the event at ``offset``; metres and square metres in the map frame.
 
-    ``x`` and ``y`` are its estimate, the mean of where it was seen from without one; the variances
-    are NaN then. ``class_number`` is an index of the class names, ``place`` -1 for none.
+    ``x`` and ``y`` are its estimate; without one, the mean of the positions it was seen from, with
+    NaN as variances. ``class_number`` is an index of the class names, ``place`` -1 for none.
     """
 
     offset: int
@@ -55,7 +55,7 @@ _COLUMNS: Final = (
 
 
 def class_names(history: History) -> list[str]:
-    """The classes that objects have had, in the order in which events named them first.
+    """The classes that objects have had, in the order of their first events.
 
     So a longer history only adds names at the end.
     """
@@ -168,7 +168,7 @@ _Apply = Callable[[_State, Any], None]
 
 
 def _changes(record: ObjectHistory) -> list[tuple[int, Any, _Apply]]:
-    """What changed the object, by offset."""
+    """The changes of the object, by offset."""
     found: list[tuple[int, Any, _Apply]] = []
     kinds: tuple[tuple[Sequence[Any], _Apply], ...] = (
         (record.sightings, _State.see),
@@ -196,7 +196,7 @@ def _last_offset(record: ObjectHistory) -> int:
 
 _INT32_MAX: Final = 2**31 - 1
 _NEAR_M: Final = 4096.0
-"""Within it of the origin a float32 is exact to half a millimetre."""
+"""Distance from the origin within which a float32 is exact to half a millimetre."""
 _ORIGIN_STEP_M: Final = 1000.0
 
 
@@ -246,7 +246,8 @@ def history_columns(
 
 
 def map_origin(history: History) -> tuple[float, float]:
-    """Where positions count from, metres: (0, 0), or a point near a first pose that is far off."""
+    """The origin of positions in metres: (0, 0), or a point near the first pose if that is far
+    off."""
     pose = next((k.pose for k in history.keyframes if k.pose is not None), None)
     if pose is None or max(abs(pose.x_m), abs(pose.y_m)) <= _NEAR_M:
         return 0.0, 0.0
@@ -255,7 +256,7 @@ def map_origin(history: History) -> tuple[float, float]:
 
 
 def _counts(history: History, start: Offset) -> dict[str, int]:
-    """How many keyframes, places and objects there were before ``start``."""
+    """The numbers of keyframes, places and objects before ``start``."""
     return {
         "keyframe": history.keyframe_count(start),
         "place_id": sum(place.formed.offset < start for place in history.places),

@@ -1,5 +1,5 @@
-"""Two moments compared, the map under other settings or without a command compared with the log's
-own, and the event that made a condition true.
+"""Answers that compare: two moments, the map under other settings or without a command and the
+log's own, and the event that made a condition true.
 """
 
 from collections.abc import Callable
@@ -70,8 +70,7 @@ def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 
 def conditions_answer(_: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The functions of conditions, for completion; and what is wrong with ``text``, at which
-    column."""
+    """The functions of conditions, for completion, and the error in ``text`` with its column."""
     return {
         "functions": [
             {

@@ -1,4 +1,4 @@
-"""Corrections: the list of them, and new ones: a dry run first, then recorded with a reason.
+"""Corrections: list them, and make new ones, first as a dry run, then recorded with a reason.
 
 The body of ``POST /api/edit`` is ``{"kind", "arguments", "reason", "dry_run", "command_id"}``. The
 arguments of a kind are those of ``mapfold edit LOG KIND``, in that order. A command goes into the
@@ -68,7 +68,7 @@ class _Kind:
 
 
 def _of(function: Callable[..., Any]) -> Callable[..., MakeCommand]:
-    """What makes a command whose arguments are texts."""
+    """A maker of commands from text arguments."""
     return lambda *arguments: lambda current, stamp: function(current, stamp, *arguments)
 
 
@@ -121,8 +121,8 @@ KINDS: Final = {
 
 
 def corrections_answer(shown: LogMap, _: QueryParams) -> dict[str, Any]:
-    """The commands of the log: who gave which, why, what it changed, what is undone. Effects only
-    where they are known already."""
+    """The commands of the log: author, reason, effect, and whether it is undone. Effects are given
+    only where they are known already."""
     current = CurrentMap(shown.reader, shown.opened.settings)
     found = effects_of(current, known_only=True)
     times = {event.offset: event.logged_ns for event in current.command_events()}
@@ -147,7 +147,8 @@ class Editor:
         self._open_session, self._issued_by = open_session, issued_by
 
     def answer(self, through: int, asked: Edit, go_on: Callable[[], None]) -> dict[str, Any]:
-        """What the command would change, or did. ``go_on`` ends a dry run by raising."""
+        """The effect of a command, of a dry run or recorded. ``go_on`` ends a dry run by
+        raising."""
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
         make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
@@ -168,7 +169,7 @@ class Editor:
         return self._document(through, asked, made, notes)
 
     def _checked(self, make_: MakeCommand) -> MakeCommand:
-        """``make_``, which refuses another log than the one that the page shows."""
+        """``make_``, refusing a log other than the one that the page shows."""
 
         def checked(current: CurrentMap, stamp: Stamp) -> Command:
             if current.reader.log_id != self._log_id:

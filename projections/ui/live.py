@@ -1,7 +1,7 @@
 """Server-sent events for a growing log, one whenever something changed.
 
-A thread looks for new events; each page has a stream, which ends with the service. The lag of the
-databases' tails is asked for only where a database is named.
+A thread polls for new events; each page has a stream, which ends with the service. The lag of the
+databases' tails is queried only if a database is named.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from .service import UiService
 LOOK_S: Final = 0.3
 TAILS_S: Final = 5.0
 MOST_STREAMS: Final = 32
-"""Each holds a connection; the server has 128."""
+"""The most streams; each holds a connection, and the server has 128."""
 _SEND_S: Final = 0.1
 _BEAT_S: Final = 15.0
 

@@ -1,8 +1,8 @@
 """Re-localisation in the map at W: the pose from which some crops are seen; and the crops of a
 mapped keyframe as such a question.
 
-The search needs the map with its embeddings, which histories do not keep: a question about another
-W folds the log once more. The last such map is kept where it is small.
+The search needs the map with its embeddings, which histories do not have, so a question about
+another W folds the log again. The last such map is kept if it is small.
 """
 
 import sys
@@ -36,7 +36,7 @@ from .search import keyframe_of
 
 MOST_BYTES: Final = 1_000_000
 _KEPT_OBSERVATIONS: Final = 20_000
-"""Of a map with more, the search matrix is not kept: at 512 dimensions it would take 80 MB."""
+"""Most observations of a map whose search matrix is kept: at 512 dimensions it takes 80 MB."""
 _MOST_TOP: Final = 20
 _MATCHES: Final = 8
 
@@ -51,8 +51,8 @@ class Localizer:
     def answer(
         self, through: Offset, query: QueryParams, payload: bytes, go_on: Callable[[], None]
     ) -> dict[str, Any]:
-        """Ranked places, a pose, all poses weighed (x, y, yaw, weight), and for each crop what in
-        the map looks like it."""
+        """Ranked places, a pose, all weighed poses (x, y, yaw, weight), and the matches of each
+        crop."""
         started = perf_counter()
         question = parse_question(payload)
         crops = question.crops

@@ -46,7 +46,7 @@ def log_document(opened: Opened, shown: LogMap, *, folded: bool = True) -> dict[
 
 
 def memory_document() -> dict[str, Any]:
-    """How much memory the server has used at most, and how many maps it keeps."""
+    """The peak memory of the server, and the number of maps that it keeps."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _KIB
     most = MOST_HISTORIES + MOST_ALTERNATIVES
     return {
@@ -57,7 +57,7 @@ def memory_document() -> dict[str, Any]:
 
 
 def _walls(shown: LogMap) -> list[list[float]]:
-    """Those of the occupancy maps in force at the end of the log, of all floors."""
+    """The walls of the occupancy maps in force at the end of the log, of all floors."""
     last = {given.map.floor: given.map for given in shown.timeline.history.maps}
     return [segment for each in last.values() for segment in wall_segments(each)]
 

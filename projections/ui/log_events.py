@@ -1,7 +1,7 @@
 """Marks of the timeline: keyframes, places founded and merged, commands, rejected payloads, losses.
 
 Places and objects are marked by their history. Commands, rejected payloads and losses are mapfold's
-own events in the log, which change nothing in a fold; they are read from the log by their keys.
+own events, which the fold does not use; they are read from the log by their keys.
 """
 
 import json
@@ -49,8 +49,8 @@ _Mark = tuple[int, int, float, int]
 class LogEvents:
     """mapfold's own events of a log, read once; `read_on` adds those recorded since.
 
-    All commands are kept, of rejected payloads and losses the first ``most`` together: a robot that
-    sends junk for a day makes millions. All are counted.
+    All commands are kept, and the first ``most`` of rejected payloads and losses together, since a
+    faulty robot makes millions in a day. All are counted.
     """
 
     def __init__(self, most: int = MOST_REPORTS) -> None:

@@ -1,8 +1,8 @@
-"""One log under one choice of settings, as far as it can be read and folded.
+"""The map of one log under one choice of settings, up to where the log can be read and folded.
 
 Where the log cannot be read or folded, the map ends, with a sentence in ``problems``. The history
-is folded once and then look-ups answer; new events are folded when `refresh` finds them. Not for
-several threads at once.
+is folded once, later questions are look-ups; new events are folded when `refresh` finds them. Not
+for several threads at once.
 """
 
 import hashlib
@@ -81,7 +81,7 @@ class LogMap:
 
     @property
     def lost(self) -> str | None:
-        """Why the log cannot be read any more, as far as it was; None if it can."""
+        """Why the part of the log that was read cannot be read any more; None if it can."""
         return self._lost
 
     @property
@@ -109,7 +109,8 @@ class LogMap:
 
     @property
     def key(self) -> str:
-        """Equal while the map only grows; another one where maps of the past have changed too."""
+        """A key that stays equal while the map only grows, and changes when maps of the past
+        change."""
         known = self.timeline.corrections()
         offsets = ",".join(str(command.offset) for command in known.in_force)
         map_ = map_fingerprint(self.timeline.settings, known)
@@ -136,7 +137,7 @@ class LogMap:
         return before != (self.through, self._lost, self._stopped)
 
     def point(self, text: str, note: Callable[[str], None] | None = None) -> Offset:
-        """The number of events that W means, as for ``--at``."""
+        """The number of events of a W, written as for ``--at``."""
         return resolve(self.reader, text, note=note)
 
     def _check_same(self) -> None:

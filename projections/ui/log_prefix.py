@@ -15,8 +15,8 @@ _ASK_EVERY = 500
 class PrefixReader(LogReader):
     """A `LogReader` that takes a log to end at ``limit``, if it has as many events.
 
-    Nothing behind the limit is read, so damage there is no error. ``go_on`` is called from time to
-    time while events are read; what it raises ends the reading.
+    Nothing beyond the limit is read, so damage there is no error. ``go_on`` is called regularly
+    while events are read; an exception from it ends the reading.
     """
 
     def __init__(

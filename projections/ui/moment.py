@@ -58,9 +58,9 @@ def command_line(opened: Opened, name: str, *words: str) -> str:
 def shell_line(*words: str) -> str:
     """A command line of printable characters only, for bash and zsh.
 
-    A terminal obeys a control character of a name also between quotes when the line is pasted:
-    Ctrl-C ends the line, and what follows is a command of its own. Those that turn the direction of
-    text would show another command. Such a word is written as ``$'…'``.
+    A terminal executes a control character of a pasted line even between quotes: Ctrl-C ends the
+    line, and what follows is a command of its own. Characters that change the direction of text
+    would display another command. Such a word is written as ``$'…'``.
     """
     return " ".join(map(_quoted, words))
 

@@ -28,7 +28,7 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int], ...]] = (
 
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
-    """An HTTP status and the error as JSON; for a condition with the ``column`` that is wrong."""
+    """The HTTP status and the JSON form of an error; for a condition with the wrong ``column``."""
     for kind, name, status in _KINDS:
         if isinstance(error, kind):
             more = {"column": error.column} if isinstance(error, ExpressionError) else {}

@@ -93,13 +93,14 @@ _SOURCES: Final[Mapping[str, Callable[[Moment, str], Iterator[dict[str, Any]]]]]
     "keyframe": _keyframes,
     "detection": _detections,
 }
-"""What has a name, by kind: its ``names``, and the ``offset`` of the event that brought it. Where
-there are very many, only those that contain what is wanted."""
+"""The searchable things by kind, with their ``names`` and the ``offset`` of their first event. Of
+large kinds only those whose name contains the wanted text."""
 
 
 def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The things whose name matches ``q``, best first: the same name, then names that begin or end
-    so, then names that contain it. Letter case does not matter. ``kind`` asks for one kind only."""
+    """The things whose name matches ``q``, best first: equal names, then names that begin or end
+    with it, then names that contain it. Letter case does not matter. ``kind`` asks for one kind
+    only."""
     moment = Moment.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")
@@ -149,7 +150,7 @@ def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 def _objects_of(
     history: History, observations: Collection[ObservationOrdinal], end: Offset
 ) -> dict[int, ObjectOrdinal]:
-    """By observation the object that it is of after ``end`` events."""
+    """For each observation the object that it is part of after ``end`` events."""
     return {
         seen.observation: history.object_survivor(each.found.object, end)
         for each in history.objects

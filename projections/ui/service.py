@@ -1,4 +1,4 @@
-"""The log shown by the page: its map under the log's own settings, and under a few others.
+"""The service of the page: the log's map under its own settings, and under a few others.
 
 Answers are made on two threads: one for the log's own map, one for maps under other settings and
 for answers whose folds take long. The first fold begins at once on the first of them. A fold is
@@ -32,15 +32,16 @@ _PAGES: Final = "pages"
 _WATCH: Final = "watch"
 
 GoOn = Callable[[], None]
-"""Called while work goes on. Raises GivenUp when no client waits for it any more."""
+"""A function called during work. Raises GivenUp when no client waits for the answer any more."""
 
 
 class GivenUp(TooMuchError):
-    """An answer was given up: the page asked for something else or left, or the program ends."""
+    """An answer was abandoned: the page asked for something else or was closed, or the program
+    ends."""
 
 
 class Loading:
-    """How far the first fold is, written by the thread that folds and read by all others."""
+    """The progress of the first fold, written by the folding thread and read by all others."""
 
     def __init__(self) -> None:
         self._folded, self._events = 0, 0
@@ -133,7 +134,7 @@ class UiService:
         return self._map.log_id
 
     def log_document(self) -> dict[str, Any]:
-        """What ``/api/log`` answers, at once: as of the last refresh."""
+        """The answer of ``/api/log`` as of the last refresh; returns at once."""
         now = {"memory": memory_document(), "loading": self.loading.document()}
         return self._document | now
 
@@ -143,9 +144,9 @@ class UiService:
         work: Callable[[LogMap, float], Result],
         wanted: Callable[[], bool] = _always,
     ) -> "Future[Result]":
-        """``work`` with the map under the log's settings, changed by ``sets``, and the seconds that
-        folding it took just now. A fold is given up, to be continued when it is asked for again,
-        once the answer is not ``wanted`` any more."""
+        """Run ``work`` with the map under the log's settings, changed by ``sets``, and the seconds
+        that folding it took. A fold is stopped once the answer is not ``wanted`` any more, and
+        continued at the next such question."""
         key = tuple(sets)
         if not key:
             return self._own.submit(lambda: work(self._map, 0.0), wanted)
@@ -154,8 +155,8 @@ class UiService:
     def ask_apart(
         self, work: Callable[[Offset, GoOn], Result], wanted: Callable[[], bool] = _always
     ) -> "Future[Result]":
-        """``work`` that reads the log itself and takes long, with the number of events that answers
-        cover and what it calls while it folds."""
+        """Run ``work`` that reads the log itself and takes long; it gets the number of events that
+        answers cover, and a function to call while it folds."""
 
         def asked() -> Result:
             wait([self._loaded])
@@ -165,7 +166,7 @@ class UiService:
         return self._others.submit(asked, wanted)
 
     def refresh(self) -> "Future[bool]":
-        """Look for events recorded since; whether there are any, or another problem."""
+        """Look for new events; the result is whether there are any, or another problem."""
         return self._own.submit(self._refresh, _always, _WATCH)
 
     def _show_progress(self, folded: int, events: int) -> None:

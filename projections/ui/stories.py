@@ -1,8 +1,8 @@
 """Why a place, an object or a keyframe is what it is, why places merged, and one merge in full.
 
-``lines`` are what the command prints; ``steps`` the same events with their offsets and with the
-places, objects and keyframes they name, which a page can link to. A merge in full has the chain of
-core points that linked its places, and what each side was.
+``lines`` are what the command prints; ``steps`` are the same events with their offsets and the
+places, objects and keyframes they name, for links. A merge in full has the chain of core points
+that linked its places, and the places before it.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -96,7 +96,7 @@ def _summary(history: History, merges: list[Merge]) -> str:
 
 
 def _other_summary(history: History, refusals: list[Refusal], objects: list[ObjectMerge]) -> str:
-    """Of an event that merged no places."""
+    """The summary of an event that merged no places."""
     refused = [
         f"{place_name(history, each.a)} and {place_name(history, each.b)} did not merge: refused"
         for each in refusals
@@ -174,8 +174,8 @@ _MOST_REFS: Final = 50
 
 
 def why_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The story of what ``what`` names; with ``other``, a keyframe, since when both are in one
-    place."""
+    """The explanation of the thing named by ``what``; with ``other``, a keyframe, since when both
+    keyframes are in one place."""
     moment = Moment.of(shown, query)
     what = text_of(query, "what")
     kind, _, name = what.partition(":")
@@ -250,7 +250,8 @@ def _step(history: History, entry: Entry) -> dict[str, Any]:
 
 
 def _refs(history: History, entry: Entry) -> Iterable[dict[str, str]]:
-    """What a step names: the keyframe that caused it, then what its facts name; each once."""
+    """The things that a step names: the keyframe that caused it, then those in its facts; each
+    once."""
     found: dict[tuple[str, str], None] = {}  # in order
     if entry.cause.run_id is not None:
         found["keyframe", f"{entry.cause.run_id}/{entry.cause.keyframe_id}"] = None

@@ -1,4 +1,4 @@
-"""The token of the printed link, and requests that other sites make a browser send.
+"""Access control of the page: the token of the printed link, and refusal of cross-site requests.
 
 * With ``everything`` every path needs the token: as ``Authorization: Bearer``, as ``?token=`` of
   the printed link, or as the cookie that this link sets. Browsers load scripts without headers.
@@ -75,7 +75,8 @@ class TokenGate:
 
 
 def _cookie_name(scope: Scope) -> str:
-    """With the port, because browsers send a host's cookies to all of its ports."""
+    """The name of the cookie; it has the port, because browsers send a host's cookies to all of its
+    ports."""
     return f"mapfold_{scope['server'][1]}"
 
 
