@@ -1,4 +1,4 @@
-"""Regions of an occupancy grid: what a robot can drive through without passing a narrow place.
+"""Regions of an occupancy grid: areas in which a robot can drive without passing a narrow place.
 
 1.  A cell's *clearance* is the distance of its middle to that of the nearest wall cell, as an exact
     squared number of cells, up to a cap. Beyond it all is wide.
@@ -11,8 +11,8 @@
     region's own width, or if the region is narrower than `MIN_WIDTH_M` and so no room. Else the
     passage is a *narrow place*, and the two stay apart.
 
-So what counts is not a fixed width of doors: a door of 0.9 m parts a room from a corridor of 1.2 m,
-a passage of two metres parts two halls, and a corridor is one region from end to end. Everything is
+So there is no fixed width of doors: a door of 0.9 m parts a room from a corridor of 1.2 m, a
+passage of two metres parts two halls, and a corridor is one region from end to end. Everything is
 counted in integers, and ties go by index: the regions are the same on every machine.
 """
 

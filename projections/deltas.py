@@ -295,7 +295,7 @@ class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectEstimated(msgspec.Struct, frozen=True, gc=False):
-    """Where an Object stands, estimated from the bearings of its observations; new values.
+    """An Object's position, estimated from the bearings of its observations; new values.
 
     Position in µm, covariance in µm² (rounded to integers), and the number of spots (places to
     stand, 0.35 m apart) that it was seen from. Only fusion by evidence emits it.
@@ -322,8 +322,8 @@ class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
 class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
     """An Object was not seen where it should have been; new values.
 
-    ``misses`` is in how many keyframes of the run it should have been seen and was not. ``missing``
-    tells whether that is enough to call it missing; it is False again once it is seen there.
+    ``misses`` is the number of keyframes of the run that should show it and do not. ``missing`` is
+    whether it counts as missing by that; it is False again once it is seen there.
     """
 
     offset: Offset
@@ -334,7 +334,7 @@ class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
-    """An Object that was missing stands elsewhere; its estimate leaves out what was seen before.
+    """An Object was found at another position; its estimate leaves out earlier observations.
 
     ``from_x_um`` … is the estimate that it had, ``to_x_um`` … the first one at the new position.
     """

@@ -3,12 +3,12 @@
 The defaults are priors, chosen on buildings of the developing half of our trial data;
 `mapfold calibrate` replaces them by a map's own and records them as a ``use-settings`` command.
 
-How alike two looks are is not stated as a cosine, since its scale depends on the embedding model
+The likeness of two looks is not given as a cosine, whose scale depends on the embedding model
 (different things lie near 0.1 with one model and near 0.75 with another), but as a *relative
-likeness*: 0 for two different things of different classes, 1 for the same picture, that is
-(cosine − different) / (1 − different). ``different`` is None by default: the fold then takes the
-mean cosine of pairs in one picture, which are different things by construction, as it has seen
-them so far.
+likeness*: 0 for two different things of different classes, 1 for the same picture, that is (cosine
+− different) / (1 − different). ``different`` is None by default: the fold then takes the mean
+cosine of pairs in one picture, which are different things by construction, as it has seen them so
+far.
 """
 
 from typing import Annotated, Literal
@@ -35,7 +35,7 @@ class EvidenceConstants(BaseModel):
     bearing_rad: _Angle = 0.05
     """Standard error of the bearing of a box's centre, pose's heading included."""
     bearing_cut_rad: _Angle = 0.12
-    """… of a box that the picture's border cuts at a side."""
+    """Standard error of the bearing of a box that the picture's border cuts at a side."""
     pose_m: _Positive = 0.08
     """Standard error of a mapped pose in each direction."""
     size_spread: _Spread = 0.3
@@ -53,14 +53,14 @@ class EvidenceConstants(BaseModel):
     same_back: _Likeness = 0.65
     """Mean relative likeness of one thing seen from opposite sides in one run."""
     same_side: _Likeness = 0.15
-    """What it gains when both see the same side."""
+    """The gain of that likeness when both show the same side."""
     same_kappa: Annotated[float, Field(ge=0.001, le=100.0)] = 2.0
-    """How fast that fades with the change of side Δ: exp(kappa (cos Δ − 1))."""
+    """The decay of that gain with the change of side Δ: exp(kappa (cos Δ − 1))."""
     same_spread: _Spread = 0.09
     side_by: Literal["sight", "heading"] = "sight"
     """Whether the side is that of the line of sight or of the robot's heading."""
     session_shift: _Likeness = 0.13
-    """What it loses between two runs."""
+    """The loss of likeness between two runs."""
 
     @field_validator("sizes_m")
     @classmethod

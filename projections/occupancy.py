@@ -1,4 +1,4 @@
-"""An occupancy map as the fold uses it: where walls are, and which poses are beside each other.
+"""An occupancy map as the fold uses it: walls, and which poses may be neighbours.
 
 Everything is in integers, so that it is the same on every machine. Micrometres of the map frame are
 turned and shifted into the grid's own frame (cosine and sine as multiples of 2⁻³⁰, rounded down);
@@ -6,11 +6,11 @@ there a cell is a half-open square, and a line's cells are the cells of its poin
 
 `passable` is the rule of ``places = "rooms"``: the straight line between two poses meets no wall,
 and both ends are in one region (`projections.clearance`), so that no narrow place lies between. Of
-a pose outside the grid only walls on the line are known.
-A pose may lie in a wall, because the robot's idea of where it is was off by a little: walls that
-a line begins or ends in do not count, and a wall cell is of the region around it.
+a pose outside the grid only walls on the line are known. A pose may lie in a wall because of its
+error: walls that a line begins or ends in do not count, and a wall cell is of the region around it.
 
-Unknown cells and all around the grid are no walls. Nor is what is small: furniture's legs.
+Unknown cells and everything outside the grid are no walls. Nor are small ones, such as legs of
+furniture.
 """
 
 import math
@@ -28,15 +28,15 @@ LEAST_WALL_M: Final = 0.5
 """Connected wall cells that are shorter than this in x and in y are no wall."""
 LEAST_BLOCK_M: Final = 0.08
 MAX_BLOCKS: Final = 400_000
-"""Regions are worked out on blocks of cells, a side of which is at least ``LEAST_BLOCK_M``, and as
-many cells as it takes for a map to have at most so many blocks: that bounds the time, which is two
-microseconds a block."""
+"""The most blocks of a map. Regions are computed on blocks of cells with a side of at least
+``LEAST_BLOCK_M``, larger if there would be more blocks: this bounds the time, two microseconds a
+block."""
 SMALL_M2: Final = 110
 SMALL_SHARE: Final = 4
 """Largest region, in square metres, that counts as one room: a way in it counts as a quarter. Both
 were chosen on buildings with walls; docs/places.md has the figures."""
 _SPREAD: Final = 5
-"""Blocks: so far into a wall its cells are of the region beside it."""
+"""Depth in blocks to which the cells of a wall are of the region beside it."""
 _TURN_BITS: Final = 30
 
 Point = tuple[int, int]
@@ -84,8 +84,8 @@ class OccupancyGrid:
         return self.straight_way_um(a, b) is not None
 
     def straight_way_um(self, a: Point, b: Point) -> int | None:
-        """How far the straight way between two poses counts as for ``places = "rooms"``; None where
-        they are not `passable`. A way in a region that is as small as a room counts less."""
+        """The length of the straight way between two poses for ``places = "rooms"``; None where
+        they are not `passable`. A way in a region as small as a room counts less."""
         start, end = self.region(a), self.region(b)
         is_within = start is not None and end is not None
         if (is_within and start != end) or not self.is_free_line(a, b):
@@ -151,7 +151,7 @@ class OccupancyGrid:
 
 
 def wall_blocks(source: OccupancyMap) -> tuple[int, Walls]:
-    """How many cells the side of a block has, and which blocks of a map have a wall in them."""
+    """The number of cells in the side of a block, and the blocks of a map that have a wall."""
     side = _block_side(source)
     blocks = _blocks(_occupied(source), side)
     least = max(1, math.ceil(LEAST_WALL_M / (side * source.resolution)))
@@ -172,7 +172,7 @@ def _block_side(source: OccupancyMap) -> int:
 
 
 def _blocks(walls: Walls, side: int) -> Walls:
-    """Which blocks have a wall cell."""
+    """The blocks that have a wall cell."""
     rows, columns = walls.shape
     padded = np.pad(walls, ((0, -rows % side), (0, -columns % side)))
     by_block = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side)
@@ -217,7 +217,8 @@ def _small_regions(labels: Labels, side_um: int) -> frozenset[int]:
 
 
 def _spread(labels: Labels, steps: int) -> Labels:
-    """Give cells of no region that of a neighbour, so many times; `_BESIDE` in its order."""
+    """Give cells without a region that of a neighbour, ``steps`` times; neighbours in the order of
+    `_BESIDE`."""
     for _ in range(steps):
         before = labels
         labels = before.copy()

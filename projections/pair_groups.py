@@ -1,7 +1,7 @@
-"""Things that are one by command, in groups, and groups that are kept apart.
+"""Groups of things that commands make one, and groups that commands keep apart.
 
-Being one is transitive: where a and b are one and b and c are one, so are a and c; and what is kept
-apart from a is kept apart from them all.
+This is transitive: if a and b are one and b and c are one, so are a and c; and a thing kept apart
+from a is kept apart from all of them.
 """
 
 from collections.abc import Container, Iterable
@@ -52,10 +52,10 @@ class PairGroups(Generic[_Thing]):
 def without_contradictions(
     statements: Iterable[tuple[tuple[_Thing, _Thing], bool]],
 ) -> tuple[list[tuple[_Thing, _Thing]], list[tuple[_Thing, _Thing]]]:
-    """Pairs that are one and pairs that are apart, ascending, of statements in the order in which
-    they were made, true for one.
+    """Pairs that are one and pairs that are apart, ascending. ``statements`` come in the order in
+    which they were made; true makes a pair one.
 
-    A statement that contradicts later ones is left out, also where it takes several of them.
+    A statement that contradicts later ones, one or several together, is left out.
     """
     roots = _Roots[_Thing]()
     enemies: dict[_Thing, set[_Thing]] = {}

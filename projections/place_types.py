@@ -1,12 +1,12 @@
 """Types of places: kitchen, office, bathroom …, from the classes of their Objects.
 
-Naive Bayes over `place_type_table`: every type is as likely beforehand, and each class that is in
-the place says how much likelier it is in a room of one type than of another. Of n Objects of a
-class the √n-th power of that counts, since six chairs are hardly more telling than three; an Object
-that was observed once is often a phantom or a wrong label and counts a quarter. What is *not* there
-says nothing, since the robot may not have looked there. The sum is tempered by `_TEMPER`,
-and more where there is more than `_MOST_WEIGHT` of it, because classes are not independent: it
-makes probabilities as high as types are right.
+Naive Bayes over `place_type_table`: all types have the same prior, and each class in the place
+contributes the ratio of its frequencies in rooms of each type. For n Objects of a class the ratio
+is taken to the power √n, since six chairs are hardly more evidence than three; an Object that was
+observed once is often a phantom or a wrong label and counts a quarter. Absent classes are no
+evidence, since the robot may not have looked there. The sum is tempered by `_TEMPER`, and more
+where there is more than `_MOST_WEIGHT` of it, because classes are not independent: this calibrates
+the probabilities.
 
 Below `UNSURE` the answer is unsure. A name given to the place by a command that has a type's name
 in it ("kitchen", "2nd floor office") decides, whatever is in the place.
@@ -27,10 +27,10 @@ from .place_type_table import NAMES, SYNONYMS, TABLE, TYPES
 
 UNSURE: Final = 0.5
 ONCE: Final = 0.25
-"""What an Object with one observation counts."""
+"""The weight of an Object with one observation."""
 _TEMPER: Final = 0.6
 _MOST_WEIGHT: Final = 4.0
-"""What all classes count together at most: what has everything is no room."""
+"""The greatest total weight of all classes: a place with everything is no room."""
 _MOST_SHOWN: Final = 3
 _LEAST_SHOWN: Final = 0.05
 
@@ -38,7 +38,7 @@ _LEAST_SHOWN: Final = 0.05
 @dataclass(frozen=True, slots=True)
 class PlaceType:
     """``type`` is None where it is unsure; ``probability`` is that of the likeliest one.
-    ``candidates`` are the likeliest, at most three, with their probabilities. ``named`` tells that
+    ``candidates`` are the likeliest, at most three, with their probabilities. ``named`` is whether
     the place's name decided."""
 
     type: str | None

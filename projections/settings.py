@@ -77,7 +77,7 @@ _Count = Annotated[int, Field(ge=0)]
 
 
 class LocalizerConstants(BaseModel):
-    """Constants of re-localisation that a map's own questions can tell.
+    """Constants of re-localisation, calibrated by a map's own questions.
 
     `projections.relocalize` has two numbers beside a pose: `known`, whether the things shown are in
     the map, and `confidence`, whether the pose is within 1.5 m. Both are logistic models with
@@ -91,13 +91,13 @@ class LocalizerConstants(BaseModel):
     known_shift: _Shift = 0.0
     known_scale: _Scale = 1.0
     known_count: _Count = 0
-    """How many of the map's own questions the correction of `known` rests on; 0 for none."""
+    """The number of the map's own questions behind the correction of `known`; 0 for none."""
     confidence_shift: _Shift = 0.0
     confidence_scale: _Scale = 1.0
     confidence_count: _Count = 0
     text_shift: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.45
-    """What a text's cosine with a picture is below that of two pictures of different things of
-    one class: added to it before it is compared with cosines of pictures."""
+    """The difference of a text's cosine with a picture from that of two pictures of different
+    things of one class; added before it is compared with cosines of pictures."""
 
 
 _YOUNGER = {
@@ -106,7 +106,7 @@ _YOUNGER = {
     "localizer": ("localizer",),
     "floor_height_m": ("floor_height_m",),
 }
-"""Settings that older versions did not have, by the one that brings them into force."""
+"""Settings that older versions did not have, by the setting that activates them."""
 
 
 class Settings(BaseModel):
@@ -153,8 +153,8 @@ class Settings(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_younger_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out younger settings that have their default, so that older fingerprints hold; of
-        a rule that is in force name all, so that the fingerprint tells when a default changes."""
+        """Leave out younger settings that have their default, so that older fingerprints hold;
+        those of a rule in force are all named, so that the fingerprint changes with a default."""
         values: dict[str, Any] = handler(self)
         defaults = {name: Settings.model_fields[name].default for name in values}
         for rule, names in _YOUNGER.items():
@@ -173,7 +173,7 @@ class Settings(BaseModel):
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
     def places_text(self) -> str:
-        """The rule of places in short: ``ε 1.5 m, min_samples 3``."""
+        """The rule of places as a short text: ``ε 1.5 m, min_samples 3``."""
         if self.places == "rooms":
             return f"rooms: cells of {self.rooms.cell_m:g} m, {self.rooms.drive_m:g} m of driving"
         return f"ε {self.eps_m:g} m, min_samples {self.min_samples}"

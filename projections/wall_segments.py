@@ -18,7 +18,7 @@ _Mask = NDArray[np.bool_]
 
 @lru_cache(maxsize=8)
 def wall_segments(given: OccupancyMap) -> list[list[float]]:
-    """x and y of both ends, metres in the map frame, to the millimetre."""
+    """The segments: x and y of both ends, in metres in the map frame, to the millimetre."""
     walls = (given.cells >= MIN_WALL) & (given.cells <= OCCUPIED)
     step = 1
     while True:

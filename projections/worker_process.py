@@ -1,8 +1,8 @@
 """A worker process that receives requests and sends answers over a connection.
 
-It keeps no state, so it may be killed at any moment, and is when its context manager ends. It has
-to end itself when its connection is closed, as it is when this process has died. It is in a process
-group of its own, so Ctrl-C in a terminal reaches this process only.
+It keeps no state, so it may be killed at any moment, and is killed when its context manager ends.
+It has to exit when its connection is closed, which happens when this process dies. It is in a
+process group of its own, so Ctrl-C in a terminal reaches this process only.
 
 Not `multiprocessing`: its processes import the caller's main module again (the whole command line,
 or a script that has no ``if __name__ == "__main__"``), and it starts another process to remove
@@ -40,7 +40,7 @@ class WorkerProcess:
                     python_command(code, *arguments, *map(str, files)),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,  # this process fails at the same, and reports it
+                    stderr=subprocess.DEVNULL,  # this process has the same problem, and reports it
                     pass_fds=files,
                     process_group=0,
                     env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
@@ -82,8 +82,8 @@ class WorkerProcess:
 
 @contextlib.contextmanager
 def unnamed_memory(size: int) -> Iterator[int]:
-    """The number of a file without a name, of ``size`` bytes; where the system has such files, in
-    memory."""
+    """The descriptor of an unnamed file of ``size`` bytes, in memory if the system has such
+    files."""
     has_memory_files = hasattr(os, "memfd_create")
     with (
         os.fdopen(os.memfd_create("mapfold"), "r+b")

@@ -1,4 +1,4 @@
-"""Moving a log into the databases: at once (`rebuild`) or as it grows (`tail`)."""
+"""Write the map of a log into the databases: once (`rebuild`) or as the log grows (`tail`)."""
 
 from .foreign_embedding import ForeignEmbedding
 from .rebuild import RebuildProgress, RebuildReport, rebuild

@@ -106,9 +106,9 @@ def _foreign_table(
 
 Kind: TypeAlias = Literal["missing", "extra", "different"]
 Keyed: TypeAlias = tuple[int, Any]
-"""A row's id, and its other values in a form that can be compared."""
+"""A row's id, and its other values in a comparable form."""
 NAMED: Final = 100
-"""The number of differences that are named; all are counted."""
+"""The most differences that are named; all are counted."""
 STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
 _NO_ROWS_TEXT: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
@@ -168,7 +168,7 @@ def check(
     *,
     only: SinkName | None = None,
 ) -> list[CheckReport]:
-    """Compare the sinks with the fold, each under the corrections that it knows.
+    """Compare the sinks with the fold, each under the corrections of its checkpoint.
 
     Raises ProjectionMissing and ProjectionMismatch.
     """

@@ -25,7 +25,8 @@ _FIRST_TABLES: Final[dict[SinkName, str]] = {
 }
 _COMMENT_PREFIX: Final = "mapfold"
 LOCK_GRACE_S: Final = 1.0
-"""It takes a server a moment to notice that the last writer's connection has ended."""
+"""Wait for the writer's lock: a server takes a moment to notice that the last writer's connection
+has ended."""
 LOCK_POLL_S: Final = 0.02
 
 
@@ -209,7 +210,7 @@ def write_refold(
 
 
 def refold(connection: Connection, sink: SinkName) -> tuple[int, int] | None:
-    """How many of how many events a tail has refolded; None when it is not at it."""
+    """The number of events that a tail has refolded, and of all; None when it is not refolding."""
     row = connection.execute(statements("checkpoint")["refold"], {"sink": sink}).fetchone()
     return None if row is None or row[0] is None or row[1] is None else (row[0], row[1])
 

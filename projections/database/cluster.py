@@ -94,7 +94,7 @@ class Cluster:
     def running(self) -> bool:
         """True when a server accepts a connection on this folder's socket.
 
-        The process table cannot tell: where process 1 does not reap, as in many containers, a
+        The process table is not used: where process 1 does not reap, as in many containers, a
         killed server stays in it forever.
         """
         self._refuse_untrusted()
@@ -112,8 +112,8 @@ class Cluster:
             return True
 
     def let_in(self) -> None:
-        """Let the server's user into the folders above data and programs. One of them may have been
-        closed since the server started; then a new session cannot load the extensions."""
+        """Allow the server's user to enter the folders above data and programs. If that was revoked
+        since the server started, a new session cannot load the extensions."""
         with _server_errors("open the folders of", self.data):
             let_server_user_enter(self.data, self.programs)
 

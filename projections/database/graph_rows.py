@@ -1,4 +1,4 @@
-"""Rows of the graph: which of them a batch of events adds, changes and removes.
+"""The rows of the graph that a batch of events adds, changes and removes.
 
 Two kinds of rows. *Fixed* ones are written once, when their event is folded: Keyframe, Pose,
 Observation and the edges HAS_KEYFRAME, HAS_POSE, HAS_OBSERVATION, OBSERVES (an observation is fused

@@ -1,9 +1,8 @@
 """AGE graphs: create, find, index, count, lock, swap and drop them.
 
 AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
-Anything else under these names belongs to another program: it is refused and never changed; but a
-graph that was made and left empty, as scripts that set up a database do, becomes ours
-(`adopt_if_empty`).
+Anything else under these names belongs to another program: it is refused and never changed, except
+that an empty graph, as scripts that set up a database make it, is taken over (`adopt_if_empty`).
 
 The swap renames the old graph; it is dropped later, when every transaction that may still have
 looked up its name has ended (see `swap`).
@@ -53,7 +52,7 @@ def exists(connection: Connection, graph: str) -> bool:
 
 
 def _renaming(connection: Connection, graph: str, *, is_graph: bool) -> str:
-    """The statement that gives a graph or a schema a name that is free."""
+    """The SQL statement that renames a graph or a schema to an unused name."""
     rows = connection.execute(statements("graph")["taken_names"], {"pattern": f"{graph}%"})
     taken = {name for (name,) in rows}
     names = (f"{graph}_{number}" for number in count(1))

@@ -1,4 +1,4 @@
-"""What a map is made with: settings and corrections, both as of a point in the log."""
+"""The inputs of a map: settings and corrections, both as of a point in the log."""
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
@@ -46,7 +46,7 @@ class MapInputs:
 
     @classmethod
     def of(cls, settings: Settings, corrections: Corrections, known_at: Offset) -> Self:
-        """With both fingerprints worked out."""
+        """The inputs with both fingerprints computed."""
         of_observations = msgspec.structs.replace(
             corrections, apart=(), joined=(), different=(), same=(), names=()
         )
@@ -64,13 +64,13 @@ class MapInputs:
         return self.corrections.settings or Settings()
 
     def known_to(self, known_at: Offset) -> "MapInputs":
-        """The same, where no command is between ``self.known_at`` and ``known_at``."""
+        """The same inputs with another ``known_at``; no command may be between the two."""
         if known_at == self.known_at:
             return self
         return replace(self, known_at=known_at)
 
     def differs_only_in_names(self, other: "MapInputs") -> bool:
-        """True when the map of ``other`` is this one but for names of places, or is this one."""
+        """Whether the map of ``other`` is equal to this one, names of places aside."""
         return (
             self.settings == other.settings
             and self.corrections.differs_in_names_only(other.corrections)
@@ -79,7 +79,7 @@ class MapInputs:
 
     @property
     def vectors(self) -> tuple[Reembed, ...]:
-        """The commands whose vectors the map has."""
+        """The ``reembed`` commands whose vectors the map has."""
         return self.corrections.reembedded_for(self.settings)
 
 
@@ -123,7 +123,7 @@ class LogInputs:
         return [command for command in self.commands if command.offset >= known_at]
 
     def extend(self, commands: Sequence[RecordedCommand], end: Offset) -> None:
-        """Add what was recorded since, up to ``end``."""
+        """Add later commands, up to ``end``."""
         self.commands += commands
         self.end = max(self.end, end)
 

@@ -1,4 +1,4 @@
-"""A fold of a log that may still grow, its view, and what each batch of events changed."""
+"""A fold of a growing log, with its view and the changes of each batch of events."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
@@ -26,9 +26,9 @@ class LiveFold:
         corrections: Corrections = NO_CORRECTIONS,
         reader: LogReader | None = None,
     ) -> None:
-        """``start`` is a snapshot's, to go on from; by default nothing is folded yet. ``reader``
-        reads the log that is folded, which may have vectors of the map's space beside those in
-        envelopes. Raises FoldError, LogDamaged."""
+        """``start`` is the fold and view of a snapshot; by default nothing is folded yet.
+        ``reader`` reads the log that is folded, which may have vectors of the map's space beside
+        those in envelopes. Raises FoldError, LogDamaged."""
         self.map, self.view = start or (
             SemanticMap(settings, corrections=corrections),
             MapView(settings, keep_embeddings=False, corrections=corrections),
@@ -40,8 +40,8 @@ class LiveFold:
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:
         """Fold events in order, a step for each: None, or why it failed.
 
-        After a failed event the map is as it was before it; the event is passed over when the next
-        step is asked for. Events are read a stretch ahead, which is faster than one by one.
+        After a failed event the map is as it was before it; the next step passes over the event.
+        Events are read a stretch ahead, which is faster than one by one.
         """
         start = 0
         while start < len(events):
@@ -63,8 +63,8 @@ class LiveFold:
             self.tracker.apply_event(event.offset, fold_parsed(event, self.map), event.logged_ns)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> None:
-        """Take over the names of ``corrections``, which the event at ``offset`` changed in nothing
-        else. The event must have been fed or skipped. Raises ValueError."""
+        """Apply the names of ``corrections``; the event at ``offset`` changed nothing else in them.
+        The event must have been fed or skipped. Raises ValueError."""
         deltas = self.map.use_names(offset, corrections)
         self.view.corrections = corrections
         self.tracker.apply_names(deltas)
@@ -80,7 +80,7 @@ def batches(
 ) -> Iterator[list[Event]]:
     """Group events: a batch ends at ``size``, before an offset in ``cuts``, and at a None.
 
-    None says that nothing came for a while; the batch is empty then if nothing came before it.
+    A None marks a pause in the events; the batch is empty if no event preceded it.
     """
     batch: list[Event] = []
     for event in events:

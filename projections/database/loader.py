@@ -134,7 +134,7 @@ TypeName: TypeAlias = Callable[[], sql.Composable]
 """Returns pgvector's type. Called when rows are sent: when they are encoded, a rebuild's thread may
 not have read yet in which schema the server has it."""
 INSERT_CHUNK: Final = 5_000
-"""Rows of one INSERT: both sides hold a statement's parameters in memory whole."""
+"""Rows of one INSERT: client and server hold all of a statement's parameters in memory."""
 VECTOR_CHUNK: Final = 500
 COPY_CHUNK: Final = 60
 """Vectors encoded and sent together: 128 kB, psycopg's own size. Larger ones are slower, as their
@@ -142,7 +142,7 @@ memory is allocated by the system each time."""
 
 
 class Loader(Protocol):
-    """Makes what inserts rows that are not in the table yet."""
+    """Makes functions that insert rows not yet in the table."""
 
     def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
         """Add vertices of one label."""

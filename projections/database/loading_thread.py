@@ -1,6 +1,6 @@
 """A thread that writes to the database while the fold goes on.
 
-The fold keeps one core busy and PostgreSQL another; taking turns would cost the sum of both. Jobs
+The fold keeps one core busy and PostgreSQL another; without a thread their times would add up. Jobs
 run one after the other on one connection, which nothing else may use before `flush`. At most
 `WAITING_JOBS` wait, so memory stays bounded: `put` blocks while there are more.
 """

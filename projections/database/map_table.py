@@ -4,7 +4,7 @@ It is part of the graph's sink: a rebuild and a tail replace its rows in the tra
 the graph's checkpoint. There are as many rows as floors with a map, so all are replaced whenever
 one of them changes; readers see the old ones or the new ones.
 
-The checkpoint has a key of the rows: who knows the maps of a key does not read them again.
+The checkpoint has a key of the rows, so that readers read the maps again only when the key changed.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ def ensure(connection: Connection) -> None:
 
 
 def replace(connection: Connection, rows: Sequence[MapRow]) -> None:
-    """Make these the rows."""
+    """Replace all rows by these."""
     connection.execute(statements("occupancy_map")["clear"])
     for row in rows:
         connection.execute(statements("occupancy_map")["insert"], row)

@@ -1,6 +1,6 @@
 """The sink that keeps rows in memory: the same rows as the databases, in plain dictionaries.
 
-Tests compare the databases with it; it also gives the rows where there is no database.
+Tests compare the databases with it; it also serves where there is no database.
 """
 
 from collections.abc import Callable, Mapping
@@ -67,7 +67,7 @@ class MemorySink:
         return MemoryShadow()
 
     def drop_replaced(self, connection: MemoryTables) -> None:
-        """Nothing to do: `MemoryShadow.swap_in` has let go of it."""
+        """Nothing to do: `MemoryShadow.swap_in` keeps no reference to replaced rows."""
 
 
 class MemoryShadow:

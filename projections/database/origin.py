@@ -22,14 +22,14 @@ _SETTINGS_OPTIONS: Final = ("--settings", "--preset", "--set")
 _WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 
 Fault: TypeAlias = Literal["log", "settings", "corrections"]
-"""What of a projection's origin is another than it should be."""
+"""The part of a projection's origin that differs from the expected one."""
 
 
 def command_line(
     name: str, log: Path, settings: Settings, *options: str, logged: Settings | None = None
 ) -> str:
-    """``mapfold NAME LOG`` with ``options``, and ``--set`` for all that the command would not take
-    by itself: from the log, whose settings are ``logged``, or the defaults."""
+    """``mapfold NAME LOG`` with ``options``, and ``--set`` for each setting that differs from the
+    command's own: the log's settings ``logged``, or the defaults."""
     changed = settings.changed_from(logged or Settings())
     return advised(name, log, *options, *_words(changed), without=_SETTINGS_OPTIONS)
 
@@ -40,7 +40,7 @@ def command_for(name: str, log: Path, inputs: MapInputs, *options: str) -> str:
 
 
 def replay_advice(log: Path, inputs: MapInputs) -> str:
-    """What to do about a projection that does not match the log, the settings or corrections."""
+    """Advice for a projection that does not match the log, the settings or corrections."""
     return f"to rebuild the map run: {command_for('replay', log, inputs)}"
 
 
@@ -81,7 +81,8 @@ def _option_value(value: object) -> str:
 
 
 def origin_fault(found: Checkpoint, log_id: str, inputs: MapInputs) -> Fault | None:
-    """What of a checkpoint's origin is not ``log_id`` or ``inputs``; None when all of it is."""
+    """The part of a checkpoint's origin that differs from ``log_id`` and ``inputs``; None if none
+    does."""
     if found.log_id != log_id:
         return "log"
     if found.fingerprint == inputs.fingerprint:
@@ -115,7 +116,8 @@ def refuse_other_origin(
 
 
 def _is_of_another_version(found: Checkpoint, inputs: MapInputs) -> bool:
-    """Neither the log nor the checkpoint has corrections, and yet the fingerprints differ."""
+    """Whether the fingerprints differ although neither the log nor the checkpoint has
+    corrections."""
     return found.known_at is None and not (inputs.corrections.fingerprint() or inputs.vectors)
 
 

@@ -30,7 +30,7 @@ from .stores import Only, open_stores
 from .vector_table import HnswReport
 
 TICK_EVENTS: Final = 256
-"""Events between two reports of progress and checks of whether enough rows wait to be written."""
+"""Events between two reports of progress; also between two checks of the number of waiting rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ def _fold_into(
 
 
 def _advice(log: Path, inputs: MapInputs, offset: Offset) -> str:
-    """What to do about an event that cannot be folded."""
+    """Advice for an event that cannot be folded."""
     before = command_for("replay", log, inputs, "--until", str(offset))
     return (
         "the databases stay as they were; to leave it out run:"

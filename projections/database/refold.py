@@ -1,15 +1,15 @@
 """Refold: a tail folds the log again under other corrections while readers use the old map.
 
 It is a rebuild (`shadows`) over the tail's own connections and locks, with three differences. It
-goes on until it has all events that came meanwhile. An event that cannot be folded is parked, as a
-tail does; but one that only a command keeps from being folded ends the refold, and the old map
-stays. And it looks for commands that are recorded while it is at work: those that only name places
-join it; another one restarts it once. After that it goes through, so that commands that keep coming
-cannot keep the map from changing, and the next refold begins. Rows of vectors that no correction
-changes are kept (`KeptVectors`).
+continues until it has folded all events recorded meanwhile. An event that cannot be folded is
+parked, as by a tail; but one that cannot be folded only because of a command ends the refold, and
+the old map stays. And it polls for commands recorded during the refold: those that only name places
+are included; another one restarts it once. After that it is completed before the next refold
+begins, so that frequent commands cannot prevent every change of the map. Rows of vectors that no
+correction changes are kept (`KeptVectors`).
 
-The checkpoint says which commands the new map knows, in the transaction of the swap. Whatever ends
-a refold, a command that no map knows yet makes the next tail refold.
+The transaction of the swap records in the checkpoint which commands the new map includes. However a
+refold ends, a command that the map does not include makes the next tail refold.
 
 Its progress is in the checkpoints, for other processes to read. The refold's own connections are in
 the transaction of the swap, whose writes are not visible before it ends, so a thread writes the
@@ -85,8 +85,8 @@ class RefoldProgress:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Write nothing for the length of the block, which changes the checkpoints; afterwards the
-        refold is over."""
+        """Pause writing progress during the block, which changes the checkpoints and ends the
+        refold."""
         with self._held:
             yield
             self._at = (None, None)
@@ -108,7 +108,7 @@ class RefoldProgress:
 
 TICK_EVENTS: Final = 256
 LOOK_S: Final = 0.5
-"""Between two looks for commands that came meanwhile."""
+"""Seconds between two polls for new commands."""
 
 
 class CommandsCame(Exception):
@@ -123,7 +123,7 @@ class RefoldStopped(Exception):
 class Refold:
     """One refold. ``found`` are the checkpoints of the old map, ``parked`` its dead letters.
 
-    With ``goes_through`` commands that come meanwhile are left to the next one.
+    With ``goes_through`` commands recorded meanwhile are left to the next refold.
     """
 
     stores: Sequence[Store]
@@ -191,7 +191,7 @@ class Refold:
                 self._letters.append(dead_letter(event, error.reason))
 
     def _look(self) -> Offset:
-        """Find the commands that came since; the log's end now."""
+        """Read new commands; returns the log's current end."""
         self._looked_at = time.monotonic()
         start, end = self.inputs.end, self.reader.refresh()
         self.inputs.extend(commands_between(self.reader, start, end), end)
@@ -200,7 +200,7 @@ class Refold:
         return end
 
     def _named(self, fold: LiveFold, last: Event | None) -> MapInputs:
-        """The inputs of the map, after names that came meanwhile."""
+        """The inputs of the map, with names recorded meanwhile."""
         latest = self.inputs.latest
         if last is None or not self.base.differs_only_in_names(latest):
             return self.base

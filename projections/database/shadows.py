@@ -5,16 +5,17 @@ transaction per database. So an interruption of any kind at any moment leaves th
 and nothing to clean up. After the commit only what was replaced is dropped and, for a large table,
 the HNSW index built. A thread for each database writes while the fold goes on (`loading_thread`).
 
-Readers name the graph and AGE resolves each label's table by that name, so a reader in the middle
-of a statement must not find half of its tables before the swap and half after. Therefore everything
-that is replaced, graph and table, is locked exclusively *before* any name changes: we wait for a
-reader that already has one of the tables; one that comes later waits at its first table, and
-PostgreSQL resolves the name again when it gets the lock.
+Readers name the graph and AGE resolves each label's table by that name, so a statement must not
+find half of its tables before the swap and half after. Therefore everything that is replaced, graph
+and table, is locked exclusively *before* any name changes. The swap waits for a reader that already
+has one of the tables; a later reader waits at its first table, and PostgreSQL resolves the name
+again when it gets the lock.
 
-While we wait and hold some of the locks, a reader may wait for us: a deadlock. So we wait only
-briefly, release all of them, and try again; below the server's deadlock_timeout (1 s) it is always
-we who give way. The locks of two databases are taken and released together: no server sees a
-deadlock between them, and the readers of one must not wait until those of the other have ended.
+While the swap waits and holds some of the locks, a reader may wait for it: a deadlock. So it waits
+only briefly, releases all locks, and tries again; within the server's deadlock_timeout (1 s) it
+always gives way before a reader is cancelled. The locks of two databases are taken and released
+together: no server can detect a deadlock between them, and readers of one must not wait for those
+of the other.
 """
 
 import contextlib
@@ -117,16 +118,17 @@ def _create(store: Store, shadows: Sequence[Shadow[Connection]]) -> None:
 
 
 SHORT_TIMEOUTS: Final = "SET LOCAL lock_timeout = '200ms'; SET LOCAL statement_timeout = '400ms'"
-"""For one attempt to lock. A sink's tables are locked by one statement, which may wait for several
-readers in turn: both sinks together stay below a second."""
+"""Timeouts of one attempt to lock. A sink's tables are locked by one statement, which may wait for
+several readers in turn: both sinks together stay below a second."""
 NO_TIMEOUTS: Final = "SET LOCAL lock_timeout = 0; SET LOCAL statement_timeout = 0"
 PAUSE_S: Final = 0.02
 LOCK_TIMEOUT_S: Final = 120.0
-"""How long to try to lock what is replaced."""
+"""Seconds to try to lock the replaced tables."""
 
 
 def lock_readers(writers: Sequence[ShadowWriter]) -> None:
-    """Lock what the shadows will replace. Raises DatabaseError after `LOCK_TIMEOUT_S`."""
+    """Lock the tables that the shadows will replace. Raises DatabaseError after
+    `LOCK_TIMEOUT_S`."""
     deadline = time.monotonic() + LOCK_TIMEOUT_S
     while (store := _store_with_readers(writers)) is not None:
         if time.monotonic() > deadline:
@@ -147,7 +149,8 @@ class _HasReaders(Exception):
 
 
 def _store_with_readers(writers: Sequence[ShadowWriter]) -> Store | None:
-    """Try once: None when all is locked; else nothing is, and readers hold locks in this store."""
+    """Try once: None when all tables are locked; else none is, and readers hold locks in the
+    returned store."""
     try:
         with contextlib.ExitStack() as savepoints:  # rolling back to them releases the locks
             for writer in writers:
@@ -181,16 +184,16 @@ class FoldedLog:
 
 @dataclass(frozen=True, slots=True)
 class Swap:
-    """What was swapped in: digest, and rows by label and table."""
+    """The map that was swapped in: its digest, and rows by label and table."""
 
     digest: str
     rows: dict[str, int]
 
 
 Notify: TypeAlias = Callable[[str], None]
-"""Told the stage that begins: writing, swapping, tidying, indexing."""
+"""A function called with each stage as it begins: writing, swapping, tidying, indexing."""
 FoldInto: TypeAlias = Callable[[Sequence[ShadowWriter]], FoldedLog]
-"""Folds a log and, with `stream`, writes what it can to the shadows on the way."""
+"""A function that folds a log and, with `stream`, writes rows to the shadows during the fold."""
 
 
 def swap_in_new_map(
@@ -202,7 +205,7 @@ def swap_in_new_map(
     shadow_of: ShadowOf = lambda sink: sink.shadow(),
     while_swapping: contextlib.AbstractContextManager[object] | None = None,
 ) -> Swap:
-    """Replace the map that readers see. Whatever is raised, the old map stays.
+    """Replace the map that readers see. On any exception the old map stays.
 
     ``while_swapping`` is entered before the checkpoints are written and left after the commit.
     """
@@ -243,7 +246,7 @@ def swap_in_new_map(
 def _transactions(stores: Sequence[Store]) -> Iterator[contextlib.ExitStack]:
     """A transaction in each store, committed in turn; an error inside rolls all of them back.
 
-    What the yielded stack is given is left after the commits.
+    Contexts entered in the yielded stack are left after the commits.
     """
     with contextlib.ExitStack() as afterwards, contextlib.ExitStack() as transactions:
         for store in stores:
@@ -271,7 +274,7 @@ def _errors_after_swap() -> Iterator[None]:
 
 
 def drop_replaced(stores: Sequence[Store], notify: Notify, *, hnsw: bool) -> HnswReport | None:
-    """After the commit: drop what was replaced; with ``hnsw`` build that index if it pays."""
+    """After the commit: drop the replaced tables; with ``hnsw`` build that index if it pays."""
     notify("tidying")
     with _errors_after_swap():
         return _drop_replaced(stores, notify, hnsw=hnsw)

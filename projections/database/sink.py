@@ -1,4 +1,4 @@
-"""The port between the fold and what the map is written to.
+"""The interface (port) between the fold and the places to which the map is written.
 
 A sink that follows a log implements `LiveSink`. For each batch of events `tail_pass` calls
 `prepare` with the ids that the batch changed and the view; `writer` opens a transaction, calls
@@ -41,14 +41,14 @@ Conn = TypeVar("Conn", contravariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """How far a sink is, and what it was made from.
+    """A sink's position in the log, and its origin.
 
     ``next_offset`` events of the log ``log_id`` are in, folded with ``settings`` (canonical JSON)
     under the corrections of the commands before ``known_at``; ``fingerprint`` is of both.
-    ``last_event`` is `event_hash` of the last event, "" for none: it tells a log that was cut and
+    ``last_event`` is `event_hash` of the last event, "" for none: it detects a log that was cut and
     continued differently. ``digest`` is the map's, when known. ``observed`` is as in
-    `inputs.MapInputs`. ``maps`` tells the occupancy maps from others, None for none. Checkpoints of
-    older versions have neither ``known_at`` nor ``observed`` nor ``maps``.
+    `inputs.MapInputs`. ``maps`` identifies the occupancy maps, None for none. Checkpoints of older
+    versions have neither ``known_at`` nor ``observed`` nor ``maps``.
     """
 
     log_id: str
@@ -89,7 +89,7 @@ class LiveSink(Protocol[Conn]):
         """
 
     def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
-        """The write that makes the rows what ``view`` has now, after a batch's ``changes``."""
+        """The write that brings the rows up to date with ``view`` after a batch's ``changes``."""
 
 
 class Shadow(Protocol[Conn]):
@@ -119,13 +119,14 @@ class RebuildSink(Protocol[Conn]):
     """A sink that can be rebuilt while readers use the old rows."""
 
     def drop_leftovers(self, connection: Conn) -> None:
-        """Drop what an earlier rebuild replaced or left. Raises DatabaseError like `ensure`."""
+        """Drop tables that an earlier rebuild replaced or left behind. Raises DatabaseError like
+        `ensure`."""
 
     def shadow(self) -> Shadow[Conn]:
         """A shadow, not created yet."""
 
     def drop_replaced(self, connection: Conn) -> None:
-        """Drop what was replaced, now or once its last reader has ended.
+        """Drop the replaced tables, now or once their last reader has ended.
 
         May close the connection while the server still drops.
         """

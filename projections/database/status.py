@@ -4,7 +4,7 @@ A sink is *following* while a live tail writes it, with every event or still cat
 when its tail has had no heartbeat for ``STALLED_S``; *refolding* while its tail folds the log again
 because of a command; *rebuilding* while a replay writes it. Without a writer it is *idle* when it
 has every event and *behind* when not. It is *other* when it was made from another log, with other
-settings or under other corrections than the commands that it knows.
+settings or under other corrections than its commands give.
 """
 
 from dataclasses import dataclass
@@ -165,7 +165,7 @@ def _sink_status(
 
 @dataclass(frozen=True, slots=True)
 class _Writer:
-    """Who holds a sink's lock, None if it is free; seconds since its tail's heartbeat."""
+    """The holder of a sink's lock, None if it is free; seconds since its tail's heartbeat."""
 
     name: str | None
     heartbeat: float | None

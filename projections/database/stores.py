@@ -29,7 +29,8 @@ Only: TypeAlias = SinkName | None
 
 
 class DatabaseSink(LiveSink[Connection], RebuildSink[Connection], Protocol):
-    """A sink of a database; connections are in autocommit where the port says no transaction."""
+    """A sink of a database; connections are in autocommit where `sink` says "outside a
+    transaction"."""
 
     @property
     def name(self) -> SinkName:
@@ -47,7 +48,7 @@ class Store:
 
     @property
     def place(self) -> str:
-        """Where it is, for messages."""
+        """The database, for messages."""
         return describe_target(self.url)
 
     def reconnect(self) -> None:

@@ -5,18 +5,18 @@ state is kept nowhere else), and writes to each sink from its own checkpoint on.
 (`TailPass`) lasts until the tail is stopped, unless the server loses commits that it had not
 flushed: then the fold is ahead of the databases, and another pass begins at their checkpoints.
 
-A batch is what has come since the last one: one event when little comes, up to `BATCH_EVENTS` when
+A batch has the events since the last one: a single event at a low rate, up to `BATCH_EVENTS` when
 the tail is behind. Each batch is one transaction per database (`writer`).
 
 An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
 same transaction that moves past it. Parked events are left out at every later start too, so that
-the rows remain what the fold says, until a rebuild tries them again.
+the rows stay equal to the fold, until a rebuild tries them again.
 
 A command changes how earlier events are folded. One that only names places is applied at once, in
-the transaction that moves past it. Another one ends the following: a `refold` folds the log again,
-and following goes on from there. At the start of a pass the checkpoints tell which commands the map
-knows, so none is lost. Where a command moves a keyframe out of the map, the refold ends, the old
-map stays as it is, without what comes later, and the tail waits for another command.
+the transaction that moves past it. Any other command interrupts the tail: a `refold` folds the log
+again, and the tail continues from there. At the start of a pass the checkpoints state which
+commands the map includes, so none is lost. If a command moves a keyframe out of bounds, the refold
+ends, the old map stays without later events, and the tail waits for another command.
 """
 
 import threading
@@ -36,9 +36,9 @@ from .tail_progress import TailProgress, TailReport
 from .writer import AWAY, Backoff, LostCommits, OnTrouble
 
 BATCH_EVENTS: Final = 500
-"""At most this many events in one transaction: about half a second of work when behind."""
+"""The most events in one transaction: about half a second of work when behind."""
 ONCE_TIMEOUT_S: Final = 60.0
-"""How long `tail` with ``once`` waits for a database that is away."""
+"""Seconds that `tail` with ``once`` waits for an unreachable database."""
 
 
 def tail(
@@ -64,10 +64,9 @@ def tail(
     ``on_fold`` is called with the number of events folded and written, at the start of a pass and
     after each batch of it; ``on_refold`` with the number of events that a refold has folded and the
     number that it has to fold. ``note`` is called with a message for each snapshot that could not
-    be used or kept, which costs time and nothing else, and for a command that a refold cannot obey;
-    with ``once`` such a command is raised (ImpossibleCommand).
-    Raises ProjectionMismatch when the databases were made from another log or with other settings,
-    ProjectionBusy, CheckpointMoved.
+    be used or kept, which costs time and nothing else, and for a command that cannot be applied;
+    with ``once`` such a command is raised (ImpossibleCommand). Raises ProjectionMismatch when the
+    databases were made from another log or with other settings, ProjectionBusy, CheckpointMoved.
     """
     plan = TailPlan(
         log,
@@ -92,7 +91,7 @@ def tail(
                 return report
         except LostCommits:
             report.restarts += 1
-            # The database may be away while the next pass begins.
+            # The database may be unreachable while the next pass begins.
             at = describe_target(targets.graph_url)
             outage = Backoff(at, plan.stop, on_trouble, plan.patience_s)
 
@@ -100,9 +99,9 @@ def tail(
 def _run_pass(
     plan: TailPlan, report: TailReport, only: Only, loader: LoaderName, outage: Backoff | None
 ) -> bool:
-    """Run one pass; False when the database was away at its beginning. Raises LostCommits.
+    """Run one pass; False when the database was unreachable at its beginning. Raises LostCommits.
 
-    ``outage`` is None for the first pass, which does not wait for a database that is away.
+    ``outage`` is None for the first pass, which does not wait for an unreachable database.
     """
     run: TailPass | None = None
     try:

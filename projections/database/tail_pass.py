@@ -67,8 +67,8 @@ class TailPlan:
 class TailPass:
     """From the checkpoints to the end of the log, or for as long as it grows.
 
-    Call `run`. ``current`` is what the map is made with now. ``parked`` has all dead letters by
-    offset, ``letters`` those that are to be written with the next batch.
+    Call `run`. ``current`` are the inputs of the map. ``parked`` has all dead letters by offset,
+    ``letters`` those that are to be written with the next batch.
     """
 
     plan: TailPlan
@@ -112,8 +112,8 @@ class TailPass:
 
     @contextlib.contextmanager
     def _lost_connections(self) -> Iterator[None]:
-        """Raise LostCommits when a database goes away: the next pass begins at the checkpoints. At
-        the beginning of the first pass it is an error."""
+        """Turn a lost connection into LostCommits: the next pass begins at the checkpoints. At the
+        beginning of the first pass it is an error."""
         try:
             yield
         except AWAY as error:
@@ -200,7 +200,7 @@ class TailPass:
         return True
 
     def _knows(self, batch: Sequence[Event]) -> bool:
-        """Take note of the commands of a batch; False when they change more than names."""
+        """Record the commands of a batch; False when they change more than names."""
         commands = [
             read_command(event)
             for event in batch
@@ -242,7 +242,7 @@ class TailPass:
     def _begin(self, reader: LogReader) -> bool:
         """Create what is missing, read the checkpoints, refuse those that do not match.
 
-        False when the map does not know all commands, or not in the way that we read them.
+        False when the map does not include all commands, or was made under other corrections.
         """
         plan = self.plan
         reader.refresh()
@@ -357,7 +357,7 @@ class TailPass:
             self.plan.on_batch(self.report)
 
     def _use_names(self, fold: LiveFold, offset: Offset) -> None:
-        """Take over names that the commands up to ``offset`` give."""
+        """Apply the names given by the commands up to ``offset``."""
         known_at = Offset(max(self.current.known_at, offset + 1))
         if not self.inputs.has_between(self.current.known_at, known_at):
             self.current = self.current.known_to(known_at)

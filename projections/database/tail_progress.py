@@ -11,8 +11,8 @@ from .checkpoints import DeadLetter
 
 @dataclass(slots=True)
 class TailReport:
-    """What a tail did so far: batches and events written, its offset, what it parked, and how
-    often it refolded the log because of commands."""
+    """A tail's counts so far: batches and events written, its offset, parked events, and
+    refolds."""
 
     next_offset: Offset = FIRST_OFFSET
     events: int = 0

@@ -25,7 +25,7 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """One row: the delta that adds it; the values of the columns are computed when asked for.
+    """One row: the delta that adds it; the values of the columns are computed on access.
 
     ``keyframe_pose`` is None when the robot had no pose; the event was logged at ``logged_ns``.
     """
@@ -56,13 +56,13 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
 
     @property
     def unit(self) -> UnitVector:
-        """The embedding as the fold has it. Every row has one."""
+        """The embedding as a unit vector of the fold. Every row has one."""
         assert self.added.embedding is not None  # noqa: S101 - see `BatchChanges.embedded`
         return self.added.embedding
 
     @property
     def embedding(self) -> NDArray[np.float32]:
-        """The embedding as the table has it, shape (dim,)."""
+        """The embedding as stored in the table, shape (dim,)."""
         return to_float32(self.unit)
 
     @property

@@ -33,9 +33,9 @@ READERS: Final = "public"
 SHADOW: Final = "mapfold"
 """The schema of a rebuild's shadow."""
 PLAIN_DIMENSION: Final = 1_900
-"""Up to here a row fits one page of 8 kB and can be kept out of TOAST."""
+"""Dimension up to which a row fits one page of 8 kB and can be kept out of TOAST."""
 EXACT_ROWS: Final = 50_000
-"""Up to this many rows the table is searched exactly."""
+"""Rows up to which the table is searched exactly."""
 INDEX_DIMENSION: Final = 2_000
 """pgvector's limit for an HNSW index on ``vector``."""
 SAFE_PARALLEL: Final = (0, 8, 2)
@@ -165,7 +165,8 @@ def _extension_schema(connection: Connection) -> str:
 
 @dataclass(frozen=True, slots=True)
 class HnswReport:
-    """``built`` says whether the index was made; ``reason`` why or why not; ``seconds`` it took."""
+    """``built`` is whether the index was made, ``reason`` why or why not, ``seconds`` the time it
+    took."""
 
     built: bool
     reason: str

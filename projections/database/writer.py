@@ -2,7 +2,7 @@
 
 Rows and checkpoint move in one transaction, the checkpoint by compare-and-set. When a transaction
 fails because the server or the connection did, it is unknown whether it was committed. So the batch
-is kept, it connects again (with growing pauses), and the checkpoint is read:
+is kept, the writer connects again (with exponential back-off) and reads the checkpoint:
 
 * it is where the batch begins: the batch was not committed; write it again
 * it is where the batch ends: it was committed, only the answer was lost; go on
@@ -34,8 +34,8 @@ from .sink import Checkpoint, PreparedWrite, SinkName
 from .stores import DatabaseSink, Store
 
 AWAY: Final = (DatabaseUnavailable, EmbeddedServerError)
-"""Errors after which another attempt may succeed. EmbeddedServerError: a server that is killed
-while it starts does not start."""
+"""Errors after which another attempt may succeed. EmbeddedServerError is raised for a server killed
+during its start."""
 FIRST_PAUSE_S: Final = 0.1
 LONGEST_PAUSE_S: Final = 5.0
 
@@ -91,10 +91,10 @@ class SinkBatch:
 
 @dataclass(slots=True)
 class Writer:
-    """Writes to one store. ``revive`` restarts a server that is ours; ``trouble`` gets messages.
+    """Writes to one store. ``revive`` restarts the embedded server; ``trouble`` gets messages.
 
-    ``checkpoints`` are the sinks' as far as we know; the caller of `write` updates them.
-    Gives up after ``patience_s`` without a connection, never for None.
+    ``checkpoints`` are the sinks' last known ones; the caller of `write` updates them. Gives up
+    after ``patience_s`` without a connection, never for None.
     """
 
     store: Store
@@ -167,7 +167,7 @@ class Writer:
         connection, found = self.store.connection, FoundCheckpoints()
         with database_errors(self.store.url), connection.transaction():
             for sink in self.store.sinks:
-                # A transaction that was rolled back may have changed what the sink knows.
+                # A transaction that was rolled back may have changed the sink's state.
                 if sink.ensure(connection):
                     raise LostCommits  # all rows are gone; the next pass reports why
                 found[sink.name] = checkpoints.load(connection, sink.name)

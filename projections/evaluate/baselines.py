@@ -1,8 +1,8 @@
-"""Baselines of re-localisation, which every score is compared with.
+"""Baselines of re-localisation, with which scores are compared.
 
-*Plain*: the ten observations most similar to each crop; the answer is the median of where their
-robots stood, in x and y each. *Best cosine*: the greatest cosine of a crop and an observation; the
-greater it is, the likelier the map knows the thing.
+*Plain*: the ten observations most similar to each crop; the answer is the median of their robots'
+positions, in x and y each. *Best cosine*: the greatest cosine of a crop and an observation, as a
+score of whether the thing is in the map.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ NEAREST = 10
 
 
 def plain_position(matches: Sequence[Sequence[Match]]) -> tuple[float, float] | None:
-    """Metres; None if none of the nearest observations has a pose."""
+    """The plain position in metres; None if none of the nearest observations has a pose."""
     poses = [m.pose[:2] for row in matches for m in row[:NEAREST] if m.pose is not None]
     if not poses:
         return None

@@ -1,13 +1,13 @@
-"""Questions from a map's own keyframes, asked as if the visit they are from were not in the map.
+"""Questions from a map's own keyframes, asked as if the visit with the keyframe were not in the
+map.
 
-Each is a keyframe of the map, asked with crops that it has. Its *visit* is taken out of the map:
-what was observed in its run within `VISIT` keyframes of it. A robot that comes another day sees
-things less alike than within one run, so the cosines to the rest of its own run are lowered by the
-map's session shift. Asked so, a thing that was seen at another time too is *known*.
+Each question has crops of a keyframe of the map. The *visit*, the observations of its run within
+`VISIT` keyframes of it, is taken out of the map. Likenesses within a run are higher than between
+days, so the cosines to the rest of the run are lowered by the map's session shift. A thing that was
+seen at another time, too, is then *known*.
 
-Asked again with the things shown taken out, as the fold knows them, the same question is one that
-the map cannot know. What stands beside them and is of the same class is taken out too: the fold may
-have split it off.
+With the Objects of the things shown taken out, too, the same question is about unknown things.
+Objects of the same class beside them are taken out as well: the fold may have split them off.
 """
 
 import math
@@ -31,21 +31,21 @@ from .questions import DEFAULT_SEED, draw_key, spread
 from .trials import RIGHT_WITHIN_M
 
 VISIT = 20
-"""Keyframes of a run before and after one that are of the same visit."""
+"""The number of keyframes before and after one that are of the same visit."""
 STAND_APART_M, SEEN_APART_M = 2.0, 3.0
-"""Objects of one class are taken out together if they stand nearer to each other, or within twice
-that where one was seen from a single spot; on maps of the page's rule, if the positions they were
-seen from are."""
+"""Objects of one class are taken out together if they are nearer to each other, or within twice
+that if one was seen from a single spot; under ``fusion = "page"`` the positions that they were seen
+from are compared."""
 MOST = 100
-"""Keyframes asked from at most, spread evenly over the map."""
+"""The most keyframes asked from, spread evenly over the map."""
 
 
 @dataclass(frozen=True, slots=True)
 class OwnAnswer:
-    """The answer to one of the map's own questions, of so many ``crops``.
+    """The answer to one of the map's own questions with this number of ``crops``.
 
-    ``known`` says that something shown was observed outside the visit too, ``taken_out`` that the
-    things shown were taken out of the map. Errors are in metres, None without a pose.
+    ``known`` is whether something shown was observed outside the visit too, ``taken_out`` whether
+    the things shown were taken out of the map. Errors are in metres, None without a pose.
     """
 
     crops: int
@@ -165,7 +165,8 @@ def _drawn(
 def _observations_of_things(
     view: MapView, by_class: dict[str, list[ObjectRecord]], seen: Sequence[ObservationOrdinal]
 ) -> set[ObservationOrdinal]:
-    """These, the others of their Objects, and those of Objects that may be the same thing."""
+    """These observations, the others of their Objects, and those of Objects that may be the same
+    thing."""
     found = set(seen)
     for ordinal in seen:
         number = view.observations[ordinal].object

@@ -1,12 +1,11 @@
-"""Call functions that need nothing from each other in several processes.
+"""Call independent functions in several processes.
 
-This process calls too, and each further one as many as it gets done. The functions cross to the
-processes as one pickle in memory, which only processes of this program read, and their results as
-pickles over the connection. Results come back in the order of the calls.
+This process makes calls too, and each further one as many as it can. The functions are passed to
+the processes as one pickle in memory, which only processes of this program read, and results come
+back as pickles over the connection. Results come back in the order of the calls.
 
-A process that dies, because it was killed or because a call raised, costs time only: what it had
-not answered is called again, in this process if no other is left. So an error of a call is raised
-here.
+If a process dies, because it was killed or a call raised, its unanswered calls are made again, in
+this process if no other is left. So an error of a call is raised here.
 """
 
 import contextlib
@@ -27,10 +26,10 @@ from projections.worker_process import ProcessGone, WorkerProcess, unnamed_memor
 T = TypeVar("T")
 
 CALLS_PER_WORKER: Final = 100
-"""For each process that is started; fewer are made sooner than it has started, as a question takes
-ten milliseconds and starting one half a second."""
+"""Calls for each process that is started; fewer are done before it has started: a question takes
+ten milliseconds, a start half a second."""
 _AHEAD: Final = 8
-"""Calls that a process is given at a time, so that it need not wait for this one."""
+"""Calls assigned to a process at a time, so that it need not wait for this one."""
 _PROGRAM: Final = "import sys; from projections.evaluate.parallel import main; main(*sys.argv[1:])"
 _NUMBER: Final = struct.Struct("<q")
 
@@ -42,10 +41,10 @@ def call_all(
     unit: str,
     note: Note | None = None,
 ) -> list[T]:
-    """The results of all, which this process and up to ``workers`` further ones call.
+    """The results of all calls, made by this process and up to ``workers`` further ones.
 
-    Reports the progress; ``note`` is called if a process has died. Raises what a call raises; if
-    several do, which one's is open.
+    Reports the progress; ``note`` is called if a process has died. Raises an exception of a call;
+    of several an arbitrary one.
     """
     results: dict[int, T] = {}
     waiting = deque(range(len(calls)))
@@ -80,14 +79,14 @@ def call_all(
 
 
 class _CallingProcess(WorkerProcess, Generic[T]):
-    """``given`` are the numbers of the calls that it has not answered, in their order."""
+    """A process that makes calls; ``given`` are the numbers of its unanswered calls, in order."""
 
     def __init__(self, memory: int) -> None:
         super().__init__(_PROGRAM, memory=memory)
         self.given: deque[int] = deque()
 
     def give(self, number: int) -> None:
-        """Have it make a call. Raises ProcessGone."""
+        """Assign a call. Raises ProcessGone."""
         self.given.append(number)
         self.send(_NUMBER.pack(number))
 

@@ -34,15 +34,15 @@ DEFAULT_SEED = 20260321
 
 T = TypeVar("T")
 VIEW_CROPS = 3
-"""Crops of a view at most."""
+"""The most crops of a view."""
 _NEAR_BY = 4
-"""The views of a question are among the last so many keyframes for each view."""
+"""The views of a question are among its last keyframes, this number times the number of views."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked, and the true pose, room and instances behind it; pose and room are those of
-    the last view, and so is the key."""
+    """A question with its true pose, room and instances; pose, room and key are those of the last
+    view."""
 
     key: Key
     asked: relocalize.Question
@@ -54,7 +54,7 @@ class Question:
 
     @property
     def crops(self) -> tuple[Crop, ...]:
-        """Those of all views."""
+        """The crops of all views."""
         return self.asked.crops
 
 
@@ -157,7 +157,7 @@ def _draw(keyframe: Accepted, most: int, seed: int) -> list[int]:
 
 
 def draw_key(seed: int, det_id: str) -> bytes:
-    """Orders the crops of a keyframe: the first are asked with."""
+    """A key that orders the crops of a keyframe; questions have the first ones."""
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 

@@ -3,7 +3,7 @@
 Accuracy and errors are over *known* questions (some true instance of theirs is in the map), errors
 over those that have a pose. ``auroc`` is that of `known` between known and unknown questions.
 Calibration counts all questions: an answer is right when the question is known and the pose is
-within 1.5 m of the truth. ``plain`` and ``best_cosine`` are what a few lines do (`baselines`).
+within 1.5 m of the truth. ``plain`` and ``best_cosine`` are simple baselines (`baselines`).
 """
 
 from collections.abc import Callable, Sequence
@@ -46,7 +46,7 @@ from .truth import Truth
 
 CROPS, VIEWS = (1, 2, 3, 5), (1, 3, 5)
 MOST_VIEWS = 200
-"""Questions of each number of views at most, spread evenly: they take longer."""
+"""The most questions of each number of views, spread evenly; they take longer."""
 OWN_CROPS = (1, 3)
 
 
@@ -79,9 +79,9 @@ def evaluate(
     questions beside this one, 0 for none, by default `default_workers`; the scores do not depend on
     it.
 
-    ``note`` is called with what the user should know about ``until`` (`eventsrc.log.seek.resolve`),
-    and when a process has died.
-    Deterministic but for ``latency_ms``, which is of exact search in memory plus the ranking.
+    ``note`` is called with remarks for the user about ``until`` (`eventsrc.log.seek.resolve`), and
+    when a process has died. Deterministic but for ``latency_ms``, which is of exact search in
+    memory plus the ranking.
     """
     with LogReader(map_log) as reader:
         end = resolve(reader, until, note=note)

@@ -22,12 +22,12 @@ from .truth import Key, Truth
 SPANS_FROM = 0.1
 """A place spans two rooms when a second room has at least this share of its members."""
 BINS = 10
-"""Of the confidence, for calibration."""
+"""The number of bins of the confidence, for calibration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Each between 0 and 1, ``adjusted_rand`` also below 0."""
+    """Scores of a clustering; each is between 0 and 1, ``adjusted_rand`` may be below 0."""
 
     homogeneity: float
     completeness: float
@@ -141,8 +141,8 @@ def expected_calibration_error(confidence: Sequence[float], right: Sequence[bool
 def calibration_floor(confidence: Sequence[float]) -> float:
     """The calibration error to expect if every confidence were the true probability.
 
-    So many answers right in a bin are a sum of independent yes or no; the mean gap between that
-    number and its expectation is computed from the distribution of the number.
+    The number of right answers in a bin is a sum of independent Bernoulli variables; the mean gap
+    to its expectation is computed from its distribution.
     """
     gaps = []
     for members in bins(confidence):

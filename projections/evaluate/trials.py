@@ -27,9 +27,9 @@ RIGHT_WITHIN_M = 1.5
 class RoomIndex:
     """The room at a position: that of the nearest keyframe whose room is known.
 
-    The map's own keyframes cannot name a room the map never entered, though a pose may lie in it.
-    So the whole of the map's log counts, also what comes after ``--at``, and the query runs that
-    saw an instance the map's log saw too; another building's runs, in another frame, do not.
+    A pose may lie in a room that none of the map's keyframes entered. So all keyframes of the map's
+    log count, those after ``--at`` too, and those of query runs that share an instance with it;
+    runs of another building, in another frame, do not.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ def _instances(keyframes: Sequence[Accepted], truth: Truth) -> set[str]:
 class Trial:
     """One question's outcome. Lengths in metres; None where truth or answer lacks the value.
 
-    ``known`` says that at least one of the crops' true instances is in the map. A place *is* a room
-    when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` says
-    that some place contains the true room: without one no place can be the right answer.
+    ``known`` is whether at least one of the crops' true instances is in the map. A place *is* a
+    room when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` is
+    whether some place contains the true room: without one no place can be the right answer.
     ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
     room there by the `RoomIndex`, None without one. ``plain_error_m`` and ``best_cosine`` are those
     of `baselines`; ``plain_place_error_m`` is the plain method's, a place's centroid.
@@ -97,7 +97,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a map answers, without the truth: see `Trial`. Positions are in metres."""
+    """The answer of a map, without the truth: see `Trial`. Positions are in metres."""
 
     answer: Answer
     plain_at: tuple[float, float] | None
@@ -209,7 +209,7 @@ class TrialRunner:
 
 
 def _distance(position: tuple[float, float] | None, question: Question) -> float | None:
-    """Metres from where the question was asked."""
+    """The distance in metres from the question's true position."""
     if position is None:
         return None
     return math.hypot(position[0] - question.x, position[1] - question.y)

@@ -1,10 +1,11 @@
-"""Candidates from the live databases: one round trip to each of them for crops with embeddings.
+"""Candidates from the live databases, in one round trip to each for crops with embeddings.
 
 Crops without one are answered with observations of Objects of their class, which takes three more.
 
 Graph and vectors are one map only if the same log and settings made both. Each has a checkpoint of
 its own, and ``replay --only`` or ``tail --only`` may have made one of them from something else. The
-numbers of observations then differ, and an answer made of both would be wrong; it is refused.
+numbers of observations then differ, and an answer made of both would be wrong, so the question is
+refused.
 """
 
 import contextlib
@@ -67,8 +68,8 @@ def refuse_mixed(
 
 
 class CandidateSearch:
-    """One question's search over open connections to ``targets``; the same one twice for one
-    database."""
+    """One question's search over open connections to ``targets``; with one database both are the
+    same connection."""
 
     def __init__(
         self,
@@ -101,7 +102,8 @@ class CandidateSearch:
         return found
 
     def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Along]":
-        """Rows of crop, similarity, det_pk and what follows in ``near``; and what is along them."""
+        """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
+        Places."""
         one = self._vectors is self._graph
         values: dict[str, Any] = {"observation": LABEL_IDS["Observation"]}
         values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
@@ -119,7 +121,8 @@ class CandidateSearch:
         return near, _NOTHING if of_graph is None else self._along(of_graph, origin)
 
     def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Along]":
-        """The same for crops of which only the class is known; ``named`` are their numbers."""
+        """As `_nearest`, for crops of which only the class is known; ``named`` are their
+        indices."""
         names = sorted({crops[number].class_name or "" for number in named})
         values: dict[str, Any] = {
             "patterns": [f'{{"class_name": {text(name)}}}' for name in names],
@@ -147,7 +150,8 @@ class CandidateSearch:
         return near, along
 
     def _near(self, rows: _Rows) -> tuple[_Rows, str | None]:
-        """Learn the cosines; the rows from ``crop`` on that have an observation, and the origin."""
+        """Store the cosines; returns the rows that have an observation, from the column ``crop``
+        on, and the origin."""
         cosines, origin = next((row[0] for row in rows if row[0] is not None), (None, None))
         self._known = self._known.with_cosines(cosines)
         return [row[1:_NEAR] for row in rows if row[3] is not None], origin
@@ -161,7 +165,7 @@ class CandidateSearch:
             return self._along(rows[0], origin)
 
     def _along(self, row: tuple[Any, ...], origin: str | None) -> "_Along":
-        """Learn the settings and check the origin; ``row`` has the columns of ``of_graph``."""
+        """Store the settings and check the origin; ``row`` has the columns of ``of_graph``."""
         settings, graph, maps, things, places = row[0]
         if graph != origin or settings is not None:
             place = describe_target(self._targets.graph_url)
@@ -185,8 +189,8 @@ class CandidateSearch:
 
 @lru_cache(maxsize=128)
 def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
-    """``crops`` is the number of those that are searched for, ``neighbours`` that of observations
-    for each, in the statements that search.
+    """The text of a statement. In those that search, ``crops`` is the number of crops and
+    ``neighbours`` that of observations for each.
 
     Without comments and line breaks: psycopg reads a short statement once, a long one for every
     question.
@@ -220,12 +224,13 @@ class _Thing(NamedTuple):
 
 
 _NONE: Final = 0
-"""In place of a graph id, of which none is 0."""
+"""Stands for no graph id; ids are never 0."""
 _NO_EDGES: Final = (_NONE, _NONE, _NONE)
 
 
 class _Along(NamedTuple):
-    """Ids of Object, its Place and the keyframe's Place by det_pk; and what is at these ids."""
+    """Ids of Object, its Place and the keyframe's Place by det_pk; and the Objects and Places with
+    these ids."""
 
     ids: dict[int, tuple[int, int, int]]
     things: dict[int, _Thing]
@@ -258,7 +263,7 @@ class _Along(NamedTuple):
         )
 
     def and_more(self, more: "_Along") -> "_Along":
-        """With those of ``more``."""
+        """These and those of ``more``."""
         return _Along(self.ids | more.ids, self.things | more.things, self.places | more.places)
 
 
@@ -292,15 +297,15 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
 
 
 def _box(array: str) -> Box:
-    """A box from the text of its array, which has the numbers of the log; in binary 0.1 would be
-    that of 32 bits."""
+    """A box from the text form of its array, which gives the log's numbers; the binary form would
+    be rounded to 32 bits."""
     x0, y0, x1, y1 = array[1:-1].split(",")
     return float(x0), float(y0), float(x1), float(y1)
 
 
 def _thing(properties: str) -> _Thing:
-    """Without a stand under the page's rule, and for a map of an older version, which has no
-    covariance."""
+    """An Object; without a stand under ``fusion = "page"`` and in a map of an older version, which
+    has no covariance."""
     found = json.loads(properties)
     stand = None
     if "est_xx" in found:
@@ -325,7 +330,7 @@ def _ordinal(graphid: int) -> PlaceOrdinal:
 
 @contextlib.contextmanager
 def _query_errors(url: str) -> Iterator[None]:
-    """Errors of a question that does not fit the map, or of a database without a map."""
+    """Translate errors of a question that does not fit the map, and of a database without a map."""
     with database_errors(url):
         try:
             yield

@@ -104,7 +104,7 @@ def places_near(connection: Connection, x: float, y: float, radius: float) -> li
 def objects_near(connection: Connection, x: float, y: float, radius: float) -> list[dict[str, Any]]:
     """Objects within ``radius`` metres, nearest first, with ``distance_m``.
 
-    That is measured to where an Object stands by estimate, or to its mean position if it has none.
+    The distance is to an Object's estimated position, or to its mean position if it has none.
     """
     found = _read_square(connection, "objects", x, y, radius)
     return _nearest(found, ("est_x", "mean_x"), ("est_y", "mean_y"), "object_id", (x, y), radius)

@@ -1,9 +1,8 @@
-"""A map's constants and walls in the databases, remembered between questions.
+"""A map's constants and walls read from the databases, cached between questions.
 
-A question carries the keys of what is known; the databases send cosines and settings again only
-where theirs have other keys. So constants cost no round trip, and little time after the first
-question. Where the key of the occupancy maps is another one, they are read by a statement of their
-own.
+A question carries the keys of cached values; the databases send cosines and settings only if their
+keys differ. So constants cost no round trip, and little time after the first question. If the key
+of the occupancy maps differs, they are read by a further statement.
 """
 
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from projections.settings import Settings
 
 @dataclass(frozen=True, slots=True)
 class KnownConstants:
-    """Constants, and the keys under which the databases have what they are made of."""
+    """Constants, and the keys of the database values that they were computed from."""
 
     cosines_key: str | None = None
     cosines: Cosines = field(default_factory=Cosines)
@@ -34,7 +33,7 @@ class KnownConstants:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Those of the statements."""
+        """The parameters of the statements."""
         return {
             "known_cosines": self.cosines_key,
             "known_settings": self.settings_key,
@@ -44,7 +43,7 @@ class KnownConstants:
         }
 
     def with_cosines(self, sent: list[Any] | None) -> Self:
-        """What is known after the databases have sent ``[key, number, mean, deviation]``, or
+        """The constants after the databases have sent ``[key, number, mean, deviation]``, or
         nothing."""
         if sent is None:
             return self
@@ -53,7 +52,7 @@ class KnownConstants:
         return replace(self, cosines_key=sent[0], cosines=cosines, constants=constants)
 
     def with_settings(self, sent: list[str] | None, place: str) -> Self:
-        """What is known after the databases have sent ``[fingerprint, settings]``, or nothing.
+        """The constants after the databases have sent ``[fingerprint, settings]``, or nothing.
 
         ``place`` is the database, for an error.
         """
@@ -70,7 +69,7 @@ class KnownConstants:
         return replace(self, settings_key=sent[0], settings=settings, constants=constants)
 
     def with_maps(self, key: str | None, maps: Mapping[str | None, OccupancyMap]) -> Self:
-        """What is known after the maps of a key were read."""
+        """The constants after the maps of a key were read."""
         walls = {floor: WallMap(given) for floor, given in maps.items()}
         return replace(self, maps_key=key, walls=walls)
 
@@ -79,8 +78,8 @@ NOTHING_KNOWN: Final = KnownConstants()
 
 
 class ConstantsMemory:
-    """The constants and walls that the last question has learned; for any thread, as they are
-    replaced as a whole."""
+    """The constants and walls after the last question; for any thread, as they are replaced as a
+    whole."""
 
     def __init__(self) -> None:
         self.known = NOTHING_KNOWN

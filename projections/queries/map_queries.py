@@ -33,8 +33,9 @@ _OBJECT_FIELDS = (
     "place_id",
     "place_name",
 )
-"""The fields of an Object in their order; agtype has its own order. Only an Object in a Place that
-has a name has the last one; only fusion by evidence gives ``est_x`` to ``missing``."""
+"""The fields of an Object in the order of the documents; agtype has its own order. Only an Object
+in a Place that has a name has the last one; only fusion by evidence gives ``est_x`` to
+``missing``."""
 
 
 class MapSource(Protocol):

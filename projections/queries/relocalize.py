@@ -105,7 +105,7 @@ class CandidateReader:
     def disable_index(self) -> None:
         """From now on search exactly, without the HNSW index: slow."""
         self._vectors.execute("SET enable_indexscan = off")
-        # a plan that was made before does not know of it
+        # plans made before would still use the index
         self._vectors.execute("SET plan_cache_mode = force_custom_plan")
 
     def close(self) -> None:
