@@ -65,7 +65,7 @@ def _topic(name: str, text: str) -> typer.models.OptionInfo:
 
 DetectionsOption = Annotated[
     list[str] | None,
-    _topic("--detections", "vision_msgs/Detection2DArray; may be repeated. Default: all."),
+    _topic("--detections", "Topic of vision_msgs/Detection2DArray; may be repeated. Default: all."),
 ]
 PoseOption = Annotated[
     str | None,
@@ -78,17 +78,24 @@ PoseOption = Annotated[
 ]
 CovarianceOption = Annotated[
     str | None,
-    _topic("--covariance", "Whose latest covariance is the error of poses by transforms; or none."),
+    _topic(
+        "--covariance",
+        "Topic whose latest covariance is the error of poses by transforms; or none.",
+    ),
 ]
 EmbeddingsOption = Annotated[
     str | None,
     _topic(
-        "--embeddings", "std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none."
+        "--embeddings",
+        "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none.",
     ),
 ]
-CameraOption = Annotated[str | None, _topic("--camera", "sensor_msgs/CameraInfo; or none.")]
+CameraOption = Annotated[
+    str | None, _topic("--camera", "Topic of sensor_msgs/CameraInfo; or none.")
+]
 GridOption = Annotated[
-    str | None, _topic("--grid", "nav_msgs/OccupancyGrid; or none. Default: topics called map.")
+    str | None,
+    _topic("--grid", "Topic of nav_msgs/OccupancyGrid; or none. Default: topics called map."),
 ]
 MapFrameOption = Annotated[
     str | None, _named("--map-frame", "FRAME", "The frame of the map. Default: map, else the root.")

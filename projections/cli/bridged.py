@@ -60,25 +60,35 @@ DetectionsOption = Annotated[
     _option(
         "--detections",
         "TOPIC",
-        f"Of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
+        f"Topic of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
     ),
 ]
 PoseOption = Annotated[
     str,
-    _option("--pose", "TOPIC", "Odometry or PoseWithCovarianceStamped; tf for transforms; none."),
+    _option(
+        "--pose",
+        "tf|TOPIC|none",
+        "Where poses come from: transforms, or a topic of Odometry or PoseWithCovarianceStamped.",
+    ),
 ]
 CovarianceOption = Annotated[
     str | None,
-    _option("--covariance", "TOPIC", "Whose errors go with poses of transforms, as /amcl_pose."),
+    _option(
+        "--covariance",
+        "TOPIC",
+        "Topic whose latest covariance is the error of poses by transforms, such as /amcl_pose.",
+    ),
 ]
 EmbeddingsOption = Annotated[
-    str | None, _option("--embeddings", "TOPIC", "Embeddings of the detections; docs/ros.md.")
+    str | None,
+    _option("--embeddings", "TOPIC", "Topic of the detections' embeddings; see docs/ros.md."),
 ]
-CameraOption = Annotated[str | None, _option("--camera", "TOPIC", "Of CameraInfo.")]
+CameraOption = Annotated[str | None, _option("--camera", "TOPIC", "Topic of CameraInfo.")]
 GridOption = Annotated[
-    str, _option("--grid", "TOPIC", "Of OccupancyGrid, which becomes the map; none for no map.")
+    str,
+    _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none."),
 ]
-MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of poses by tf.")]
+MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of the map.")]
 BaseFrameOption = Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")]
 RunIdOption = Annotated[
     str | None,
@@ -92,7 +102,7 @@ HeightsOption = Annotated[bool, heights_option(_PANEL)]
 MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
 TopicOption = Annotated[
     list[str] | None,
-    _option("--topic", "TOPIC", "Another one to keep, of any type; may be repeated."),
+    _option("--topic", "TOPIC", "Another topic to keep, of any type; may be repeated."),
 ]
 
 

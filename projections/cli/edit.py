@@ -67,7 +67,7 @@ def _log(context: typer.Context, log: LogArgument) -> None:
 @_kind("name-place")
 def _name_place(
     place: PlaceArgument,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="What to call it.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
 ) -> MakeCommand:
     """Give a place a name."""
     return lambda current, stamp: make.name_place(current, stamp, place, name)
@@ -75,38 +75,41 @@ def _name_place(
 
 @_kind("keep-apart")
 def _keep_apart(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
-    """Two places are never one."""
+    """Keep two places apart, whatever joins them later."""
     return lambda current, stamp: make.keep_apart(current, stamp, first, second)
 
 
 @_kind("undo-merge")
 def _undo_merge(
     offset: Annotated[
-        int, typer.Argument(metavar="OFFSET", help="The merge's, from `mapfold merges LOG`.")
+        int,
+        typer.Argument(
+            metavar="OFFSET", help="The offset of the merge, from `mapfold merges LOG`."
+        ),
     ],
 ) -> MakeCommand:
-    """The places that a merge made one are never one."""
+    """Undo a merge of places and keep them apart."""
     return lambda current, stamp: make.undo_merge(current, stamp, offset)
 
 
 @_kind("join")
 def _join(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
-    """Two places are one.
+    """Join two places into one.
 
-    Also where no chain of poses joins them.
+    Also where no chain of poses connects them.
     """
     return lambda current, stamp: make.join(current, stamp, first, second)
 
 
 @_kind("same-object")
 def _same_object(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
-    """Two objects are one."""
+    """Fuse two objects into one."""
     return lambda current, stamp: make.same_object(current, stamp, first, second)
 
 
 @_kind("different-objects")
 def _different_objects(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
-    """Two objects are never one.
+    """Keep two objects apart.
 
     Two observations of one object, named by their det_ids, become two objects.
     """
@@ -117,7 +120,7 @@ def _different_objects(first: ObjectArgument, second: OtherObjectArgument) -> Ma
 def _drop_object(
     thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
 ) -> MakeCommand:
-    """Leave an object that is none out of the map.
+    """Leave out an object that does not exist in the building.
 
     Every observation that it has now is left out; the log keeps them.
     """
@@ -128,13 +131,13 @@ def _drop_object(
 def _drop_detection(
     det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID…", help="Their det_ids.")],
 ) -> MakeCommand:
-    """Leave detections out of the map; the log keeps them."""
+    """Leave out detections; the log keeps them."""
     return lambda current, stamp: make.drop_detection(current, stamp, det_ids)
 
 
 @_kind("forget-run")
 def _forget_run(run: RunArgument) -> MakeCommand:
-    """Leave a run out of the map."""
+    """Leave out all keyframes of a run; the log keeps them."""
     return lambda current, stamp: make.forget_run(current, stamp, run)
 
 
@@ -145,7 +148,7 @@ def _forget_keyframes(
         str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
     ],
 ) -> MakeCommand:
-    """Leave some keyframes of a run out of the map."""
+    """Leave out some keyframes of a run; the log keeps them."""
     return lambda current, stamp: make.forget_keyframes(current, stamp, run, span)
 
 
@@ -182,7 +185,9 @@ def _correct_poses(
     ] = DEFAULT_SLACK_S,
     ignore_missing: Annotated[
         bool,
-        typer.Option("--ignore-missing", help="Pass over poses of keyframes the run has not."),
+        typer.Option(
+            "--ignore-missing", help="Skip poses of keyframes that the run does not have."
+        ),
     ] = False,
 ) -> MakeCommand:
     """Correct the poses of a run.
@@ -214,9 +219,9 @@ def _use_settings(
     ] = None,
     set_: SetOption = None,
 ) -> MakeCommand:
-    """The map has other settings from here on.
+    """Change the settings of the map.
 
-    Those of FILE, else those it has now, changed by --preset and --set.
+    To those of FILE, else those in force, changed by --preset and --set.
     """
     if file is None and not set_:
         raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
@@ -231,7 +236,7 @@ def _use_settings(
 def _undo(
     undone: Annotated[str, typer.Argument(metavar="COMMAND_ID", help="From `mapfold edits LOG`.")],
 ) -> MakeCommand:
-    """As if a command had never been given.
+    """Undo a command, as if it had never been given.
 
     Undoing an undo restores the command.
     """
