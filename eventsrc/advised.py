@@ -1,5 +1,4 @@
-"""Command lines in messages. `advised` makes all of them, so that they can be pasted into a shell
-and run.
+"""Command lines that messages advise, made by `advised` so that they can be pasted into a shell.
 
 The code that raises an error does not have the options of the running command. So the program sets
 one function that adds them (`complete_by`). In programs other than ``mapfold`` nothing is added,

@@ -41,7 +41,7 @@ class Checked(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def stamp_ns(self) -> int | None:
-        """The robot's time; None if the payload has none."""
+        """The robot's time; None if the payload is no envelope or its version has no time."""
         if not isinstance(self.result, CheckedEnvelope) or not has_keyframe_id(self.version):
             return None
         return self.result.stamp_ns
@@ -56,10 +56,10 @@ def append_payload(
     max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
     version: int | None = None,
 ) -> Result:
-    """Append ``payload``, which came under ``key``; returns the result of its validation.
+    """Append ``payload``, received under ``key``, and return the result of its validation.
 
-    ``logged_ns`` is when it was received, now by default; ``version`` the envelope version that it
-    was recorded in before.
+    ``logged_ns`` is the time of receipt, by default the current time. ``version`` is the envelope
+    version that another log has recorded it in; by default it is detected.
     """
     logged = writer.now_ns() if logged_ns is None else logged_ns
     (checked,) = check_payloads(
@@ -74,7 +74,7 @@ def append_payload(
 
 
 def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
-    """The event of a payload that came under ``key`` and was checked."""
+    """The event to append for a payload received under ``key``, by the result of its check."""
     version, result = checked.version, checked.result
     if isinstance(result, Rejected):
         return rejected_event(key, payload, result.reason, logged_ns)
@@ -92,12 +92,14 @@ def check_payloads(
     max_bytes: int,
     version: int | None = None,
 ) -> list[Checked]:
-    """Validate each payload, and the key that it came under, of messages (key, payload).
+    """Validate key and payload of each message (key, payload).
 
-    ``first`` is the offset that the first will have, or one before it, and ``logged_ns`` when they
-    are appended, or some time before: a payload of an older form has neither keyframe nor time, and
-    any of these is valid for it. Faster together than one by one, with the same results. A dozen or
-    two at a time is best, so that what is decoded of them fits the processor's cache.
+    Results are the same as one by one; together is faster. A dozen or two at a time is best: their
+    decoded vectors then fit the processor's cache.
+
+    ``first`` and ``logged_ns`` stand in for the keyframe id and the time of a bare list
+    (`eventsrc.upcast`), which has neither. For validation any offset and any time will do, so both
+    may be earlier than those that the events get.
     """
     pending = [
         PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))
@@ -118,7 +120,8 @@ def check_payloads(
 
 
 def _as_map(event: PendingEvent, max_bytes: int) -> NewMap | Rejected | None:
-    """A payload that is no envelope, as an occupancy map; None if it does not mean to be one."""
+    """The occupancy map in a payload that is no envelope, or the reason why its grid is refused;
+    None if the payload does not look like a grid."""
     if len(event.payload) > max_bytes or not is_grid_message(event.payload):
         return None
     try:
@@ -128,12 +131,12 @@ def _as_map(event: PendingEvent, max_bytes: int) -> NewMap | Rejected | None:
 
 
 def map_event(event: bytes, logged_ns: int) -> NewEvent:
-    """The event that keeps a map."""
+    """The ``mapfold/map`` event of the JSON ``event``."""
     return NewEvent(MAP_KEY, event, logged_ns, logged_ns)
 
 
 def rejected_event(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
-    """The event that keeps a refused payload."""
+    """The ``mapfold/rejected`` event of a refused payload."""
     escaped = key.encode(errors="backslashreplace").decode()  # a lone surrogate is not UTF-8
     record = RejectedPayload.encode(escaped, reason, payload)
     return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)

@@ -3,8 +3,7 @@
 The first four bytes are the encapsulation: ``00 00`` for big endian, ``00 01`` for little endian,
 and two bytes of options. After them come the fields in the order of the message's definition, each
 number at a multiple of its size, counted from the end of the encapsulation; a text or a sequence is
-its length and its items. Whatever a message declares is compared with the bytes that are there
-before it is read.
+its length and its items. Every declared length is compared with the bytes left before it is used.
 """
 
 import struct
@@ -17,16 +16,19 @@ _MOST_PADDING: Final = 3
 
 
 class CdrFault(ValueError):
-    """A payload is not the message that it is read as; the text names the field."""
+    """A payload does not fit the message type that it is read as; the text names the field."""
 
 
 def is_cdr(payload: bytes) -> bool:
-    """Whether a payload begins as CDR does, which JSON never does."""
+    """Whether a payload begins with the encapsulation of CDR. JSON never does."""
     return payload[:2] in _BYTE_ORDERS
 
 
 class CdrFields:
-    """The fields of a payload that `is_cdr`. Every method raises CdrFault."""
+    """Reads the fields of a payload that `is_cdr`, in order. ``field`` is the name for messages.
+
+    Every method raises CdrFault if the payload ends too soon.
+    """
 
     def __init__(self, payload: bytes) -> None:
         self._order = _BYTE_ORDERS[payload[:2]]
@@ -34,7 +36,8 @@ class CdrFields:
         self._at = 0
 
     def numbers(self, kinds: str, field: str) -> tuple[Any, ...]:
-        """Numbers of one size, by the letters of `struct`."""
+        """The next numbers, aligned to their size. ``kinds`` are letters of `struct`, all of one
+        size."""
         size = struct.calcsize(f"={kinds[0]}")
         start = -(-self._at // size) * size
         layout = struct.Struct(self._order + kinds)
@@ -43,7 +46,7 @@ class CdrFields:
         return layout.unpack_from(self._body, start)
 
     def text(self, field: str) -> bytes:
-        """A text without the null character in which it ends, and which its length counts."""
+        """The next text, without its closing null character, which its length includes."""
         (length,) = self.numbers("I", f"the length of {field}")
         self._need(self._at + length, field)
         self._at += length
@@ -52,7 +55,7 @@ class CdrFields:
         return bytes(self._body[self._at - length : self._at - 1]) if length else b""
 
     def last(self, length: int, field: str) -> memoryview:
-        """The bytes of the last field."""
+        """The ``length`` bytes of the last field. Raises CdrFault if more than padding follows."""
         self._need(self._at + length, field)
         rest = len(self._body) - self._at - length
         if rest > _MOST_PADDING:
@@ -60,7 +63,7 @@ class CdrFields:
         return self._body[self._at : self._at + length]
 
     def left(self, size: int) -> int:
-        """How many bytes follow, when the next field's numbers have ``size`` bytes each."""
+        """Number of bytes left after aligning to numbers of ``size`` bytes."""
         return len(self._body) - -(-self._at // size) * size
 
     def _need(self, end: int, field: str) -> None:

@@ -1,7 +1,6 @@
-"""nav_msgs/OccupancyGrid in CDR, the encoding of ROS 2, as a bridge sends it or a bag holds it.
+"""Decode nav_msgs/OccupancyGrid in CDR, the encoding of ROS 2, as bridges send it and bags hold it.
 
-A reader of this one message only; docs/decisions/map-messages.md says why. `eventsrc.cdr` reads
-its fields.
+docs/decisions/map-messages.md says why this one message has a reader of its own.
 """
 
 from typing import Final, NamedTuple
@@ -15,11 +14,12 @@ from .occupancy_map import InvalidMap, check_size
 __all__ = ["GRID_SCHEMA", "CdrGrid", "decode_cdr_grid", "is_cdr"]
 
 GRID_SCHEMA: Final = "nav_msgs/msg/OccupancyGrid"
-"""Its name in an MCAP file."""
+"""The name of its schema in an MCAP file."""
 
 
 class CdrGrid(NamedTuple):
-    """The fields that a map is made of; ``data`` has -1 for unknown, row by row from the origin."""
+    """The fields that a map is made of. ``resolution`` is in metres; ``data`` is row by row from
+    the origin: -1 for unknown, else 0 to 100."""
 
     resolution: float
     width: int
@@ -30,7 +30,7 @@ class CdrGrid(NamedTuple):
 
 
 def decode_cdr_grid(payload: bytes) -> CdrGrid:
-    """The grid of a payload that `is_cdr`. Raises InvalidMap, with the field."""
+    """The grid of a payload that `is_cdr`. Raises InvalidMap, which names the field."""
     try:
         return _decode(CdrFields(payload))
     except CdrFault as fault:
@@ -57,7 +57,7 @@ def _decode(fields: CdrFields) -> CdrGrid:
         raise InvalidMap(
             f"data: value {data[wrong[0]]} at index {wrong[0]:,}; -1 is unknown, else 0 to 100"
         )
-    # The shortest decimal that names the float32: 0.05, as the map server was told.
+    # The shortest decimal that names the float32, such as the 0.05 of a map server's settings.
     shortest = float(str(np.float32(resolution)))
     return CdrGrid(shortest, width, height, (x, y), (qx, qy, qz, qw), data)
 

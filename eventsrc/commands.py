@@ -1,10 +1,10 @@
 """Commands: corrections of the map by a person or a SLAM back end, as events on
 ``mapfold/command``.
 
-A command is appended like any event and never changed. What it names, it names by things of the
-log that every fold knows: keyframes and det_ids, never by the id of a place or an object, which
-another fold may give to something else. `projections.corrections` compiles commands to what the
-fold obeys; docs/corrections.md describes them.
+A command is appended like any event and never changed. It refers to places and objects by keyframes
+and det_ids, which are in the log, never by ids of places or objects, which differ from fold to
+fold. `projections.corrections` compiles commands to what the fold obeys; docs/corrections.md
+describes them.
 """
 
 import math
@@ -37,7 +37,7 @@ from .envelope import (
 
 MAX_REASON = 2_000
 MAX_NAMED = 100_000
-"""Keyframes or det_ids in one command."""
+"""Bound of the keyframes or det_ids in one command."""
 MAX_YAW_RAD = 10_000.0
 """Bound of a corrected yaw and of a turn: a larger one is no angle but a mistake."""
 _MOST_SHOWN = 80
@@ -51,7 +51,7 @@ MAX_JSON_VALUES = 2_000_000
 MAX_JSON_FIELDS = 100
 """Bound of the fields of one JSON object in a command."""
 _UNCOUNTED_BYTES = 64 * 1024
-"""In payloads up to this size nothing is counted."""
+"""In payloads up to this size values and fields are not counted."""
 
 
 class _Model(BaseModel):
@@ -61,14 +61,14 @@ class _Model(BaseModel):
 
 
 class Anchor(_Model):
-    """A keyframe that stands for the place it belongs to; a place's own is its founder."""
+    """A keyframe that stands for the place that it is in. A place's own anchor is its founder."""
 
     run_id: Annotated[RunId, TEXT]
     keyframe_id: Annotated[KeyframeId, INT64]
 
 
 class _Command(_Model):
-    """What every command has. ``command_id`` is unique in the log."""
+    """The fields of every command. ``command_id`` is unique in the log."""
 
     command_id: Text
     issued_by: Text
@@ -136,7 +136,8 @@ class DifferentObjects(_Command):
 
 
 class DropObject(_Command):
-    """A phantom: the observations it had when the command was given are left out of the map."""
+    """An Object that does not exist: the detections that it had when the command was given are left
+    out of the map."""
 
     kind: Literal["drop-object"] = "drop-object"
     det_ids: DetIds
@@ -186,8 +187,8 @@ class CorrectedPose(_Model):
 class RigidTransform(_Model):
     """x' = cos·x − sin·y + dx, y' = sin·x + cos·y + dy, yaw' = yaw + dyaw.
 
-    Metres and radians. Cosine and sine are part of the command: a fold that worked them out could
-    differ in the last bit from machine to machine.
+    Metres and radians. Cosine and sine are part of the command, because computing them in the fold
+    could give another last bit on another machine.
     """
 
     dx: Position
@@ -207,7 +208,7 @@ class RigidTransform(_Model):
 
     @classmethod
     def of(cls, dx: float, dy: float, dyaw: float) -> "RigidTransform":
-        """The transform with its cosine and sine worked out."""
+        """The transform with cosine and sine computed from ``dyaw``."""
         return cls(dx=dx, dy=dy, dyaw=dyaw, cos=math.cos(dyaw), sin=math.sin(dyaw))
 
 
@@ -253,7 +254,7 @@ class Reembed(_Command):
 
 
 class Undo(_Command):
-    """As if the command ``undone`` had never been given. Undoing an undo restores it."""
+    """The command ``undone`` has no effect. Undoing an undo restores the command."""
 
     kind: Literal["undo"] = "undo"
     undone: Text
@@ -308,9 +309,9 @@ def parse_command(payload: bytes) -> Command:
 
 
 def _check_cost(payload: bytes) -> None:
-    """Raises InvalidCommand for what would cost much time and memory to validate.
+    """Raise InvalidCommand for JSON that would take much time or memory to validate.
 
-    Pydantic makes an error for every field too many, which takes 30 microseconds and 5 kB each.
+    Pydantic makes an error for every unknown field, which takes 30 microseconds and 5 kB each.
     """
     values = sum(map(payload.count, (b",", b"[", b"{")))
     if values > MAX_JSON_VALUES:

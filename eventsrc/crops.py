@@ -1,8 +1,8 @@
-"""Crops of detections: the JPEG of what a detection's box showed, as a verbatim message of a log.
+"""Crops of detections: JPEGs of the pixels inside a detection's box, as verbatim messages of a log.
 
 A detector publishes them under ``PREFIX/DET_ID``, the det_id percent-encoded. In a log all are on
 the topic ``PREFIX``, as sensor_msgs/CompressedImage in CDR with the det_id as ``frame_id``, so that
-Foxglove and Rerun show them. The JPEG itself is as it came.
+Foxglove and Rerun show them. The JPEG itself is unchanged.
 """
 
 import struct
@@ -38,7 +38,7 @@ _NS: Final = 1_000_000_000
 
 
 class InvalidCrop(ValueError):
-    """This is no crop; the message says why."""
+    """Bytes or a key that are no crop; the message says why."""
 
 
 class Crop(NamedTuple):
@@ -94,7 +94,7 @@ def decode_crop(payload: bytes) -> Crop:
 
 
 def _text(body: bytes, at: int) -> tuple[bytes, int]:
-    """A text and where the next length is."""
+    """The text at ``at``, and the aligned position behind it. Raises InvalidCrop."""
     (length,) = struct.unpack_from("<I", body, at)
     end = at + 4 + length
     if not 0 < length <= len(body) - at - 4 or body[end - 1]:

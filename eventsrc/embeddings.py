@@ -1,7 +1,7 @@
 """Vectors of another embedding space for detections of a log, as ``mapfold/embeddings`` events.
 
 `mapfold reembed` appends them, and then one command, ``reembed``, which puts them into force. A map
-of their space has them for the detections that have no vector of it themselves.
+of their space uses them for detections that were recorded without a vector of it.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from .system_events import Embeddings
 
 
 class InvalidEmbeddings(ValueError):
-    """This is no embeddings event; the message names the field, its value and the rule."""
+    """A payload is no embeddings event; the message names the field, its value and the rule."""
 
 
 class NewVectors(NamedTuple):
@@ -45,7 +45,7 @@ class NewVectors(NamedTuple):
 
 
 def is_usable(vectors: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Of each row, whether it has a direction: finite and not zero."""
+    """Which rows of ``vectors`` have a direction: are finite and not zero. Shape (rows,)."""
     largest = np.abs(vectors).max(axis=1)
     usable: NDArray[np.bool_] = np.isfinite(largest) & (largest > 0.0)
     return usable

@@ -5,8 +5,8 @@ Unknown fields need only be JSON; they are ignored here, and the log keeps them,
 payload verbatim. `eventsrc.ingest` makes an envelope from bytes and gives the reason if it cannot.
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 
-Here too are the types of what identifies things: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are
-ints and strings at run time; mypy keeps them apart.
+The types of identifiers are here too: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are ints and
+strings at run time; mypy keeps them apart.
 """
 
 import math
@@ -60,7 +60,7 @@ Text = Annotated[str, TEXT]
 
 
 def describe_error(error: ErrorDetails) -> str:
-    """What is wrong, in pydantic's words or, for a `Text`, in ours."""
+    """The rule that a value breaks: a `Text`'s own, else the message of pydantic."""
     if error["type"] not in ("string_too_long", "string_pattern_mismatch"):
         return error["msg"].removeprefix("Value error, ")
     text: str = error["input"]
@@ -115,13 +115,13 @@ COVARIANCE_SIZE = 9
 MAX_VARIANCE = 1e6
 """Bound of a pose's variances: a standard error of a kilometre, or of 1000 radians."""
 _SAME = 1e-6
-"""How far the two halves of a covariance may differ, of the greatest that they may be."""
+"""How far two symmetric entries of a covariance may differ, relative to their largest value."""
 _ROUNDING = 1e-12
-"""What rounding may leave off the diagonal beside a variance of 0, of the greatest variance."""
+"""How far rounding may move an entry beside a variance of 0, relative to the largest variance."""
 
 
 def covariance_fault(nine: Sequence[float]) -> str | None:
-    """Why these are no covariance of x, y and yaw, row by row; None if they are."""
+    """Why ``nine`` numbers, row by row, are no covariance of x, y and yaw; None if they are."""
     if len(nine) != COVARIANCE_SIZE:
         return f"has {len(nine)} numbers; give {COVARIANCE_SIZE}, row by row of x, y and yaw"
     if not all(map(math.isfinite, nine)):
@@ -276,7 +276,7 @@ def stamp_ns(timestamp: float) -> int:
 
 
 def has_evidence(envelope: Envelope) -> bool:
-    """Whether it states its camera, or a depth or position of any detection."""
+    """Whether the envelope states its camera, or a depth or position of any detection."""
     if envelope.camera is not None:
         return True
     for detection in envelope.detections:
@@ -286,7 +286,7 @@ def has_evidence(envelope: Envelope) -> bool:
 
 
 def has_floor(envelope: Envelope) -> bool:
-    """Whether it says which floor the robot is on."""
+    """Whether the envelope states a floor or a height."""
     return envelope.floor is not None or envelope.map_z is not None
 
 

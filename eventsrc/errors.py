@@ -7,10 +7,10 @@ without a traceback, and exits with ``exit_code``.
     ├── MisuseError                 2  the call itself is wrong
     ├── LogError                    1  a log cannot be used as asked
     │   ├── LogNotFound             2  no log there
-    │   ├── NotALog                 2  something else is there
+    │   ├── NotALog                 2  not a mapfold log
     │   ├── LogBusy                 1  another writer holds it
     │   └── LogDamaged              1  recorded events cannot be read
-    ├── InvalidEnvelope             1  a payload is not an envelope (carries a Rejection reason)
+    ├── InvalidEnvelope             1  a payload is not an envelope; the message is the reason
     └── TransportError              1  Zenoh cannot connect, listen or send
         └── SpoolError              1  a robot's spool cannot be used
             └── SpoolFull           1  it has no room for another envelope
@@ -42,7 +42,7 @@ class LogNotFound(LogError):
 
 
 class NotALog(LogError):
-    """There is something at this path, but it is not a mapfold log."""
+    """The file or folder at this path is not a mapfold log."""
 
     exit_code = 2
 

@@ -37,8 +37,8 @@ from .gaps import DEFAULT_SETTLE_NS, GapLedger, RunState, gap_of, is_consistent
 from .system_events import LOSS_KEY, Loss
 
 MAX_BYTES: Final = 8 * 1024 * 1024
-"""Half a million gaps. A larger ledger is not saved: reading it would take more memory than reading
-the log."""
+"""Bound of the saved ledger, about half a million gaps. A larger one is not saved: loading it would
+take more memory than reading the log."""
 _FILE_PATTERN: Final = re.compile(rb'\{"sha256":"([0-9a-f]{64})","ledger":(\{.*\})\}', re.DOTALL)
 
 Note = Callable[[str], None]
@@ -46,7 +46,7 @@ Note = Callable[[str], None]
 
 
 Run = tuple[RunId, Int64, Int64, Annotated[tuple[tuple[Int64, Int64, bool], ...], FailFast()]]
-"""A `RunState` as it is saved."""
+"""A `RunState` in the file."""
 
 
 class SavedLedger(BaseModel):
@@ -80,14 +80,14 @@ def _load(reader: LogReader, note: Note | None = None) -> SavedLedger | None:
     except (OSError, _Unusable) as error:
         if note is not None:
             reason = error.strerror if isinstance(error, OSError) else error
-            note(f"{path} is not used: {reason}; what it says is counted again from the log")
+            note(f"{path} is not used: {reason}; the gaps are counted again from the log")
         return None
     return saved
 
 
 def _read(path: Path) -> bytes:
-    """The file's bytes. Raises OSError, also for a symbolic link, and _Unusable for anything but a
-    regular file, and for a huge one."""
+    """The file's bytes. Raises OSError, also for a symbolic link; _Unusable if it is not a regular
+    file or larger than `MAX_BYTES`."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         status = os.fstat(fd)
@@ -111,7 +111,7 @@ def _decode(data: bytes) -> SavedLedger:
     except ValidationError as error:
         fault = error.errors(include_url=False, include_context=False, include_input=False)[0]
         place = ".".join(map(str, fault["loc"]))
-        raise _Unusable(f"it holds what no ledger does: {place}: {fault['msg']}") from None
+        raise _Unusable(f"its content is not valid: {place}: {fault['msg']}") from None
 
 
 def _check_belongs(saved: SavedLedger, reader: LogReader) -> None:
@@ -120,7 +120,9 @@ def _check_belongs(saved: SavedLedger, reader: LogReader) -> None:
     if saved.log_id != reader.log_id:
         raise _Unusable("it is of another log")
     if saved.next_offset > reader.next_offset:
-        raise _Unusable(f"it knows {saved.next_offset} events and the log has {reader.next_offset}")
+        raise _Unusable(
+            f"it covers {saved.next_offset} events, but the log has {reader.next_offset}"
+        )
     if not same_but_sealed(saved.segments, segment_signatures(reader.path, saved.next_offset)):
         raise _Unusable("segments that it was made from have changed or are gone")
 
@@ -146,9 +148,9 @@ def _write(path: Path, data: bytes) -> None:
 
 
 SAVE_EVERY: Final = 50_000
-"""Events between saves; a second or two of reading."""
+"""Events between two saves while a log is read; a second or two of reading."""
 _NOTED_EVENTS: Final = 100_000
-"""From so many events to read on, which takes seconds, a line says so."""
+"""From this many events to read, which takes seconds, a note announces the reading."""
 
 
 class _Identity(BaseModel):
@@ -167,7 +169,7 @@ def ledger_of(
     now_ns: int | None = None,
     note: Note | None = None,
 ) -> GapLedger[RunId]:
-    """The ledger of a whole log, from the saved one where that can be used.
+    """The ledger of a whole log; only events behind a usable saved ledger are read.
 
     Unreported holes count as open since ``now_ns`` (by default now, on the monotonic clock).
     ``note`` gets a line if a saved ledger is not used.
@@ -178,13 +180,13 @@ def ledger_of(
 
 
 def fold_and_save_ledger(reader: LogReader, *, note: Note | None = None) -> GapLedger[RunId]:
-    """`ledger_of` for the log's writer: saved, and every `SAVE_EVERY` events on the way, so that a
-    killed process has to read no more than those again."""
+    """`ledger_of` for the log's writer, which saves the ledger at the end and after every
+    `SAVE_EVERY` events: after a kill at most that many events are read again."""
     now_ns = time.monotonic_ns()
     at, ledger = _load_or_new(reader, DEFAULT_SETTLE_NS, now_ns, note)
     end = reader.next_offset
     if note is not None and end - at >= _NOTED_EVENTS:
-        note(f"reading {reader.path} once, to know which keyframes it lacks …")
+        note(f"reading {reader.path} once, to find its missing keyframes …")
     while at < end:
         upto = min(Offset(at + SAVE_EVERY), end)
         # Only a reading without an end looks for damage behind the last event.
@@ -216,8 +218,9 @@ def unread_events(reader: LogReader) -> int:
 def save_ledger(path: Path, log_id: str, next_offset: Offset, ledger: GapLedger[RunId]) -> None:
     """Save the ledger of the first ``next_offset`` events of the log at ``path``.
 
-    They must be durable, with everything the ledger reported among them. Failing to write is no
-    error, for it is a cache; nor are keyframe ids in the log that no envelope can have.
+    These events must be durable, and the loss events of all reported gaps among them. Nothing is
+    raised if the file cannot be written, since it is a cache, or if the log has keyframe ids that
+    no envelope can have.
     """
     with contextlib.suppress(OSError, ValidationError):
         saved = SavedLedger(
@@ -251,7 +254,7 @@ def _add_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
     try:
         loss = Loss.model_validate_json(payload)
     except ValidationError:
-        return  # of a later version; what it says was lost is still seen in the keyframes
+        return  # of a later version; its gap still shows in the keyframe ids
     gap = gap_of(loss)
     if gap is not None:
         ledger.add_reported(gap, now_ns)

@@ -9,8 +9,8 @@ The rules:
 * A hole is *reported* as a gap, once, when it has been open for the settle time or when the
   recorder ends. Until then keyframes out of order and a publisher's resending may fill it, and
   nothing is written that would have to be taken back.
-* The ``mapfold/loss`` event of a gap stays in the log when a late keyframe closes the gap. So what
-  is lost *now* is the holes of the whole log, not the sum of the loss events.
+* The ``mapfold/loss`` event of a gap stays in the log when a late keyframe closes the gap. So the
+  keyframes missing at the end of the log are its holes, not the sum of its loss events.
 * A keyframe recorded twice is no loss. It is counted as a duplicate.
 * A publisher may announce its last keyframe. When that was the settle time ago, and the run's
   highest recorded keyframe is lower, the ids in between are a hole too. When the recorder ends,
@@ -32,7 +32,7 @@ from .envelope import RunId
 from .system_events import Loss
 
 Source = TypeVar("Source", bound=str)
-"""Who counts: a `RunId` of its keyframes, or a Zenoh publisher of its messages."""
+"""The id of a consecutive numbering: a `RunId` for keyframes, or a Zenoh publisher for messages."""
 
 DEFAULT_SETTLE_NS: Final = 5_000_000_000
 """Longer than a publisher waits before it resends, so that a resent keyframe is no reported gap."""
@@ -79,7 +79,7 @@ class _Hole(Generic[Source]):
 
 @dataclass(slots=True)
 class _Run(Generic[Source]):
-    """The recorded keyframes of one run: ``first`` to ``last`` except the holes, which are in
+    """The recorded keyframes of one run: ``first`` to ``last`` except ``holes``, in ascending
     order."""
 
     run_id: Source
@@ -102,8 +102,8 @@ class RunState(NamedTuple, Generic[Source]):
 
 
 def is_consistent(runs: Iterable[RunState[Source]], events: int) -> bool:
-    """Whether a ledger of so many events can have this state: between two holes there is a recorded
-    keyframe, and each event is one keyframe or a loss with a recorded one on each side."""
+    """Whether a ledger of ``events`` events can have this state: between two holes there is a
+    recorded keyframe, and each event is one keyframe or a loss with a recorded one on each side."""
     seen: set[Source] = set()
     recorded = 0
     for run_id, first, last, holes in runs:
@@ -126,7 +126,7 @@ class GapLedger(Generic[Source]):
     def __init__(self, settle_ns: int = DEFAULT_SETTLE_NS) -> None:
         self._settle_ns = settle_ns
         self._runs: dict[Source, _Run[Source]] = {}
-        # Holes to report, oldest first: (since_ns, a number that makes it unique, hole).
+        # A heap of holes to report, oldest first: (since_ns, serial number, hole).
         self._unreported: list[tuple[int, int, _Hole[Source]]] = []
         self._pushed = 0
         # Announcements of publishers, oldest first: (when, run, last keyframe).
@@ -154,7 +154,8 @@ class GapLedger(Generic[Source]):
             self._fill(run, keyframe_id)
 
     def expect(self, run_id: Source, last: int, now_ns: int) -> None:
-        """Add an announcement at ``now_ns`` that ``run_id`` has sent keyframe ``last``."""
+        """Add a publisher's announcement, received at ``now_ns``, that it has sent keyframe
+        ``last``."""
         self._announced.append((now_ns, run_id, last))
 
     def mark_reported(self, gap: Gap[Source]) -> None:
@@ -173,8 +174,8 @@ class GapLedger(Generic[Source]):
             index += 1
 
     def add_reported(self, gap: Gap[Source], now_ns: int) -> None:
-        """Add a gap from a loss event: it is missing and reported, and the keyframe before it was
-        recorded or reported missing."""
+        """Add the gap of a loss event, as missing and reported. The keyframe before it counts as
+        recorded if it is outside the run's known range."""
         before = gap.first - 1
         run = self._runs.get(gap.run_id)
         if run is None or not run.first <= before <= run.last:
@@ -183,7 +184,7 @@ class GapLedger(Generic[Source]):
         self.mark_reported(gap)
 
     def due(self, now_ns: int) -> list[Gap[Source]]:
-        """The gaps to report now, open for the settle time. Each is returned once."""
+        """The gaps that have been open for the settle time at ``now_ns``. Each is returned once."""
         settled_ns = now_ns - self._settle_ns
         while self._announced and self._announced[0][0] <= settled_ns:
             announced_ns, run_id, last = self._announced.popleft()
@@ -191,7 +192,7 @@ class GapLedger(Generic[Source]):
         return self._report(settled_ns)
 
     def flush(self) -> list[Gap[Source]]:
-        """Every gap not yet reported, however young, for when the recorder ends."""
+        """Every gap not yet reported, however short it was open; for the end of a recording."""
         self._announced.clear()
         return self._report(None)
 
@@ -208,7 +209,7 @@ class GapLedger(Generic[Source]):
             self._remove(run, index)
 
     def forget(self, run_id: Source) -> list[Gap[Source]]:
-        """Drop a run; its missing keyframes that were not reported yet."""
+        """Drop a run; return its gaps that were not reported yet."""
         run = self._runs.pop(run_id)
         gaps = [Gap(run_id, hole.first, hole.last) for hole in run.holes if not hole.reported]
         while run.holes:
@@ -216,13 +217,13 @@ class GapLedger(Generic[Source]):
         return gaps
 
     def gaps(self) -> Iterator[Gap[Source]]:
-        """Everything that is missing now, reported or not, in the order the runs began."""
+        """All gaps, reported or not, in the order of each run's first keyframe."""
         for run in self._runs.values():
             for hole in run.holes:
                 yield Gap(run.run_id, hole.first, hole.last)
 
     def reported_gaps(self) -> Iterator[Gap[Source]]:
-        """What is missing now and has been reported, in the order the runs began."""
+        """The reported gaps that are still open, in the order of each run's first keyframe."""
         for run in self._runs.values():
             for hole in run.holes:
                 if hole.reported:
@@ -233,7 +234,7 @@ class GapLedger(Generic[Source]):
         return sum(gap.count for gap in self.reported_gaps())
 
     def state(self) -> tuple[RunState[Source], ...]:
-        """The state for `restore`, without how long holes have been open."""
+        """The state for `restore`; it does not have the opening times of holes."""
         return tuple(
             RunState(
                 run.run_id,
@@ -270,14 +271,15 @@ class GapLedger(Generic[Source]):
         self._remove(run, run.holes_before(keyframe_id) - 1)
 
     def _extend(self, run_id: Source, last: int, now_ns: int) -> None:
-        """Open a hole up to keyframe ``last``, which was sent, unless a higher one is recorded."""
+        """Open a hole from behind the run's last keyframe up to ``last``; none if ``last`` is not
+        beyond it."""
         run = self._runs.get(run_id)
         if run is not None and last > run.last:
             self._add_new(run, len(run.holes), run.last + 1, last, now_ns)
             run.last = last
 
     def _split(self, run: _Run[Source], index: int, first: int, last: int) -> None:
-        """Make the part from ``first`` to ``last`` of a hole a hole of its own."""
+        """Split a hole so that ``first`` to ``last`` is a hole of its own."""
         hole = run.holes[index]
         if (hole.first, hole.last) == (first, last):
             return
@@ -292,7 +294,8 @@ class GapLedger(Generic[Source]):
         self.missing -= hole.count
 
     def _report(self, open_since_ns: int | None) -> list[Gap[Source]]:
-        """Sorted by run id and keyframe, so that equal ledgers report equally."""
+        """The unreported holes open since ``open_since_ns`` or before (None: all), marked as
+        reported. Sorted by run id and keyframe, so that equal ledgers report equally."""
         reported = []
         while self._unreported and (
             open_since_ns is None or self._unreported[0][0] <= open_since_ns

@@ -36,7 +36,7 @@ _DEEP_GREY: Final = 257
 
 
 class BadImage(ValueError):
-    """These bytes are no image that can be used; the message says why."""
+    """Bytes that are no usable image; the message says why."""
 
 
 def encode_png(pixels: Pixels) -> bytes:
@@ -49,7 +49,7 @@ def encode_png(pixels: Pixels) -> bytes:
 
 
 def decode_grey_png(data: bytes, width: int, height: int) -> Pixels:
-    """The rows of an 8-bit grey PNG of just this size, from top to bottom. Raises BadImage."""
+    """The rows of an 8-bit grey PNG, from top to bottom. Raises BadImage, also for another size."""
     with _opened(data, ("PNG",)) as image:
         if image.mode != "L":
             raise BadImage(f"it is a PNG of mode {image.mode}, not 8-bit grey")
@@ -74,12 +74,12 @@ def decode_rgba(data: bytes, max_side: int, max_pixels: int) -> Pixels:
 
 
 def _opened(data: bytes, formats: tuple[str, ...]) -> "Image.Image":
-    """An image whose head was read; Pillow decodes pixels when they are asked for."""
+    """An image of which only the header was read. Raises BadImage."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # we have own limits
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers check sizes
             return Image.open(io.BytesIO(data), formats=formats)
     except UnidentifiedImageError:
         raise BadImage(f"it is no {' or '.join(formats).replace('PPM', 'PGM')} image") from None

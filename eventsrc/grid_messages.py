@@ -1,10 +1,10 @@
-"""nav_msgs/OccupancyGrid as JSON or in CDR: from a message to an occupancy map.
+"""Occupancy maps from nav_msgs/OccupancyGrid messages, as JSON or in CDR.
 
 CDR is read by `eventsrc.cdr_grids`. The JSON has the fields of the ROS message: ``info`` with
 ``resolution``, ``width``, ``height`` and ``origin`` (``position`` and the quaternion
 ``orientation``), and ``data``, row by row from the origin: -1 for unknown, else 0 to 100.
-``header`` may be there or not, and so may ``floor``, which ROS does not have: the floor that the
-map is of, as in envelopes.
+``header`` is optional, and so is ``floor``, which ROS does not have: the floor that the map shows,
+as in envelopes.
 """
 
 import math
@@ -19,7 +19,7 @@ from .text import visible
 
 _MARKS = (b'"info"', b'"resolution"', b'"data"')
 _MOST_BYTES_A_CELL = 8
-"""``-1`` or ``100``, a comma and white space, indented or not."""
+"""Bound of the JSON of one cell: ``-1`` or ``100``, a comma and white space."""
 _MAX_TILT = 0.02
 _UPRIGHT_ENOUGH = 1e-3
 
@@ -49,7 +49,7 @@ class _Info(msgspec.Struct):
 
 
 class _Head(msgspec.Struct):
-    """The message without its cells, which are not parsed before its size is known to be good."""
+    """The message with its cells unparsed, so that its size is checked before they are decoded."""
 
     info: _Info
     data: msgspec.Raw
@@ -61,15 +61,15 @@ _CELLS = msgspec.json.Decoder(list[Annotated[int, msgspec.Meta(ge=-1, le=100)]])
 
 
 def is_grid_message(payload: bytes) -> bool:
-    """Whether a payload that is no envelope means to be an occupancy grid: any CDR does, because no
-    other message in CDR is taken."""
+    """Whether to read a payload that is no envelope as an occupancy grid: JSON with the fields of
+    one, or any CDR, because no other message in CDR is read."""
     if is_cdr(payload):
         return True
     return payload.lstrip()[:1] == b"{" and all(mark in payload for mark in _MARKS)
 
 
 def read_grid_message(payload: bytes, source: str) -> OccupancyMap:
-    """The map of a message that came from ``source``, a key or a file. Raises InvalidMap."""
+    """The map of a message. ``source`` is the key or file that it came from. Raises InvalidMap."""
     return _read_cdr(payload, source) if is_cdr(payload) else _read_json(payload, source)
 
 
@@ -110,7 +110,7 @@ def _size(info: _Info) -> str:
 
 
 def _yaw(q: _Quaternion) -> float:
-    """Radians about the vertical; 0 for the quaternion of zeros, which is what is never set."""
+    """Radians about the vertical; 0 for a quaternion of zeros, the default of an unset field."""
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if norm == 0.0:
         return 0.0

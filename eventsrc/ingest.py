@@ -35,7 +35,7 @@ from .text import visible
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 2 * DEFAULT_MAX_PAYLOAD_BYTES
-"""Bound of ``max_bytes``: a log keeps events of up to 96 MiB, and rejected payloads as base64."""
+"""Bound of ``max_bytes``. As base64 in a rejection such a payload fits the 96 MiB of an event."""
 MAX_JSON_VALUES = 500_000
 """Bound of the values in one payload, counted as commas and opening brackets: parsing JSON costs
 some hundred bytes and a microsecond a value, however short the value."""
@@ -46,7 +46,7 @@ _EMPTY_LIST: Final = (
     "names no run, keyframe, time or pose"
 )
 _MAX_SHOWN: Final = 80
-"""How many characters of a value a reason shows."""
+"""Characters of a value that a reason shows."""
 
 Vector = NDArray[np.float32]
 _FLOAT32 = np.dtype("<f4")
@@ -75,7 +75,7 @@ class Rejected(msgspec.Struct, frozen=True, gc=False):
 
 
 class CheckedEnvelope(msgspec.Struct, frozen=True, gc=False):
-    """What stays of a valid envelope whose bytes are kept."""
+    """Run, keyframe and time of a valid envelope, for callers that keep its bytes."""
 
     run_id: RunId
     keyframe_id: KeyframeId
@@ -83,12 +83,12 @@ class CheckedEnvelope(msgspec.Struct, frozen=True, gc=False):
 
     @classmethod
     def of(cls, envelope: Envelope) -> "CheckedEnvelope":
-        """That of an envelope."""
+        """Run, keyframe and time of ``envelope``."""
         return cls(envelope.run_id, envelope.keyframe_id, envelope.stamp_ns)
 
 
 class _Embedded(Protocol):
-    """A detection, as far as its vector is concerned."""
+    """The fields of a detection that hold its vector."""
 
     @property
     def embedding(self) -> str | None: ...
@@ -97,7 +97,7 @@ class _Embedded(Protocol):
 
 
 class _RejectionError(Exception):
-    """Carries a reason up to `ingest`, within this module."""
+    """A reason for rejection, caught within this module."""
 
 
 def ingest(payload: bytes, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES) -> Accepted | Rejected:
@@ -108,7 +108,7 @@ def ingest(payload: bytes, *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES) -> Acc
 def ingest_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
-    """`ingest` of each, faster: their vectors are decoded together."""
+    """`ingest` each payload; faster than one by one, because their vectors are decoded together."""
     read = [_read(payload, max_bytes) for payload in payloads]
     rows = _decode_uniform(_detections(read))
     if rows is None:
@@ -118,9 +118,12 @@ def ingest_all(
 
 
 def ingest_plain(payloads: Sequence[bytes], *, max_bytes: int) -> list[Accepted] | None:
-    """`ingest_all` in half of the time, for callers that only read fields: each envelope is a
-    `PlainEnvelope`, which has the fields of an `Envelope` and the same values. None where
-    `ingest_all` must decide: one of them is unusual, or not all vectors are of one dimension."""
+    """`ingest_all` in half the time, for callers that only read fields: each envelope is a
+    `PlainEnvelope`, with the fields and values of an `Envelope`.
+
+    None if a payload is not a plain envelope or the vectors differ in dimension; use `ingest_all`
+    then.
+    """
     plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
     envelopes = [e for e in plain if e is not None]
     rows = _decode_uniform([d for e in envelopes for d in e.detections])
@@ -139,8 +142,8 @@ def ingest_plain(payloads: Sequence[bytes], *, max_bytes: int) -> list[Accepted]
 def check_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[CheckedEnvelope | Rejected]:
-    """Whether `ingest` accepts each, and the reason if not; faster, for callers that only keep the
-    bytes."""
+    """Validate each payload as `ingest` does, but return no vectors; faster, for callers that only
+    keep the bytes."""
     plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
     if not _have_vectors([d for e in plain if e is not None for d in e.detections]):
         plain = [e if e is not None and _have_vectors(e.detections) else None for e in plain]
@@ -153,7 +156,7 @@ def check_all(
 
 
 def _have_vectors(detections: Sequence[_Embedded]) -> bool:
-    """Whether all embeddings that there are can be decoded; together those of one dimension."""
+    """Whether all given embeddings are valid; those of one dimension are decoded together."""
     if _decode_uniform(detections) is not None:  # the usual case
         return True
     by_dim: defaultdict[int | None, list[_Embedded]] = defaultdict(list)
@@ -200,7 +203,8 @@ def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
 
 
 def _accept(result: Envelope | Rejected, vectors: Iterator[Vector] | None) -> Accepted | Rejected:
-    """Ids and vectors of a parsed envelope; ``vectors`` yields those of all, if decoded already."""
+    """A parsed envelope with its ids and vectors. ``vectors`` yields the vectors if they have been
+    decoded already."""
     if isinstance(result, Rejected):
         return result
     own = None if vectors is None else tuple(islice(vectors, len(result.detections)))
@@ -301,7 +305,7 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
 
 
 def _plain_det_ids(envelope: PlainEnvelope) -> tuple[DetId, ...]:
-    """Those given, which `read_plain` has compared, or those by default."""
+    """The given det_ids, else the default ones. `read_plain` has checked that they are unique."""
     given = [DetId(d.det_id) for d in envelope.detections if d.det_id is not None]
     if given:
         return tuple(given)
@@ -322,7 +326,7 @@ def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
 
 def _decode_uniform(detections: Sequence[_Embedded]) -> Vector | None:
     """All vectors at once, shape (len(detections), dim), if they are valid and of one dimension, as
-    is usual; None if each must be looked at."""
+    is usual; None if each must be decoded on its own."""
     try:
         raws = [pybase64.b64decode(d.embedding, None, True) for d in detections]  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -332,7 +336,7 @@ def _decode_uniform(detections: Sequence[_Embedded]) -> Vector | None:
     if None in dims or len(dims) != 1 or sizes != {4 * dim for dim in dims if dim}:
         return None
     rows = np.frombuffer(b"".join(raws), _FLOAT32).reshape(len(raws), -1)
-    # A squared norm that is 0, infinite or NaN says that a component may be.
+    # A squared norm of 0, infinity or NaN means that the vector may be zero or not finite.
     for norm2 in np.einsum("ij,ij->i", rows, rows).tolist():
         if not 0.0 < norm2 < math.inf:
             return None
@@ -366,7 +370,7 @@ def _decode_base64(place: str, text: str) -> bytes:
 
 
 def _base64_error(text: str) -> str:
-    """What is wrong with ``text``, as `binascii` says. Not used to decide: not every version of it
+    """The fault in ``text``, by `binascii`. Not used to validate, because not every version of it
     refuses excess padding."""
     try:
         binascii.a2b_base64(text, strict_mode=True)

@@ -1,4 +1,4 @@
-"""Files of class names, one a line or as a JSON list: the first is that of class 0."""
+"""Read files of class names, one a line or as a JSON list. The first name is that of class 0."""
 
 import json
 import re
@@ -13,9 +13,11 @@ _NAME_IN_BRACKETS: Final = re.compile(r"\[[^]\",\n]+\][ \t\r]*(\n|$)")
 
 
 def read_label_file(path: Path, else_give: str = "check the path") -> list[Any]:
-    """The names in a file, in order, of lines without the space around them. Lines may be empty,
-    but not the last; what a JSON list has may be anything. Raises MisuseError, for a file that
-    cannot be read with ``else_give``."""
+    """The class names in a file, in order.
+
+    Lines are stripped; all but the last may be empty. Items of a JSON list are returned unchecked.
+    Raises MisuseError; for a file that cannot be read its message ends with ``else_give``.
+    """
     place = f"--labels {path}"
     try:
         with path.open("rb") as file:

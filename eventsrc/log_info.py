@@ -1,10 +1,10 @@
-"""Facts about a log (`mapfold log info`), counted from its indexes, reading hardly any events.
+"""Facts about a log (`mapfold log info`), counted from the indexes of its segments.
 
 First and last stamp are those of envelopes: mapfold's own events are stamped when they were
 written, which for a correction may be months after the run, and verbatim messages by clocks of
-their own. A sealed segment names the bounds of all its stamps, which are exact if it has envelopes
-only. Otherwise its chunks are read if that could still change the answer; mostly it cannot, because
-the segments before and behind it have earlier and later stamps.
+their own. A sealed segment has the first and last of all its stamps, which is exact if it has
+envelopes only. The chunks of any other are read only if its stamps reach beyond those found so far;
+mostly they do not, because the segments before and behind it have earlier and later stamps.
 """
 
 from collections import Counter
@@ -32,10 +32,10 @@ from .system_events import LOSS_KEY, REJECTED_KEY, Loss
 
 @dataclass(frozen=True, slots=True)
 class SegmentInfo:
-    """One segment: ``events`` are the durable ones, ``size_bytes`` what the file takes.
+    """One segment: the number of its durable ``events`` and the ``size_bytes`` of its file.
 
     ``begun_ns`` is when it was begun, by the clock of the machine that wrote it; None for segments
-    of earlier versions. Events that were ``imported`` have the time of the drive.
+    of earlier versions. In an ``imported`` one the log times are those of the drive.
     """
 
     name: str
@@ -49,10 +49,13 @@ class SegmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """A log at a glance. Times are int nanoseconds, None while the log is empty; the first is the
-    earliest and the last the latest, whatever their order in the log; stamps are those of
-    envelopes. ``lost`` is what the log reports as lost, less the keyframes that came late.
-    ``formats`` are the encodings and schemas of verbatim messages, by topic."""
+    """Counts and time bounds of a log.
+
+    Times are int nanoseconds, earliest and latest whatever their order in the log, None while it is
+    empty; stamps are those of envelopes. ``lost`` is the number of events reported as lost, less
+    the keyframes that came late. ``formats`` are the encodings and schemas of verbatim messages,
+    by topic.
+    """
 
     log_id: str
     path: Path
@@ -84,7 +87,8 @@ class _RobotStamps:
         self.last = stamp_ns if self.last is None else max(self.last, stamp_ns)
 
     def add_sealed(self, entry: SegmentPath, segment: SealedFile) -> None:
-        """Add the bounds that a sealed segment names."""
+        """Add the stamp bounds of a sealed segment; keep it for `read_doubtful` if it has other
+        events too."""
         first, last = segment.first_stamp_ns, segment.last_stamp_ns
         if _has_other_events(segment):
             self._doubtful.append((first, last, entry))
@@ -93,7 +97,7 @@ class _RobotStamps:
             self.add(last)
 
     def read_doubtful(self, reader: LogReader) -> None:
-        """Read the segments with other events that could still move the bounds."""
+        """Read the segments with other events whose stamps reach beyond the bounds."""
         unread = []
         for doubtful in sorted(self._doubtful, key=lambda d: d[1], reverse=True):
             if self.last is None or doubtful[1] > self.last:
@@ -189,9 +193,10 @@ def _add_formats(tally: _Tally, segment: OpenSegment, body: bytes) -> None:
 
 
 def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) -> int:
-    """How many events were lost: reported losses, less the keyframes that came late.
+    """The number of lost events: losses reported, less the keyframes that came late.
 
-    Reads the losses, and for gaps of keyframes, which may have been filled, the gap ledger."""
+    Gaps of keyframes are counted from the gap ledger, because late keyframes may have filled them.
+    """
     losses = [loss for event in reader.read(keys={LOSS_KEY}) if (loss := _loss(event)) is not None]
     others = [loss.count for loss in losses if gap_of(loss) is None]
     if len(others) == len(losses):

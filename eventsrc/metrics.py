@@ -1,10 +1,9 @@
-"""Metrics for Prometheus over HTTP: the recorder's, and any other values (`--metrics`); and as text
-for a server of another kind (`Instruments`).
+"""Metrics for Prometheus over HTTP (`--metrics`): the recorder's, and other programs' values; also
+as text, for programs that have an HTTP server (`Instruments`).
 
-Only this module imports prometheus_client. Values are read when they are scraped, so metrics cost
-the recording nothing. Each request has a thread, which a silent connection would keep, with its
-file descriptor, forever. So a silent connection is closed after ``SILENT_S``, and beyond
-``MAX_CONNECTIONS`` the oldest is closed.
+Only this module imports prometheus_client. Values are read at each scrape, so recording does no
+extra work. Each connection has a thread and a file descriptor. So a silent one is closed after
+``SILENT_S``, and beyond ``MAX_CONNECTIONS`` the oldest is closed.
 """
 
 import contextlib
@@ -101,12 +100,12 @@ _COUNTERS: Final = (
     ("rejected", "Payloads refused and kept under mapfold/rejected."),
     ("queue_full", "Messages lost because the queue was full."),
     ("too_large", "Messages lost because they were too large to be kept as rejected."),
-    ("transport_missed", "Messages that advanced publishers sent and that never came."),
+    ("transport_missed", "Messages of advanced publishers that were sent but not received."),
     ("lost_from_log", "Recorded events lost with a segment file that was taken away or cut short."),
 )
 _OF_ROS: Final = (
-    ("untyped", "Messages of ROS kept without a schema: no bridge told their type."),
-    ("unknown_keys", "Messages left out under keys of no topic of ROS."),
+    ("untyped", "Messages of ROS kept without a schema: no bridge declared their type."),
+    ("unknown_keys", "Messages left out because their keys are no topics of ROS."),
 )
 _STREAM_COUNTERS: Final = (
     ("keyframes", "Keyframes made."),
@@ -119,11 +118,11 @@ _STREAM_COUNTERS: Final = (
     ("without_camera", "Keyframes without the camera's field of view."),
     ("without_covariance", "Keyframes with a pose, but without its error."),
 )
-"""Of each topic of detections of ROS."""
+"""Counters of each topic of ROS detections."""
 _GAUGES: Final = (
-    ("missing", "Keyframes the log's runs lack now."),
+    ("missing", "Keyframes missing from the log's runs."),
     ("queue_depth", "Messages that wait for the log's writer."),
-    ("queue_size", "How many may wait."),
+    ("queue_size", "The most messages that may wait."),
     ("next_offset", "Events in the log."),
     ("unsealed", "Finished segments that wait to be sealed."),
 )
@@ -143,9 +142,9 @@ class _RecorderCollector(Collector):
         if report.streams:
             yield from _ros_metrics(report)
         failing = report.sealing_error is not None
-        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 while it fails.", failing)
+        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 if it fails.", failing)
         free = shutil.disk_usage(self._log).free
-        yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Room where the log is.", free)
+        yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Free space for the log.", free)
 
 
 def _ros_metrics(report: "RecorderReport") -> Iterator[Metric]:
@@ -200,10 +199,12 @@ class _ValuesCollector(Collector):
 
 
 class Instruments:
-    """What a program counts itself, beside values that are read at a scrape. For any thread."""
+    """A program's own counters and histograms, beside ``values``, which are read at each scrape.
+    Thread-safe."""
 
     def __init__(self, values: Callable[[], Iterable[MetricValue]]) -> None:
-        disable_created_metrics()  # type: ignore[no-untyped-call]  # a time of birth for every label: as many lines again
+        # Without this every label has a line more, with the time when it was first used.
+        disable_created_metrics()  # type: ignore[no-untyped-call]
         self._registry = CollectorRegistry()
         self._registry.register(_ValuesCollector(values))
 
@@ -220,7 +221,7 @@ class Instruments:
         return lambda value, *of: histogram.labels(*of).observe(value)
 
     def text(self) -> bytes:
-        """All of it in Prometheus' text format."""
+        """All metrics in Prometheus' text format."""
         return generate_latest(self._registry)
 
 
@@ -232,7 +233,10 @@ METRICS_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 def serving_values(
     address: tuple[str, int], values: Callable[[], Iterable[MetricValue]]
 ) -> Iterator[int]:
-    """Serve other values in the same way; ``values`` is called at each scrape."""
+    """Serve ``/metrics`` with the values that ``values`` returns at each scrape; yields the port.
+
+    Raises TransportError when the address cannot be listened on.
+    """
     with _serving(address, _ValuesCollector(values)) as port:
         yield port
 

@@ -1,7 +1,7 @@
 """Occupancy maps: a grid of cells that are free, occupied or unknown, as `mapfold/map` events.
 
-A map is data of the log like any other: it is validated when it comes in, kept as an event, and
-holds for what comes after it. `eventsrc.grid_messages` makes one from a nav_msgs/OccupancyGrid,
+A map is validated when it comes in, kept as an event of the log, and in force for the events after
+it. `eventsrc.grid_messages` makes one from a nav_msgs/OccupancyGrid,
 `eventsrc.importers.map_yaml` from the map.yaml of a map server.
 """
 
@@ -27,20 +27,24 @@ MAX_MAP_BYTES = 32 * 1024 * 1024
 UNKNOWN = 255
 OCCUPIED = 100
 MIN_WALL = 65
-"""Percent from which a cell counts as occupied: what map servers take for their threshold."""
+"""Percent from which a cell counts as occupied, the default of map servers."""
 
 Cells = NDArray[np.uint8]
 
 
 class InvalidMap(ValueError):
-    """This is no occupancy map; the message names the field, its value and the rule."""
+    """Data that is no occupancy map; the message names the field, its value and the rule."""
 
 
 @dataclass(frozen=True, eq=False)
 class OccupancyMap:
-    """An occupancy grid. ``cells`` is of shape (height, width) with values as in the event; its
-    first row is the one of the origin, where the image's is the last. ``floor`` is the one that it
-    names, None for the floor that the log is of first. Nothing of it is ever changed."""
+    """An occupancy grid; immutable.
+
+    ``cells`` has shape (height, width), with values as in the event; its first row is at the
+    origin, unlike the image's, whose last row is. ``resolution`` is in metres, ``origin`` x, y
+    (metres) and yaw (radians). ``floor`` is the name of the floor that it shows; None stands for
+    the first floor in the log.
+    """
 
     map_id: str | None
     resolution: float
@@ -60,8 +64,8 @@ class OccupancyMap:
         return int(self.cells.shape[0])
 
     def digest(self) -> str:
-        """SHA-256 of the grid and where it lies, as 64 hex digits: id, source and floor do not
-        count."""
+        """SHA-256 of the cells, resolution and origin, as 64 hex digits; not of id, source and
+        floor."""
         return self._digest
 
     @cached_property
@@ -71,7 +75,7 @@ class OccupancyMap:
         return hashlib.sha256(text + b"\n" + self.cells.tobytes()).hexdigest()
 
     def encode(self) -> bytes:
-        """The JSON of the event. Raises InvalidMap for a map that no log takes."""
+        """The JSON of the event. Raises InvalidMap for a map that breaks the event's bounds."""
         check_size(self.width, self.height)
         allowed = (self.cells <= OCCUPIED) | (self.cells == UNKNOWN)
         if not allowed.all():
@@ -118,7 +122,7 @@ def decode_map(payload: bytes) -> OccupancyMap:
 
 
 def read_map_head(payload: bytes) -> OccupancyMapEvent:
-    """The fields of a ``mapfold/map`` event; its image is not looked at. Raises InvalidMap."""
+    """The fields of a ``mapfold/map`` event; its image is not decoded. Raises InvalidMap."""
     return _parse(payload)
 
 

@@ -1,4 +1,4 @@
-"""Command lines of Python processes of our own, with the modules of this one."""
+"""Command lines of Python processes that import the same modules as this one."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ import sys
 def python_command(code: str, *arguments: str) -> list[str]:
     """The command line that runs ``code`` with ``sys.argv[1:]`` as ``arguments``.
 
-    It imports modules from where this process does, and not from the current folder. Unlike
+    The process has the ``sys.path`` of this one, without the current folder. Unlike
     `multiprocessing` it does not import the caller's main module again.
     """
     entries: list[object] = [*sys.path]

@@ -1,10 +1,10 @@
 """Read envelopes of known fields in half of pydantic's time, for callers that need no models.
 
-`read_plain` accepts a part of what `eventsrc.envelope` accepts, and nothing else: an envelope with
-known fields only, whose texts are printable. For anything else it returns None, and the caller uses
-pydantic, which also gives the reasons. What it reads has the fields and values of the models,
-but for a floor that is an integer. So the models of `eventsrc.envelope` alone define what is
-valid; a property test compares the two over texts that are made to tell them apart.
+`read_plain` accepts a subset of what `eventsrc.envelope` accepts: envelopes with known fields only,
+whose texts are printable. For any other payload it returns None, and the caller uses pydantic,
+which also gives the reasons. The results have the fields and values of the models, except that an
+integer floor stays an integer. So the models of `eventsrc.envelope` alone define what is valid; a
+property test compares the two on payloads near the rules' limits.
 """
 
 from collections.abc import Mapping
@@ -33,10 +33,10 @@ _Pixels = Annotated[float, Meta(ge=1.0, le=1e6)]
 
 
 class _Known(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, gc=False):
-    """An object of known fields."""
+    """A JSON object with known fields only."""
 
     def model_copy(self, *, update: Mapping[str, Any]) -> Self:
-        """As of a model of pydantic."""
+        """A copy with other values of some fields, as `pydantic.BaseModel.model_copy` makes it."""
         return msgspec.structs.replace(self, **update)
 
 
@@ -93,8 +93,8 @@ _decode: Final = msgspec.json.Decoder(PlainEnvelope).decode
 
 
 def read_plain(payload: bytes) -> PlainEnvelope | None:
-    """The envelope in ``payload``, valid but for its embeddings, which are not looked at; None if
-    pydantic must decide. The cost of the payload must be checked before."""
+    """The envelope in ``payload``, valid except for its embeddings, which are not decoded; None if
+    pydantic must validate it. Call `eventsrc.ingest.check_cost` before."""
     try:
         envelope = _decode(payload)
     except ValueError:  # msgspec's errors, and bytes that are not UTF-8
@@ -105,8 +105,8 @@ def read_plain(payload: bytes) -> PlainEnvelope | None:
 
 
 def _is_plain(envelope: PlainEnvelope) -> bool:
-    """Whether it keeps the rules that its types do not state. No printable character is a control
-    character."""
+    """Whether the envelope keeps the rules that its types do not state. Texts are printable, so
+    they have no control characters."""
     if not envelope.run_id.isprintable():
         return False
     if not (envelope.map_x is None) is (envelope.map_y is None) is (envelope.map_yaw is None):
@@ -125,5 +125,5 @@ def _is_plain(envelope: PlainEnvelope) -> bool:
             return False
         if det_id is not None:
             ids.append(det_id)
-    # An id that is given may be the same as another, or as one generated for a detection without.
+    # A given id may equal another, or one generated for a detection without an id.
     return not ids or (len(set(ids)) == len(envelope.detections) and all(map(str.isprintable, ids)))

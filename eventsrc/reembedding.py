@@ -30,14 +30,15 @@ from .upcast import read_envelope
 DEFAULT_TOPIC: Final = "tb/crops"
 DEFAULT_BATCH: Final = 64
 _MOST_VALUES: Final = 1_000_000
-"""Of the vectors in one event."""
+"""Bound of the bytes of vectors in one event."""
 _MOST_NAMED: Final = 20
 
 Vector: TypeAlias = NDArray[np.float32]
 
 
 class CropEncoder(Protocol):
-    """An encoder: the name of its ``space``, how long its vectors are, the SHA-256 of its model."""
+    """An encoder of crops: the name of its ``space``, the ``dimension`` of its vectors, the SHA-256
+    of its model."""
 
     @property
     def space(self) -> str: ...
@@ -51,7 +52,7 @@ class CropEncoder(Protocol):
 
 
 class Fault(NamedTuple):
-    """A crop without a vector: the offset of its event, its det_id if it can be read, and why."""
+    """A crop that got no vector: the offset of its event, its det_id if readable, the reason."""
 
     offset: Offset
     det_id: DetId | None
@@ -60,10 +61,13 @@ class Fault(NamedTuple):
 
 @dataclass
 class Reembedding:
-    """Counts of a run. Of the ``detections`` of a log ``own`` were recorded with a vector of the
-    space and ``known`` have one by an earlier run; ``added`` have one now. ``without_crop`` have
-    none in the log; the crops of ``corrupt`` cannot be decoded, and for those of ``unusable`` the
-    encoder answered NaN or zero. ``command`` is the offset of the command if one was appended."""
+    """Counts of a run, most of them of detections.
+
+    Of all ``detections`` of the log, ``own`` were recorded with a vector of the space, ``known``
+    got one by an earlier run and ``added`` by this one. ``without_crop`` have no crop in the log.
+    ``corrupt`` crops cannot be decoded; for ``unusable`` ones the encoder answered NaN or zero.
+    ``command`` is the offset of the command if one was appended.
+    """
 
     space: str
     dimension: int
@@ -77,7 +81,7 @@ class Reembedding:
     command: int | None = None
     stopped: bool = False
     faults: list[Fault] = field(default_factory=list)
-    """The first of corrupt and unusable crops."""
+    """The first few corrupt or unusable crops."""
 
     def note(self, kind: Literal["corrupt", "unusable"], fault: Fault) -> None:
         """Count a crop without a vector."""
@@ -99,13 +103,13 @@ def reembed(
 ) -> Reembedding:
     """Add vectors of ``encoder`` for the detections that have a crop and no vector of its space.
 
-    ``progress`` gets the number of events looked at and of all; when ``stopped`` returns True, it
-    ends after the current group and appends no command. Raises LogBusy while another writes the
-    log, LogNotFound, MisuseError if vectors of the space have another dimension or are of another
-    encoder.
+    ``progress`` gets the number of events read and of all events. When ``stopped`` returns True,
+    the run ends after the current group and appends no command. Raises LogBusy while another
+    process writes the log, LogNotFound, MisuseError if the log has vectors of the space with
+    another dimension or by another encoder.
     """
     with LogReader(log):
-        pass  # a writer would make the log
+        pass  # raises LogNotFound; a writer would create the log
     with LogWriter(log) as writer:
         with LogReader(log) as reader:
             state = _State.read(reader, encoder)
@@ -132,9 +136,9 @@ def reembed(
 
 @dataclass
 class _State:
-    """What a log has: ``own`` detections with a vector of the space in their envelope, the
-    ``wanted`` others, those ``given`` one by an event, those ``tried`` now, and to which offset
-    commands reach."""
+    """The detections of a log by where their vector of the space is: ``own`` have it in their
+    envelope, ``wanted`` are the others, ``given`` have it in an event on ``mapfold/embeddings``,
+    ``tried`` had a crop read by this run. Events before offset ``covered`` have a command."""
 
     own: set[DetId] = field(default_factory=set)
     wanted: set[DetId] = field(default_factory=set)
@@ -144,7 +148,8 @@ class _State:
 
     @classmethod
     def read(cls, reader: LogReader, encoder: CropEncoder) -> "_State":
-        """Look at all events. Raises MisuseError for vectors that do not go with the encoder's."""
+        """Read all events. Raises MisuseError for vectors of the space that have another dimension
+        or are by another encoder."""
         state = cls()
         for event in reader.read():
             if event.key == EMBEDDINGS_KEY:
@@ -217,7 +222,7 @@ def _groups(
     done: Reembedding,
     progress: Callable[[int, int], None],
 ) -> Iterator[list[tuple[Offset, Crop]]]:
-    """The crops of wanted detections, so many at a time; each detection once in a group."""
+    """The crops of wanted detections, ``size`` at a time; each detection once in a group."""
     group: dict[DetId, tuple[Offset, Crop]] = {}
     for event in reader.read(keys=set(topics)):
         progress(event.offset, reader.next_offset)
@@ -243,7 +248,7 @@ def _append(
     crops: list[tuple[Offset, Crop]],
     done: Reembedding,
 ) -> set[DetId]:
-    """Encode a group, append its vectors and sync; the detections that have one now."""
+    """Encode a group of crops, append the vectors and sync; return the detections that got one."""
     det_ids, rows = [], []
     answers = encoder.encode([crop.jpeg for _, crop in crops])
     for (offset, crop), answer in zip(crops, answers, strict=True):
@@ -270,7 +275,7 @@ def _append(
 def _command(
     reader: LogReader, encoder: CropEncoder, covered: Offset, issued_by: str, reason: str
 ) -> Reembed | None:
-    """The command for the vectors that none is for yet; None if there are none."""
+    """The command for the vectors from offset ``covered`` on; None if there are none."""
     digest, first, end, count = hashlib.sha256(), None, FIRST_OFFSET, 0
     for event in reader.read(covered, keys={EMBEDDINGS_KEY}):
         found = _decoded(event)

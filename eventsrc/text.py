@@ -28,8 +28,8 @@ def visible(text: str) -> str:
 
 
 def visible_lines(text: str) -> str:
-    """``text`` of several lines, with all other control characters as escapes. Text from outside in
-    it must have gone through `visible` before, or it can add lines."""
+    """``text`` with line breaks kept and all other control characters as escapes. Apply `visible`
+    to text from outside first, or it can add lines."""
     return "\n".join(map(visible, text.split("\n")))
 
 

@@ -7,8 +7,8 @@
 CSV and JSON lines name ``keyframe_id`` or ``stamp`` (or ``timestamp``), then ``x``, ``y`` and
 ``yaw`` (or ``map_x``, ``map_y``, ``map_yaw``), or instead of yaw the quaternion ``qx``, ``qy``,
 ``qz``, ``qw``. Metres, radians and seconds; poses of the robot in the map frame, whose z axis is
-up. Other columns are ignored. The format follows from the first line, and by its name's
-ending where the line leaves it open.
+up. Other columns are ignored. The format follows from the first line, or from the file's suffix
+where that line fits several.
 """
 
 import csv
@@ -24,7 +24,7 @@ from .errors import MisuseError
 from .text import visible
 
 MAX_LINE: Final = 4_096
-"""Characters of a line."""
+"""Bound of a line's length in characters."""
 MAX_POSES: Final = 1_000_000
 MAX_SHOWN: Final = 60
 _QUATERNION: Final = ("qx", "qy", "qz", "qw")
@@ -75,11 +75,11 @@ class _Line(NamedTuple):
 
 
 class TrajectoryError(MisuseError):
-    """A file that is no trajectory; the message names the line."""
+    """A file that is no trajectory; the message names the file and the line."""
 
 
 class _LineError(ValueError):
-    """What is wrong with a line."""
+    """A line that is no pose; the message says why."""
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -146,7 +146,7 @@ def _counted(count: int) -> int:
 
 
 class _Lines(Iterator[tuple[int, str]]):
-    """Number, from 1, and text of the lines that are neither empty nor comments."""
+    """Yields number, from 1, and text of each line that is neither empty nor a comment."""
 
     def __init__(self, name: str, file: BinaryIO) -> None:
         self._name, self._file = name, file

@@ -1,7 +1,7 @@
-"""Convert older forms of the envelope to the current one, step by step, when they are read.
+"""Upcast older versions of the envelope to the current one, step by step, when they are read.
 
-A log keeps payloads as they came, so it must stay readable when the form changes. Each channel of a
-log has the version of its envelopes; `read_envelope` converts an event from its version to the
+A log keeps payloads as they came, so it must stay readable when the envelope changes. Each channel
+of a log has the version of its envelopes; `read_envelope` converts an event from its version to the
 current one and validates it like a new one.
 
     1   the bare list of a detector, before there was an envelope: ``[{"class_name": "cup",
@@ -52,7 +52,7 @@ _DETECTION_FIELDS = tuple(field.alias or name for name, field in Detection.model
 
 
 class VersionedEvent(Protocol):
-    """What an upcaster is given of the event around a payload; `eventsrc.log.Event` is one."""
+    """The fields of an event that upcasters may use. `eventsrc.log.Event` has them."""
 
     @property
     def offset(self) -> int: ...
@@ -67,7 +67,7 @@ class VersionedEvent(Protocol):
 
 
 Upcaster = Callable[[Any, VersionedEvent], Any]
-"""From the JSON value of one version to that of the next. Raises ValueError if it is not valid."""
+"""Converts the JSON value of one version to the next. Raises ValueError if it is invalid."""
 
 
 class PendingEvent(msgspec.Struct, frozen=True, gc=False):
@@ -109,7 +109,7 @@ def _converted(event: VersionedEvent, max_bytes: int) -> Accepted | Rejected:
 def read_envelopes(
     events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
-    """`read_envelope` of each; faster together, but for those of version 1."""
+    """`read_envelope` each event; faster than one by one unless one has version 1."""
     if any(event.version not in _SAME_BUT_FOR_NEW_FIELDS for event in events):
         return [read_envelope(event, max_bytes=max_bytes) for event in events]
     read = ingest_all([event.payload for event in events], max_bytes=max_bytes)
@@ -133,7 +133,7 @@ def read_fields(
 def check_envelopes(
     events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[CheckedEnvelope | Rejected]:
-    """Like `read_envelopes`, for callers that only keep the bytes."""
+    """Like `read_envelopes`, but without vectors; faster, for callers that only keep the bytes."""
     if any(event.version != ENVELOPE_VERSION for event in events):
         read = read_envelopes(events, max_bytes=max_bytes)
         return [r if isinstance(r, Rejected) else CheckedEnvelope.of(r.envelope) for r in read]
@@ -141,7 +141,7 @@ def check_envelopes(
 
 
 def detect_version(payload: bytes) -> int:
-    """The version of a payload from its first bytes: a list of objects is a bare list."""
+    """The version of a payload, by its first bytes: 1 for a list of objects, else the current."""
     if payload.startswith(b"{"):
         return ENVELOPE_VERSION
     start = payload[:64].split()
@@ -169,7 +169,7 @@ def _upcast_bare_list(document: Any, event: VersionedEvent) -> dict[str, Any]:
 
 
 def _upcast_detection(detection: dict[str, Any]) -> dict[str, Any]:
-    """The known fields, ``class_name`` as ``class``; the others stay in the log."""
+    """The known fields of a detection, with ``class_name`` renamed to ``class``."""
     known = {name: detection[name] for name in _DETECTION_FIELDS if name in detection}
     if "class" not in detection and "class_name" in detection:
         known["class"] = detection["class_name"]
@@ -183,16 +183,16 @@ _NEW_IN_ENVELOPE: Mapping[int, frozenset[str]] = MappingProxyType(
         4: frozenset({"pose_covariance"}),
     }
 )
-"""Fields of an envelope that the next version added to these."""
+"""By version, the envelope fields that the next version added."""
 _NEW_IN_DETECTION = frozenset({"depth_m", "depth_sigma_m", "position", "position_sigma_m"})
 """Fields of a detection that version 2 did not have."""
 _SAME_BUT_FOR_NEW_FIELDS = (2, 3, 4, 5)
 
 
 def _must_convert(event: VersionedEvent, read: Accepted | Rejected) -> bool:
-    """Whether an older envelope that was read as a current one must be converted first: if it is no
-    current one, or has fields that its version did not know. Hardly any has, and to parse each
-    twice would take far longer."""
+    """Whether an older envelope, which was read as a current one, must be converted and read again:
+    it has fields that its version did not define. This is rare, so reading first is faster than
+    converting each."""
     if event.version == ENVELOPE_VERSION:
         return False
     if isinstance(read, Rejected):

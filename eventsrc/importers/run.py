@@ -35,7 +35,7 @@ from .log_times import LogTimes
 from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 from .ros_bags import BagReport, RosBag
 from .source import ImportedMessage, Source
-from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, means_envelope
+from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, looks_like_envelope
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"
@@ -302,7 +302,7 @@ class _Import:
 
     def _is_for_others(self, message: ImportedMessage) -> bool:
         """Whether a message that is no envelope was never meant to be one."""
-        return message.is_foreign and not self._topics and not means_envelope(message.payload)
+        return message.is_foreign and not self._topics and not looks_like_envelope(message.payload)
 
     @property
     def place(self) -> str | None:

@@ -50,7 +50,7 @@ class PassedOver:
     count: int
 
 
-def means_envelope(payload: bytes) -> bool:
+def looks_like_envelope(payload: bytes) -> bool:
     """Whether a payload that is no valid envelope was meant to be one, by its fields; True for what
     is no JSON, because a torn envelope may look like that."""
     try:

@@ -11,7 +11,7 @@ import stat
 import threading
 from typing import Final
 
-from eventsrc.progress import tell_progress
+from eventsrc.progress import send_progress_to
 
 from .terminal import Bar, on_output, on_own_bar, people
 
@@ -34,13 +34,13 @@ class ReadingBar:
 
     def __enter__(self) -> "ReadingBar":
         if not self._over:
-            tell_progress(self.show)
+            send_progress_to(self.show)
             on_output(self._on_output)
             on_own_bar(self._on_own_bar)
         return self
 
     def __exit__(self, *_: object) -> None:
-        tell_progress(None)
+        send_progress_to(None)
         on_output(None)
         on_own_bar(None)
         self._stop()

@@ -9,7 +9,7 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from eventsrc.progress import tell_progress
+from eventsrc.progress import send_progress_to
 from projections.database import checkpoints, rebuild, tail
 from projections.database.check import NAMED, check
 from projections.database.connection import Connection, Targets
@@ -59,9 +59,9 @@ def test_a_sound_projection(log: Path, two_databases: Targets) -> None:
     rebuild(log, two_databases, SETTINGS, only="vectors", until=90)
     rebuild(log, two_databases, SETTINGS, only="graph")
     stages: set[str] = set()
-    tell_progress(lambda stage, *_: stages.add(stage))
+    send_progress_to(lambda stage, *_: stages.add(stage))
     graph, vectors = check(log, two_databases, SETTINGS)
-    tell_progress(None)
+    send_progress_to(None)
     assert stages == {"reading the log"}
     assert (graph.sink, graph.differing, graph.next_offset) == ("graph", 0, 120)
     assert (vectors.sink, vectors.differing, vectors.next_offset) == ("vectors", 0, 90)

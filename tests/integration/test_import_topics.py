@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from eventsrc.importers.topics import TopicChoice, means_envelope
+from eventsrc.importers.topics import TopicChoice, looks_like_envelope
 from eventsrc.log import Event, LogWriter
 from eventsrc.system_events import REJECTED_KEY
 from tests.commands import Commands
@@ -145,7 +145,7 @@ def test_a_segment_of_a_log_is_never_judged_by_its_looks(run: Commands) -> None:
     ],
 )
 def test_what_is_meant_as_an_envelope(document: Any, expected: bool) -> None:
-    assert means_envelope(payload(document)) is expected
+    assert looks_like_envelope(payload(document)) is expected
 
 
 @given(st.binary(max_size=60))
@@ -153,8 +153,8 @@ def test_bytes_that_are_no_json_may_be_a_torn_envelope(data: bytes) -> None:
     try:
         json.loads(data)
     except ValueError:
-        assert means_envelope(data)
-    assert means_envelope(b"[" * 100_000)
+        assert looks_like_envelope(data)
+    assert looks_like_envelope(b"[" * 100_000)
 
 
 def test_a_choice_without_patterns_takes_every_topic() -> None:

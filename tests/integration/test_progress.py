@@ -16,7 +16,7 @@ from rich.console import Console
 
 from eventsrc.errors import MapfoldError
 from eventsrc.log import verify_log
-from eventsrc.progress import report_progress, reported, tell_progress, working
+from eventsrc.progress import report_progress, reported, send_progress_to, working
 from projections.cli import COMMANDS, command_line, reading_bar, terminal
 from projections.cli.reading_bar import ReadingBar
 from projections.cli.terminal import Bar, FileBars, output_begins
@@ -119,11 +119,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reports_of(what: Callable[[], object]) -> list[Report]:
     """What is reported while something runs."""
     reports: list[Report] = []
-    tell_progress(lambda *report: reports.append(report))
+    send_progress_to(lambda *report: reports.append(report))
     try:
         what()
     finally:
-        tell_progress(None)
+        send_progress_to(None)
     return reports
 
 
@@ -193,7 +193,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
     monkeypatch.setattr(terminal, "people", console)
     monkeypatch.setattr(reading_bar, "people", console)
     yield text
-    tell_progress(None)
+    send_progress_to(None)
 
 
 def begin(bar: ReadingBar) -> None:
