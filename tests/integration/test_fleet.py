@@ -2,13 +2,14 @@
 
 import json
 import os
+import pickle
 import shlex
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from psycopg import sql
@@ -17,17 +18,40 @@ from psycopg.conninfo import conninfo_to_dict
 from projections.database.connection import connect
 from projections.database.embedded import EmbeddedServer
 from projections.fleet.asking import ask_sites
+from projections.fleet.engine import Ended, Progress, Task
 from projections.fleet.replaying import ChosenSettings, ReplayRequest, replay_site
 from projections.fleet.site_databases import SiteDatabases, exists
 from projections.fleet.sites import Site
 from projections.relocalize import read_question
 from tests.commands import Commands
 from tests.fleets import extend, fleet_databases, write_sites, wrong_rows
+from tests.integration.test_time_travel_commands import InProcess
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.servers import furnish
+from tests.thorough import THOROUGH
 
 EVENTS = 30  # of each site
 NAMES = ['a\'; DROP "x" %s', "büro", "lab"]
+
+
+class OneProcess:
+    """An engine that runs the tasks in this process, where a worker would take a second to start.
+
+    Requests and results are pickled, as between processes.
+    """
+
+    def run(
+        self, task: Task, requests: Sequence[Any], progress: Progress | None = None
+    ) -> Iterator[Ended]:
+        for index, request in enumerate(requests):
+            result = task(pickle.loads(pickle.dumps(request)), progress or (lambda _: None))
+            yield Ended(index, pickle.loads(pickle.dumps(result)), None, 1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
 
 
 class Fleet:
@@ -51,6 +75,20 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, pg_server: EmbeddedServer) -
         yield Fleet(tmp_path_factory.mktemp("fleet"), pg_server, template)
 
 
+@pytest.fixture
+def in_process(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> InProcess:
+    """Runs commands in this process, and so do these with the tasks of sites.
+
+    Under scripts/test_slow workers of `LocalPool` run them.
+    """
+    if not THOROUGH:
+        monkeypatch.setattr("projections.cli.fleet_options.LocalPool", lambda _: OneProcess())
+    monkeypatch.setenv("MAPFOLD_DB", fleet.template)
+    return InProcess(fleet.sites.parent, capfd)
+
+
 @pytest.mark.seconds
 def test_a_replay_makes_the_database_of_each_site_equal_to_its_log(fleet: Fleet) -> None:
     first = fleet.first.json
@@ -69,7 +107,7 @@ def test_a_replay_makes_the_database_of_each_site_equal_to_its_log(fleet: Fleet)
 
 @pytest.mark.seconds
 def test_what_is_up_to_date_is_skipped_and_what_fails_is_named(
-    fleet: Fleet, tmp_path: Path
+    fleet: Fleet, in_process: InProcess, tmp_path: Path
 ) -> None:
     sites = tmp_path / "sites"
     sites.mkdir()
@@ -78,7 +116,7 @@ def test_what_is_up_to_date_is_skipped_and_what_fails_is_named(
     (sites / "bad").mkdir()
     (sites / "bad" / "00000000000000000000.mcap").write_bytes(b"no segment")
 
-    said = fleet.run("fleet", "replay", sites, "--jobs", "1", "--json", code=3)
+    said = in_process("fleet", "replay", sites, "--jobs", "1", "--json", code=3)
 
     outcomes = {entry["site"]: entry["outcome"] for entry in said.json["sites"]}
     assert outcomes == {"bad": "failed", "büro": "up_to_date", "lab": "up_to_date"}
@@ -133,7 +171,9 @@ def test_advised_commands_are_for_the_site(pg_url: str, tmp_path: Path) -> None:
         assert shlex.split(command)[-2:] == ["--db", pg_url]
 
 
-def test_status_is_a_table_of_all_sites(fleet: Fleet, tmp_path: Path) -> None:
+def test_status_is_a_table_of_all_sites(
+    fleet: Fleet, in_process: InProcess, tmp_path: Path
+) -> None:
     listed = tmp_path / "list"
     more = write_log(tmp_path / "more", bridge())
     lines = [f"lab {fleet.sites / 'lab'}", f"new {more}", f"gone {tmp_path / 'gone'}"]
@@ -149,7 +189,7 @@ def test_status_is_a_table_of_all_sites(fleet: Fleet, tmp_path: Path) -> None:
     assert rows[2][:2] == ["gone", "failed"]
     assert f"failed: gone: no log at {tmp_path / 'gone'}" in said.err
 
-    document = fleet.run("fleet", "status", listed, "--jobs", "1", "--json", code=3).json
+    document = in_process("fleet", "status", listed, "--jobs", "1", "--json", code=3).json
     assert document["ok"] is False
     lab, new, gone = document["sites"]
     single = fleet.run("status", fleet.sites / "lab", "--db", fleet.url("lab"), "--json").json
@@ -170,7 +210,7 @@ def _without_ages(entry: dict[str, Any]) -> dict[str, Any]:
     return entry | {"sinks": sinks}
 
 
-def test_verify_reads_all_logs(fleet: Fleet, tmp_path: Path) -> None:
+def test_verify_reads_all_logs(fleet: Fleet, in_process: InProcess, tmp_path: Path) -> None:
     said = fleet.run("fleet", "verify", fleet.sites, "--jobs", "1")
     assert f"3 sites: {3 * EVENTS} events," in said.err
     assert said.err.endswith(": all good\n")
@@ -180,7 +220,7 @@ def test_verify_reads_all_logs(fleet: Fleet, tmp_path: Path) -> None:
     data = bytearray(segment.read_bytes())
     data[len(data) // 2] ^= 1
     segment.write_bytes(bytes(data))
-    found = fleet.run("fleet", "verify", tmp_path / "sites", "--json", code=3)
+    found = in_process("fleet", "verify", tmp_path / "sites", "--json", code=3)
     [entry] = found.json["sites"]
     assert (entry["site"], entry["sound"], entry["error"]) == ("damaged", False, None)
     assert entry["report"] == fleet.run("log", "verify", damaged, "--json", code=3).json
@@ -236,13 +276,15 @@ def test_what_cannot_be_is_refused_before_anything_is_done(fleet: Fleet) -> None
         assert wrong in fleet.run("fleet", "replay", fleet.sites, *options, code=2).err
 
 
-def test_a_server_that_is_not_there_is_said_once(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_server_that_is_not_there_is_said_once(
+    fleet: Fleet, in_process: InProcess, tmp_path: Path
+) -> None:
     sites = write_sites(tmp_path / "sites", ["a", "b"], 5)
     nowhere = f"postgresql:///{{site}}?host={tmp_path}"
     said = fleet.run("fleet", "replay", sites, "--db", nowhere, code=1)
     assert said.err.startswith("mapfold: database a at ")
     assert len(said.err.splitlines()) == 1
-    status = fleet.run("fleet", "status", sites, "--db", nowhere, "--json", code=3).json
+    status = in_process("fleet", "status", sites, "--db", nowhere, "--json", code=3).json
     assert [site["sinks"]["graph"]["condition"] for site in status["sites"]] == ["unreachable"] * 2
 
 

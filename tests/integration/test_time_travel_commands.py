@@ -1,6 +1,7 @@
 """The commands merges, why, diff, bisect and whatif: streams, exit codes, JSON."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ class InProcess:
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(self.folder)
             patch.setattr("sys.argv", ["mapfold", *map(str, args)])
+            # The program sets it, and the tests fork no program of another environment.
+            patch.setenv("OPENBLAS_NUM_THREADS", os.environ.get("OPENBLAS_NUM_THREADS", "1"))
             for stream in ("stdout", "stderr"):  # a program makes its own of them; give them back
                 patch.setattr(sys, stream, getattr(sys, stream))
             try:
