@@ -1,1 +1,1 @@
-"""Reading the constants of fusion by evidence off the map's own revisits."""
+"""Calibration: estimate the constants of fusion by evidence from the map's own revisits."""

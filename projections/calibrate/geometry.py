@@ -1,4 +1,4 @@
-"""Ranges, errors of bearings and poses, and sizes of classes, read off triangulated things."""
+"""Estimate ranges, errors of bearings and poses, and sizes of classes from triangulated things."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ LEAST_OF_A_CLASS = 4
 _MAD = 1.4826
 """A normal distribution's standard deviation, in units of its median absolute deviation."""
 _FEWEST_LEFT = 0.05
-"""Of an observation whose leverage is nearly 1 nothing is left to read: it counts no less."""
+"""Least share of a variance left in a residual: an observation whose leverage is nearly 1 has no
+information."""
 _CAP = 25.0
-"""Squared residuals count up to so many variances: the boxes of other things hardly matter."""
+"""Cap of squared residuals, in variances, which limits the effect of boxes of other things."""
 _ROUNDS = 200
 _PRIOR_RANGES = 7
 _TO_PART = 10.0
@@ -54,10 +55,10 @@ def errors(
 ) -> tuple[Reading, Reading, Reading]:
     """Errors of bearings, of cut ones, and of poses.
 
-    By how far the lines of sight run past the thing: an error of the bearing grows with the
-    distance, one of the pose does not. Where all distances are much the same that does not tell
-    them apart: for each of the three, some observations that have this error only, of the size
-    that the prior expects, take part.
+    Estimated from the distances between lines of sight and the thing: an error of the bearing grows
+    with the range, one of the pose does not. If all ranges are similar the two cannot be separated,
+    so pseudo-observations with only one of the three errors, of the prior's size, are added for
+    each.
     """
     priors = Errors(prior.bearing_rad, prior.bearing_cut_rad, prior.pose_m)
     names = ("bearing_rad", "bearing_cut_rad", "pose_m")
@@ -124,8 +125,8 @@ def sizes(
 
 
 def camera_faults(things: Sequence[Thing], seen: Sightings) -> list[Reading]:
-    """What bearings say about the camera: the share by which they grow too fast from the middle
-    of the picture to its side, and the angle by which all are off. Only what stands out."""
+    """Faults of the camera seen in bearings: the share by which they grow too fast from the middle
+    of the picture to its side, and the angle by which all are off. Only significant ones."""
     if not things:
         return []
     rows = np.concatenate([thing.rows for thing in things])

@@ -1,10 +1,11 @@
-"""Error inflation: how far two halves of a thing's views disagree, in units of their errors.
+"""Error inflation: the disagreement of two halves of a thing's views, in units of their errors.
 
-Lines of sight err together: a box shows the near side of a thing, or what a table leaves of it; a
-stretch of a drive is off as a whole. Their residuals about one position do not tell. Two positions
-do, each from half of the views, split by side and by run: if errors were independent, the square of
-their distance would be 2 in the mean, in units of its variance. The quotient is what the variances
-of bearings and poses are too small by for a fold that counts views as independent.
+Errors of lines of sight are correlated: a box shows the near side of a thing, or the part that a
+table leaves visible; a stretch of a drive is off as a whole. Residuals about one position do not
+show that. Two positions do, each from half of the views, split by side and by run: if errors were
+independent, the square of their distance would be 2 in the mean, in units of its variance. The
+quotient is the factor by which variances of bearings and poses are too small for a fold that treats
+views as independent.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,21 +19,20 @@ from .things import Thing
 
 LEAST_HALF = 3
 MOST = MAX_SPOTS * VIEWS_OF_A_SPOT
-"""So many views an estimate of the fold rests on at most. What more of them agree on does not make
-it surer."""
+"""The most views behind an estimate of the fold; further ones do not reduce its error."""
 _ROUNDS = 6
 _WORST = 20.0
 _UNSURE_M2 = 1.0
 """A half with a larger error is not informative."""
 _LEAST_M2 = 0.04
 _FEW = 10.0
-"""So many things count as much as the assumption that errors are independent."""
+"""The number of things that weighs as much as the prior of independent errors."""
 
 
 def inflation(
     things: Sequence[Thing], seen: Sightings, bearing_rad: float, cut_rad: float, pose_m: float
 ) -> float:
-    """By how much variances are too small, 1 or more."""
+    """The factor by which variances are too small, 1 or more."""
     bearing_var = np.where(seen.cut, cut_rad**2, bearing_rad**2)
     found = [
         square

@@ -1,10 +1,10 @@
-"""How re-localisation would do on a map, and how far its two probabilities are off there.
+"""Scores of re-localisation on a map's own questions, and the correction of its two probabilities.
 
 The map is asked its own questions (`projections.evaluate.own_questions`). A logit z of `known` or
-of `confidence` is compared with whether it was right: the scale and shift that fit best, drawn
-towards those that fit on the maps that the weights were fitted on, because the map's own questions
-are not quite those of another day: what is left out is not the same as what was never there. What
-the map differs by from those maps is its correction.
+of `confidence` is compared with whether it was right: the scale and shift are fitted, drawn towards
+those of own questions on the maps that the weights were fitted on. Own questions differ from those
+of another day, since leaving out a visit is not the same as never having made it, so only the
+difference from those maps is the correction.
 
 Machines agree on the correction. What `known` is computed from is exact, and the line is fitted
 with exactly rounded sums and `projections.exact_functions`. `confidence` and the error of the pose
@@ -52,8 +52,8 @@ _BOUNDS = (Line(0.25, -4.0), Line(4.0, 4.0))
 
 @dataclass(frozen=True, slots=True)
 class OwnScores:
-    """What the map's own questions show. ``answers`` are those of the map without a correction,
-    ``constants`` its correction."""
+    """The results of the map's own questions. ``answers`` are those without a correction,
+    ``constants`` the correction."""
 
     answers: tuple[OwnAnswer, ...]
     constants: LocalizerConstants
@@ -73,13 +73,13 @@ NOT_ASKED = OwnScores((), LocalizerConstants())
 
 
 def read_localiser(view: MapView) -> OwnScores:
-    """Ask a map whose settings have no correction."""
+    """Ask a map, whose settings must have no correction, its own questions."""
     answers = tuple(each for crops in CROPS for each in ask_own_questions(view, crops))
     return OwnScores(answers, correction(answers))
 
 
 def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
-    """The constants with which the map's probabilities are right; the defaults without answers."""
+    """The constants that calibrate the map's probabilities; the defaults without answers."""
     said, is_known = [_stepped(a.answer.known) for a in answers], [a.known for a in answers]
     sure, is_right = [_stepped(a.answer.confidence) for a in answers], [a.correct for a in answers]
     known = _beyond(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
@@ -97,7 +97,7 @@ def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
 
 
 def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmness: float) -> Line:
-    """The line that fits best, drawn towards the usual one."""
+    """The maximum a posteriori line, with the usual line as the prior."""
     pairs = [(z, 1.0 if is_right else 0.0) for z, is_right in zip(logits, right, strict=True)]
     scale, shift = usual
     for _ in range(_ROUNDS):
@@ -124,7 +124,8 @@ def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmne
 
 
 def _beyond(line: Line, usual: Line) -> Line:
-    """What turns a logit of this map into one for which the usual line is right, bounded."""
+    """The correction, bounded: the line that turns a logit of this map into one that the usual line
+    fits."""
     least, most = _BOUNDS
     scale, shift = line.scale / usual.scale, (line.shift - usual.shift) / usual.scale
     return Line(

@@ -1,8 +1,8 @@
-"""How alike looks are: of different things, and of one thing from other sides and in other runs.
+"""Estimate likenesses: of different things, and of one thing from other sides and in other runs.
 
-Different things are the pairs of one picture. The likeness of one thing is read off pairs of
-observations of a thing that qualified. All likenesses but ``different`` are relative:
-(cosine − different) / (1 − different).
+Different things are the pairs of one picture. The likeness of one thing is estimated from pairs of
+observations of a qualified thing. All likenesses but ``different`` are relative: (cosine −
+different) / (1 − different).
 """
 
 import math
@@ -19,7 +19,7 @@ from .sightings import Flags, Floats, Ints, Sightings
 from .things import Thing
 
 KAPPAS = (2.0, 1.0, 4.0)
-"""Those that are tried; where two fit as well, the first, the prior."""
+"""The values that are tried; of equally good ones the first, which is the prior."""
 FEWEST_DIFFERENT = 20
 """Pairs in pictures that the scale of likeness needs."""
 _MOST_IN_A_PICTURE = 24
@@ -87,7 +87,7 @@ def different(
 
 
 def of_things(seen: Sightings, things: Sequence[Thing], scaled_by: float) -> Pairs:
-    """Pairs of observations of one thing; those of a thing count as much as it has
+    """Pairs of observations of one thing; the pairs of a thing weigh as much as its
     observations."""
     first, second, weight = [], [], []
     for thing in things:
@@ -112,11 +112,10 @@ def of_things(seen: Sightings, things: Sequence[Thing], scaled_by: float) -> Pai
 
 
 def same(pairs: Pairs, prior: EvidenceConstants) -> dict[str, Reading]:
-    """What is left of the likeness of one thing from another side and in another run.
+    """The constants of the likeness of one thing from another side and in another run.
 
-    The prior takes part as so many pairs that are as alike as it expects, over all changes of
-    side, half of them of two runs; of κ and of what the side goes by, those are chosen that leave
-    least.
+    The prior is added as pairs with the expected likeness, over all changes of side, half of them
+    of two runs; κ and the kind of side are chosen by the least residual.
     """
     count = round(float(pairs.weight.sum()))
     between = round(float(pairs.weight[pairs.other_run].sum()))

@@ -30,7 +30,7 @@ _SIZE = "sizes_m."
 _EDGES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _DECIMALS = 6
 FEW = 20
-"""Known questions below which the figures say little."""
+"""The number of known questions below which the figures are unreliable."""
 
 
 def readings(calibration: Calibration) -> list[Reading]:
@@ -115,7 +115,7 @@ def _number(value: float | str | None) -> str:
 
 
 def hints(calibration: Calibration) -> Iterator[str]:
-    """What stands in the way of a better calibration, and the next step."""
+    """Obstacles to a better calibration, each with the next step."""
     last, camera = calibration.last, calibration.settings.camera
     if not calibration.observations:
         yield "no observation has a pose and an embedding: all constants are priors"
@@ -148,7 +148,7 @@ def hints(calibration: Calibration) -> Iterator[str]:
         yield _camera_hint(fault, camera.hfov_deg)
     if calibration.settings.fusion != "evidence":
         yield (
-            "the map is folded by the page's rule, so its objects do not depend on these, only"
+            "the map is folded with fusion=page, so its objects do not depend on these, only"
             " re-localisation does; --set fusion=evidence --write switches the log to fusion by"
             " evidence"
         )
@@ -182,7 +182,7 @@ def localiser_document(own: OwnScores) -> dict[str, Any]:
 
 
 def localiser_text(own: OwnScores) -> str:
-    """Two tables: errors and shares, and how often what was said was right."""
+    """Two tables: errors and shares, and the share of right answers by stated probability."""
     if not own.answers:
         return "re-localisation: no keyframe to ask from\n"
     rows = [
@@ -234,7 +234,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _right(said: Sequence[tuple[float, bool]]) -> list[str]:
-    """For each bin the share that was right, and how many there are."""
+    """For each bin the share of right answers, and their number."""
     cells = []
     for low, high in pairwise(_EDGES):
         right = [each for p, each in said if low <= p < high or p == high == 1.0]

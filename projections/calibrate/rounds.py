@@ -1,9 +1,8 @@
 """A calibration: fold the log by evidence, read the constants, fold with them, read again.
 
 The first fold uses the priors, and both readings are drawn towards them, never towards constants
-read before: what a map shows counts once, and a map that was calibrated gives the same constants
-again. Then the map as its settings make it, with the constants read, is asked its own questions
-(`localiser`).
+read before: each observation counts once, and a calibrated map gives the same constants again. Then
+the map as its settings make it, with the constants read, is asked its own questions (`localiser`).
 """
 
 import math
@@ -38,8 +37,8 @@ ROUNDS = 2
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """What one round read: the constants, each with what it rests on, and how many things and
-    observations qualified. ``camera`` is what stands out about the camera."""
+    """The result of one round: the constants with their evidence, and the numbers of qualified
+    things and observations. ``camera`` are significant faults of the camera."""
 
     constants: EvidenceConstants
     readings: tuple[Reading, ...]
@@ -50,7 +49,7 @@ class Round:
 
 
 def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
-    """Read the constants off a map that was folded with ``used``, drawn towards ``prior``."""
+    """Estimate the constants from a map that was folded with ``used``, drawn towards ``prior``."""
     with np.errstate(all="ignore"):  # of nonsense; what is not finite is left to the prior
         return _read(seen, used, prior)
 
@@ -88,7 +87,7 @@ def _read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) ->
 
 
 def _bounded(reading: Reading, group: str | None = None) -> Reading:
-    """The reading with a value that the settings take: a map of nonsense may show more."""
+    """The reading with its value limited to what the settings allow."""
     if not isinstance(reading.value, float):
         return reading
     least, most = _bounds(group or reading.name)
@@ -109,7 +108,7 @@ class Calibration:
     """What a log shows. ``settings`` are those that it was calibrated under; `calibrated` are the
     same with its constants. Counts are of the last fold: keyframes with a pose, observations that
     were fused, Objects, runs. ``unboxed`` observations have an empty box; ``beyond`` boxes reach
-    beyond the picture. ``own`` is what its own questions show."""
+    beyond the picture. ``own`` are the results of its own questions."""
 
     settings: Settings
     last: Round
@@ -131,9 +130,9 @@ class Calibration:
 
 
 Cameras = dict[KeyframeOrdinal, Camera]
-"""Those of the keyframes whose envelopes state one."""
+"""The cameras of keyframes whose envelopes state one."""
 Fold = Callable[[Settings], tuple[MapView, Cameras]]
-"""Folds a log under settings; the view has the embeddings."""
+"""A function that folds a log under settings; the view has the embeddings."""
 
 
 def calibrate(

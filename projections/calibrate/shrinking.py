@@ -4,18 +4,19 @@ import math
 from dataclasses import dataclass
 
 PRIOR_COUNT = 100
-"""A prior counts as much as this many observations: a reading of n has the weight n/(n + 100)."""
+"""The number of observations that a prior weighs as much as: a reading of n has the weight n/(n +
+100)."""
 _DIGITS = 4
 _LEAST = 0.001
-"""Of errors and spreads; no map is better than a millimetre or a milliradian."""
+"""The least errors and spreads: no map is better than a millimetre or a milliradian."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A constant as a map shows it.
+    """A constant estimated from a map.
 
-    ``value`` is what to use, ``seen`` what the map alone says (None where it says nothing),
-    ``prior`` what is usual, ``count`` how many observations or pairs it rests on.
+    ``value`` is the estimate to use, ``seen`` that of the map alone (None without evidence),
+    ``prior`` the usual value, ``count`` the number of observations or pairs behind it.
     """
 
     name: str
@@ -44,7 +45,7 @@ def level(name: str, seen: float, prior: float, count: int) -> Reading:
 
 
 def unread(name: str, prior: float | str | None) -> Reading:
-    """A constant of which the map shows nothing: the prior."""
+    """The reading of a constant without evidence: the prior."""
     return Reading(name, prior, None, prior, 0)
 
 

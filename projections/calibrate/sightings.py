@@ -1,6 +1,6 @@
 """The observations of a folded map as columns: pose, direction, class, box and look of each.
 
-`Sightings` is what all readings are made from. Cosines of looks are exact: unit vectors are whole
+All constants are estimated from `Sightings`. Cosines of looks are exact: unit vectors are whole
 multiples of 2⁻²⁰ (`projections.exact`), so a product of two does not depend on the machine.
 """
 
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 _BEYOND_PX = 2.0
-"""A box that reaches further beyond the picture's border is of another camera."""
+"""Most pixels that a box may reach beyond the picture; more means another camera."""
 
 
 class Row(NamedTuple):

@@ -156,8 +156,8 @@ def check_unused(choice: BridgeChoice) -> None:
 
 
 def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId] | None) -> Bridge:
-    """What records the topics of ``choice``; first makes the envelopes that a recorder which was
-    killed left out. Raises MisuseError for what is no topic, MapfoldError without rosbags."""
+    """The recorder of the topics of ``choice``. First makes the envelopes that a killed recorder
+    left out. Raises MisuseError for an invalid topic, MapfoldError without rosbags."""
     types = MessageTypes()
     recording, topics = recording_of(choice, writer.now_ns(), ledger)
     try:
@@ -177,7 +177,7 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
 def recording_of(
     choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
 ) -> tuple[RosRecording, tuple[str, ...]]:
-    """How envelopes are made, and all topics that are kept."""
+    """The recipe for envelopes, and all topics that are kept."""
 
     def full(topic: str, option: str) -> str:
         return topic_of(choice.namespace, topic, option)
@@ -223,7 +223,7 @@ def recording_of(
 
 
 def used_topics(recording: RosRecording) -> list[str]:
-    """The topics that envelopes and maps are made of."""
+    """The topics from which envelopes and maps are made."""
     found: dict[str, None] = {}
     for stream in recording.streams:
         pose = [stream.pose, stream.covariance, stream.tf, stream.tf_static]
@@ -234,7 +234,7 @@ def used_topics(recording: RosRecording) -> list[str]:
 
 
 def _camera(topic: str) -> str:
-    """The part of a run id that tells apart the runs of several topics of detections."""
+    """The part of a run id that distinguishes the runs of several topics of detections."""
     return topic.strip("/").removesuffix("/detections")
 
 

@@ -88,13 +88,14 @@ def calibrate_command(
 ) -> None:
     """Read the constants of fusion by evidence off the map's own revisits.
 
-    Things seen from several spots tell how far away things usually are, how well boxes and poses
-    point at them, how large they are and how alike their pictures are from other sides and on
-    other days; pairs in one picture tell how alike different things look. Each constant is drawn
-    towards its prior until some hundred observations stand for it.
+    Things seen from several spots give usual distances, errors of boxes and poses, sizes of things,
+    and the likeness of their pictures from other sides and on other days; pairs in one picture give
+    the likeness of different things. Each constant is drawn towards its prior until some hundred
+    observations support it.
 
-    Then the map is asked about its own keyframes, as if it had not been there then: how far off
-    re-localisation would be, and how much its two probabilities have to be corrected on this map.
+    Then questions from the map's own keyframes, each asked with the observations around it left out
+    of the map, give the errors of re-localisation and the correction of its two probabilities on
+    this map.
 
     With --write every fold of the log uses them from then on, with the other settings in force and
     those of --set; `mapfold edit LOG undo` takes it back.

@@ -1,7 +1,7 @@
 """``mapfold replay`` and ``mapfold tail``: rebuild the databases from a log, and keep
 them at its end.
 
-A replay prints what was left out and why.
+A replay prints how many events were left out, and why.
 """
 
 import contextlib
@@ -55,7 +55,8 @@ from .terminal import Bar, emit, finish, say, say_metrics
 def left_out(
     log: Path, settings: Settings, report: RebuildReport, logged: Settings | None = None
 ) -> str | None:
-    """What a replay left out of the map and what to do about it, in one line; None for nothing.
+    """One line about keyframes and observations that a replay left out, with advice; None if there
+    are none.
 
     ``logged`` are the settings that the log names.
     """
@@ -117,14 +118,14 @@ def _settings_for(settings: Settings, first: ForeignEmbedding) -> Settings:
 
 
 class Sinks(StrEnum):
-    """What ``--only`` takes."""
+    """The values of ``--only``."""
 
     graph = "graph"
     vectors = "vectors"
 
 
 class Loaders(StrEnum):
-    """What ``--loader`` takes."""
+    """The values of ``--loader``."""
 
     copy = "copy"
     insert = "insert"

@@ -196,7 +196,7 @@ def detect(
         typer.Option(
             metavar="METRES",
             min=0.0,
-            help="How far from the last keyframe a picture is the next one.",
+            help="Distance from the last keyframe at which a picture is the next one.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = MOVED_M,
@@ -205,7 +205,7 @@ def detect(
         typer.Option(
             metavar="DEGREES",
             min=0.0,
-            help="After what turn it is one.",
+            help="Turn since the last keyframe at which it is one.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = TURNED_DEG,
@@ -214,7 +214,8 @@ def detect(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help=f"After how long it is one; 0: at once. [default: {AFTER_S:g}; without poses 0]",
+            help="Time since the last keyframe after which it is one; 0: at once."
+            f" [default: {AFTER_S:g}; without poses 0]",
             rich_help_panel=_KEYFRAMES,
             show_default=False,
         ),
@@ -225,7 +226,7 @@ def detect(
             metavar="DEGREES",
             min=1.0,
             max=170.0,
-            help="Horizontal field of view of the camera, to be told in the envelopes.",
+            help="Horizontal field of view of the camera, stated in the envelopes.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = None,

@@ -94,7 +94,8 @@ def spool_path() -> Path:
 
 
 def stdin_until(stop: threading.Event) -> Callable[[int], bytes]:
-    """Reads up to so many bytes of stdin, none at its end or once ``stop`` is set."""
+    """A function that reads up to a number of bytes from stdin; it returns none at the end or once
+    ``stop`` is set."""
 
     def read(size: int) -> bytes:
         number = sys.stdin.fileno()

@@ -1,4 +1,4 @@
-"""What all kinds of `mapfold edit` share: options, recording a command, and what is printed."""
+"""Common parts of all kinds of `mapfold edit`: options, recording a command, and its report."""
 
 import dataclasses
 import functools
@@ -104,9 +104,9 @@ def kind_of(
 ) -> Callable[[Callable[..., MakeCommand]], Callable[..., MakeCommand]]:
     """Add a subcommand to ``app``.
 
-    The function takes the arguments of the kind and returns what makes the command; the options
-    that all kinds share are added to its own. Without ``settings`` the options ``--set`` and
-    ``--settings`` are the function's.
+    The function takes the arguments of the kind and returns the maker of the command; the options
+    that all kinds share are added. Without ``settings`` the options ``--set`` and ``--settings``
+    are those of the function.
     """
     shared = {
         key: value
@@ -190,7 +190,7 @@ def _show(made: Made, common: _Common) -> None:
 
 
 def _report(made: Made, common: _Common) -> None:
-    """Print where a command is, and what it changed in the map it was made from."""
+    """Print the offset of a command, and its effect on the map that it was made from."""
     keep_effect(made)
     if common.json:
         emit(recorded_document(made))
@@ -199,8 +199,8 @@ def _report(made: Made, common: _Common) -> None:
 
 
 def keep_effect(made: Made) -> None:
-    """Keep the effect of a recorded command for `mapfold edits`, and say which commands have none
-    any more because of it."""
+    """Cache the effect of a recorded command for `mapfold edits`, and report commands that lost
+    their effect by it."""
     outcome = made.outcome
     if outcome.effect is not None and made.offset == made.current.end:
         EffectCache(made.current).put(outcome.change, outcome.effect)
@@ -208,7 +208,7 @@ def keep_effect(made: Made) -> None:
 
 
 def recorded_document(made: Made) -> dict[str, Any]:
-    """JSON of a recorded command: where it is and what it changed."""
+    """JSON of a recorded command: its offset and its effect."""
     effect = made.outcome.effect
     document = {
         "offset": made.offset,
@@ -222,7 +222,7 @@ def recorded_document(made: Made) -> dict[str, Any]:
 
 
 def recorded_text(made: Made) -> str:
-    """A line on a recorded command: where it is and what it changed."""
+    """A line on a recorded command: its offset and its effect."""
     effect = made.outcome.effect
     when = "was recorded before" if made.repeated else "recorded"
     if effect is None:
@@ -236,7 +236,7 @@ def recorded_text(made: Made) -> str:
 
 
 def _say_void(made: Made) -> None:
-    """Say which commands have no effect any more."""
+    """Report commands that have no effect any more."""
     for recorded, why in made.outcome.void:
         say(void_text(recorded, why))
 

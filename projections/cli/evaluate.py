@@ -1,4 +1,4 @@
-"""`mapfold evaluate`: how good are the places, the objects and the re-localisation."""
+"""`mapfold evaluate`: scores of places, objects and re-localisation."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -82,15 +82,15 @@ _LABEL = 30
 def evaluate(
     map_logs: Annotated[
         list[Path],
-        typer.Option("--map", metavar="LOG", help="Log the map is made of; several are maps each."),
+        typer.Option("--map", metavar="LOG", help="Log of a map; may be repeated."),
     ],
     query_logs: Annotated[
         list[Path] | None,
-        typer.Option("--query", metavar="LOG", help="Log to ask from; several are fine."),
+        typer.Option("--query", metavar="LOG", help="Log to ask from; may be repeated."),
     ] = None,
     truth_files: Annotated[
         list[Path] | None,
-        typer.Option("--truth", metavar="FILE", help="Truth of map and query runs; several."),
+        typer.Option("--truth", metavar="FILE", help="Truth of the runs; may be repeated."),
     ] = None,
     until: Annotated[
         str, typer.Option("--at", metavar="W", help=f"Fold the map's log only to here: {W}.")
@@ -125,9 +125,9 @@ def evaluate(
     """How good places, objects and re-localisation are.
 
     Scores against the truth, of re-localisation with one to five crops a question, and with one to
-    five pictures (views) of up to three crops. Beside them what the plain recipe does (the median
-    position of the ten most similar observations) and the best cosine alone. With several maps
-    each is asked every question, and the worst one is named.
+    five pictures (views) of up to three crops. Beside them the scores of the plain recipe (the
+    median position of the ten most similar observations) and of the best cosine alone. With several
+    maps each is asked every question, and the worst one is named.
 
     With --self the map is asked about its own keyframes, as if it had not been there then.
     """
@@ -186,12 +186,12 @@ def _refuse_alone(method: Method, hfov: float | None, image: str | None) -> None
 
 _Scored = Sequence[tuple[Path, Mapping[str, Any]]]
 _JUDGED_BY = "3"
-"""Crops of the questions by which the worst map is found; of a map without such questions the
-fewest of which it has some."""
+"""Number of crops of the questions by which the worst map is chosen; for a map without such
+questions its smallest number."""
 
 
 class Judged(NamedTuple):
-    """A map and its errors, and the plain recipe's, with ``crops`` crops a question."""
+    """A map with its errors and the plain recipe's, for questions of ``crops`` crops."""
 
     log: Path
     crops: str
@@ -200,12 +200,12 @@ class Judged(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """The median error as a part of the plain recipe's."""
+        """The ratio of the median error to the plain recipe's."""
         return float(self.ours["p50"] / self.plain["p50"])
 
 
 def _document(found: _Scored) -> Mapping[str, Any]:
-    """One map's scores; of several those of each, and the worst."""
+    """The scores of one map; for several maps those of each, and the worst map."""
     if len(found) == 1:
         return found[0][1]
     worst = worst_of(found)
@@ -216,8 +216,8 @@ def _document(found: _Scored) -> Mapping[str, Any]:
 
 
 def worst_of(found: _Scored) -> Judged | None:
-    """The map whose median error is greatest beside the plain recipe's; by the maps' own questions
-    where no others were asked of things that a map has."""
+    """The map whose median error is greatest relative to the plain recipe's; by the maps' own
+    questions if there are no other questions about known things."""
     return _worst_by("relocalization", found) or _worst_by("self", found)
 
 
@@ -227,7 +227,7 @@ def _worst_by(group: str, found: _Scored) -> Judged | None:
 
 
 def _judged(log: Path, columns: Mapping[str, Any]) -> Judged | None:
-    """None where no question has errors to compare."""
+    """A map judged by some scores; None if no question has errors to compare."""
     for crops in sorted(columns, key=lambda crops: (crops != _JUDGED_BY, int(crops))):
         ours, plain = columns[crops]["pose_error_m"], columns[crops]["plain"]["pose_error_m"]
         if ours["p50"] is not None and plain["p50"]:
@@ -247,9 +247,9 @@ def worst_text(found: _Scored) -> str:
 
 
 def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
-    """Say so when none of a map's keyframes and observations has truth; None is no scores.
+    """Warn if none of a map's keyframes and observations has truth; None stands for no scores.
 
-    Without the warning the scores of nothing look perfect.
+    Without the warning, scores over no things would look perfect.
     """
     if scores is None or scores["places"]["rooms"] or scores["objects"]["instances"]:
         return

@@ -163,7 +163,8 @@ def export(
 
 
 def _recorder(name: str, told_apart_by: str) -> Callable[[RecordedFold, Path], int]:
-    """What writes the recordings of an option. Raises MisuseError where its extra is missing."""
+    """The function that writes the recordings of an option. Raises MisuseError if its extra is not
+    installed."""
     try:
         if name == "foxglove":
             from projections.foxglove.recording import write_recording

@@ -55,7 +55,7 @@ def _row(site: Site, found: SiteStatus) -> list[str]:
 
 
 def _sink_cell(sink: SinkStatus) -> str:
-    """Condition, and how many events behind; parked events, which were left out."""
+    """The condition, the number of events behind, and that of parked events."""
     cell: str = sink.condition
     if sink.lag:
         cell = f"behind by {sink.lag:,}" if cell == "behind" else f"{cell}, behind by {sink.lag:,}"

@@ -89,7 +89,7 @@ def import_(
         list[str] | None,
         typer.Option(
             metavar="GLOB",
-            help="Only topics (keys) like this, such as 'tb/*'; may be given again.",
+            help="Only topics (keys) that match this, such as 'tb/*'; may be repeated.",
         ),
     ] = None,
     detections: DetectionsOption = None,

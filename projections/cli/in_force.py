@@ -1,6 +1,6 @@
-"""Options of the running command, for the command lines that its messages advise. Such a line needs
-the same log, settings and databases, or it does something else: a fault that a check found under
-``--settings F`` is repaired under these settings only.
+"""Add the running command's options to the command lines that its messages advise. Such a line
+needs the same log, settings and databases: a fault that a check found under ``--settings F`` is
+repaired only under these settings.
 """
 
 import inspect
@@ -21,15 +21,16 @@ _CARRIED: Final = (
     "--connect",
     "--zenoh-config",
 )
-"""In the order in which they are added."""
+"""The options that are added, in order."""
 _DATABASES: Final = frozenset({"--db", "--vector-db"})
 _ANSWERS_OTHERS: Final = frozenset({"serve", "ui"})
-"""Commands whose messages also go to other machines, which must not learn the databases' URLs."""
+"""Commands whose messages are also sent to other machines, which must not get the databases'
+URLs."""
 _LOG: Final = "log"
 _CONTEXT: Final = "running_context"
 
 _running: list[Any] = []
-"""The click contexts of the commands that run: one, or none."""
+"""The click contexts of running commands: one, or none."""
 
 
 def remember_running(app: typer.Typer) -> None:

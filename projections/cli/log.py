@@ -128,7 +128,7 @@ def _map_text(head: OccupancyMapEvent) -> str:
 
 
 class RangeNotes:
-    """Notes on what `log cat` showed: events outside the times asked for, and keys without events.
+    """Notes on what `log cat` showed: events outside the requested times, and keys without events.
 
     A range between two times is one of offsets: from the first event stamped then or later to the
     last one stamped then or earlier. Where stamps run backwards in between (runs of last year
@@ -256,7 +256,7 @@ def cat(
     from_: Annotated[str, typer.Option("--from", metavar="W", help="First event.")] = "0",
     to: Annotated[str, typer.Option("--to", metavar="W", help="End of the range.")] = "end",
     key: Annotated[
-        list[str] | None, typer.Option(metavar="K", help="Only this key; may be given again.")
+        list[str] | None, typer.Option(metavar="K", help="Only this key; may be repeated.")
     ] = None,
     skip_damage: Annotated[
         bool, typer.Option("--skip-damage", help="Report unreadable offsets and continue (exit 3).")
@@ -296,8 +296,8 @@ def cat(
 
 
 def _end(reader: LogReader, to: str, start: Offset, on_gap: OnGap | None) -> Offset | None:
-    """Where a range from offset ``start`` on ends. None for the end of the log, and if damage was
-    met in the search for ``to``: reading shows the events before it and stops there."""
+    """The end of a range from offset ``start`` on. None for the end of the log, and if the search
+    for ``to`` met damage: reading then shows the events before the damage."""
     if to == "end":
         return None
     if on_gap is not None:

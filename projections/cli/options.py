@@ -100,7 +100,7 @@ def settings_from(
 def settings_of(
     file: Path | None, assignments: list[str] | None
 ) -> Callable[[Corrections], Settings]:
-    """`settings_from` for corrections that are not known yet. Raises SettingsError at once."""
+    """`settings_from` as a function of corrections, for later. Raises SettingsError at once."""
     settings_from(file, assignments)
     return partial(settings_from, file, assignments)
 
@@ -305,7 +305,8 @@ def check_picture(out: Path | None) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Make the folder of a file that is written inside; what fails is a MisuseError."""
+    """Make the folder of a file that is written inside the block; an OSError becomes a
+    MisuseError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield

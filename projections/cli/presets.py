@@ -16,7 +16,7 @@ from typer.models import OptionInfo
 from projections.settings import PRESETS
 
 Preset = StrEnum("Preset", list(PRESETS))  # type: ignore[misc]
-"""What ``--preset`` takes."""
+"""The values of ``--preset``."""
 
 PresetOption = Annotated[
     Preset | None,

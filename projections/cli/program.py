@@ -6,9 +6,9 @@ are imported, and OpenBLAS gets one thread: the matrix products here are too sma
 
 Streams. All three are open: where one was closed (``2>&-``), the next file to be opened, a log's
 for example, would get its number and everything that is written to that stream. A failed write to
-stdout is OutputLost, so that a full disk there is not taken for a fault of the log that is read; a
-reader that has left stays a BrokenPipeError. A failed write to stderr is ignored: a recorder goes
-on when the disk of its messages is full or its terminal is gone.
+stdout is OutputLost, so that a full disk there is not reported as a fault of the log that is read;
+if the reader has closed the pipe it stays a BrokenPipeError. A failed write to stderr is ignored: a
+recorder goes on when the disk of its messages is full or its terminal is gone.
 
 Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted ·
 141 the reader of stdout left before everything was printed · 143 terminated. typer itself would
@@ -80,7 +80,7 @@ def start(
 
 
 def _needed(commands: Mapping[str, str]) -> Mapping[str, str]:
-    """The command that was asked for, or that a shell wants to be completed; all if it is none."""
+    """The requested command, or the one that a shell completes; all commands if it is none."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if COMPLETION_VARIABLE in os.environ:
         typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
@@ -187,7 +187,7 @@ class _Stderr(io.FileIO):
 
 
 def secure_streams() -> None:
-    """Make stdin, stdout and stderr as described above, for the life of the program."""
+    """Replace stdin, stdout and stderr as described above, until the program ends."""
     for number in range(3):
         _open_if_closed(number)
     sys.stdout = _secured(sys.stdout, _Stdout)

@@ -1,4 +1,5 @@
-"""The progress bar of every command: what `eventsrc.progress` reports, once it takes a second.
+"""The progress bar of every command: shows the reports of `eventsrc.progress` once work takes a
+second.
 
 Commands need no code for it. It is shown on stderr if that is a terminal, and hidden while a
 command shows a bar of its own (`terminal.Bar`, `terminal.FileBars`). It ends once data is written
@@ -16,11 +17,11 @@ from eventsrc.progress import send_progress_to
 from .terminal import Bar, on_output, on_own_bar, people
 
 DELAY_S: Final = 1.0
-"""What takes less gets no bar."""
+"""Shorter work gets no bar."""
 
 
 class ReadingBar:
-    """Shows what is reported while inside this context manager."""
+    """A context manager that shows the progress reported inside it."""
 
     def __init__(self, delay_s: float = DELAY_S) -> None:
         self._delay_s = delay_s

@@ -21,7 +21,7 @@ from .terminal import emit, finish, people, say
 
 EVERY_S = 1.0
 _FEW_UNSEALED = 3
-"""Up to this many unsealed segments are normal and not shown."""
+"""The number of unsealed segments up to which none are shown, as it is normal."""
 
 
 class RecorderStatus:
@@ -115,7 +115,7 @@ def show_status(log: Path) -> Iterator[Callable[[RecorderReport], None]]:
 
 
 def say_restart(log: Path, writer: LogWriter) -> None:
-    """Print what was recovered and what was cut off, if the last writer did not finish."""
+    """Print the recovered and the cut-off events, if the last writer did not finish."""
     found = writer.restart
     if not (found.recovered_segments or found.torn_bytes or found.torn_events):
         return
@@ -187,7 +187,7 @@ def unwritten_text(report: RecorderReport) -> str:
 
 
 def unused_text(report: RecorderReport) -> list[str]:
-    """Lines about messages of ROS that were kept and that nothing was made of."""
+    """Lines about messages of ROS that were kept but not used for envelopes."""
     lines = [
         visible(f"{topic}: {counted(count, 'message')} kept that cannot be read: {reason}")
         for topic, count, reason in report.unread

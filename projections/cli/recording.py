@@ -199,7 +199,7 @@ def record(
 
 
 def _crop_keys(given: list[str] | None) -> tuple[str, ...]:
-    """What ``--crops`` names. Raises MisuseError."""
+    """The key expressions of ``--crops``. Raises MisuseError."""
     keys = tuple(filter(None, DEFAULT_CROPS if given is None else given))
     for key in keys:
         if not key.endswith("/*") or "*" in key[:-1]:

@@ -1,7 +1,7 @@
-"""`mapfold relocalize`: which Place is this, from a few object crops or classes.
+"""`mapfold relocalize`: find a robot's Place and pose from a few object crops or classes.
 
-With ``--track`` it answers questions one after the other, each with a line of JSON. A line that is
-no question is answered with an error, and the next one is read.
+With ``--track`` it answers a stream of questions, each with a line of JSON. An invalid line is
+answered with an error.
 """
 
 import contextlib
@@ -183,7 +183,7 @@ def _first_line(answer: Answer) -> str:
 
 
 def _known_text(answer: Answer) -> str:
-    """How likely the things shown are in the map."""
+    """The probability that the things shown are in the map, as text."""
     return f"known {answer.known:.2f}"
 
 

@@ -143,7 +143,7 @@ def serve(
         typer.Option(
             "--token-file",
             metavar="FILE",
-            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; must be there unless"
+            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
             " --http is on loopback.",
         ),
     ] = None,

@@ -1,4 +1,4 @@
-"""`mapfold help` and `mapfold completion`: what a shell needs of the program itself."""
+"""`mapfold help` and `mapfold completion`: help texts and shell completion."""
 
 import sys
 from enum import StrEnum

@@ -1,6 +1,6 @@
 """Re-localise run B: questions of a few crops without a pose, and the errors of the answers.
 
-The question is not chosen for its answer: it is the picture from around the start with the most
+The question is chosen regardless of the answer: the picture near the start with the most
 detections, counting at most three; of several the first. It is asked with the most confident of
 them, then with two, then three. Afterwards every keyframe of the run that shows anything is asked
 once, to measure single questions.
@@ -27,7 +27,7 @@ from .folder import DemoFolder
 
 MOST_CROPS: Final = 3
 NEAR_M: Final = 1.5
-"""An estimate this near counts as right; the same bound the answer's confidence is about."""
+"""Error up to which an estimate counts as right; the answer's ``confidence`` has the same bound."""
 
 
 @dataclass(frozen=True, slots=True)

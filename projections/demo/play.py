@@ -34,7 +34,7 @@ from .recording import record_run
 from .report import DemoResult, result_document
 
 SETTINGS: Final = Settings().with_assignments(PRESETS["rooms"])
-"""The default chains the whole house."""
+"""With the default settings the whole house becomes one place."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
-"""Waiting for something on a machine of any speed: as long as there is progress.
+"""Wait on a machine of any speed, as long as there is progress.
 
-On a busy machine everything takes longer, so a deadline would end what is going well. Waiting ends
-when nothing that is observed has changed for a while.
+On a busy machine a fixed deadline would end work that proceeds. Waiting ends when the observed
+values have not changed for a while.
 """
 
 import os
@@ -18,7 +18,7 @@ only waits for messages uses less."""
 
 
 class Progress:
-    """Whether what ``observe`` returns still changes."""
+    """Watches whether the values of ``observe`` still change."""
 
     def __init__(
         self,
@@ -55,8 +55,8 @@ def _file_size(file: Path) -> int:
 
 
 def cpu_steps(pid: int) -> int:
-    """How often a process has used `LEAST_CPU_S` of processor time; 0 where the system does not say
-    (only Linux does), and when the process has ended."""
+    """The processor time of a process in units of `LEAST_CPU_S`; 0 on systems other than Linux, and
+    when the process has ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text("ascii", "replace").rpartition(")")[2].split()
         ticks = int(fields[11]) + int(fields[12])

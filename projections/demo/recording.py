@@ -128,7 +128,7 @@ class Children:
 
 _ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
 _WAIT_S: Final = 600
-"""How long the publisher waits for the recorder, which is there; it makes progress meanwhile."""
+"""Seconds that the publisher waits for the recorder, which is running already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +166,8 @@ def record_run(
     targets: Targets,
     settings: Settings,
 ) -> tuple[Recorded, Followed]:
-    """Have run A published, recorded into the folder's log behind what is in it, and tailed into
-    the databases."""
+    """Publish run A, record it into the folder's log after the events there, and tail it into the
+    databases."""
     started = time.monotonic()
     with LogReader(folder.log) as reader:
         before = reader.next_offset
@@ -238,7 +238,7 @@ class BackgroundTail:
 
     @property
     def reached(self) -> Offset:
-        """The offset before which all is in the databases."""
+        """The number of events that are in the databases."""
         return self._commits[-1][0] if self._commits else FIRST_OFFSET
 
     def wait_for(self, end: Offset) -> Followed:

@@ -86,7 +86,7 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
 
 
 def tell_types(view: MapView) -> Iterator[str]:
-    """What kinds of rooms the places seem to be."""
+    """The likely types of the places."""
     kinds = ((place, view.type_of(place.ordinal)) for place in view.places.values())
     told = [
         f"{_short(place.place_id)} {kind.type} {kind.probability:.0%}".replace("%", " %")

@@ -149,7 +149,7 @@ def _rectangle(canvas: Canvas, box: Box, fill: str, edge: str, zorder: int) -> N
 _AROUND_M: Final = 1.5
 """Walls this far from the drive make the picture larger; those beyond are drawn where they fit."""
 _MOST_CELLS: Final = 1_600
-"""In a row or column of the image."""
+"""Most cells in a row or column of the image."""
 
 Spots = list[tuple[float, float]]
 
@@ -218,7 +218,7 @@ def _in_map_frame(
 def _visible(
     given: OccupancyMap, bounds: tuple[float, float, float, float]
 ) -> tuple[int, int, NDArray[np.uint8]]:
-    """First row, first column and cells of the part of the map that lies in the bounds."""
+    """First row, first column and cells of the part of the map inside the bounds."""
     x0, y0, x1, y1 = bounds
     x, y, yaw = given.origin
     cos, sin = np.cos(yaw), np.sin(yaw)

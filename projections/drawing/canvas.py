@@ -27,7 +27,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 _MARGIN_M = 0.35
 _AROUND_POSES_M = 0.4
-"""So that a place's region, which reaches 0.55 m around its keyframes, is whole."""
+"""Margin in metres: a place's region reaches 0.55 m around its keyframes."""
 _WIDTH_IN = 13.0
 _HEAD_IN, _FOOT_IN = 0.7, 0.5
 _DPI = 120

@@ -1,8 +1,8 @@
 """Label placement: positions at which labels do not cover each other. No drawing here.
 
 Greedy, the most important label first. Each tries positions on rings around its anchor, nearest
-ring first, and gets the first box that overlaps no occupied one. A label for which there is none
-within the rings is left out; the caller tells how many were.
+ring first, and gets the first box that overlaps no occupied one. A label without a free box within
+the rings is left out; the caller reports how many were.
 """
 
 import math

@@ -26,7 +26,7 @@ from .scene import (
 )
 
 DOT_M = 0.04
-"""What an object's dot occupies to each side."""
+"""Half the size of the box that an object's dot occupies."""
 _LABEL_PT = 8.0
 _WIDE_M = 2.0
 """Ellipses wider than this are drawn faintly."""
@@ -49,7 +49,7 @@ def draw_adjacency(canvas: Canvas, view: MapView) -> None:
 
 
 def draw_place_names(canvas: Canvas, view: MapView) -> None:
-    """Each place's name on its centroid, in its colour, and what kind of room it seems to be."""
+    """Each place's name on its centroid, in its colour, with its likely type."""
     names = place_badges(view)
     for ordinal, place in view.places.items():
         centroid = place.centroid_x, place.centroid_y

@@ -1,8 +1,7 @@
 """A map's picture: layers from the floor up, fixed text before labels that can be moved.
 
-Objects are drawn where they stand if the fold has estimates of that, as fusion by evidence does;
-else at the page's position, which is where the *robot* was when it saw them (mean). Their labels
-are moved to stay legible, and a thin line leads back.
+Objects are drawn at their estimated position under fusion by evidence; else at the mean position of
+the *robot* when it saw them. Their labels are moved to stay legible, and a thin line leads back.
 """
 
 from collections.abc import Iterable, Sequence

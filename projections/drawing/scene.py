@@ -1,4 +1,5 @@
-"""What a picture shows: floor plan, lost robot, merges; and from the map groups, names, drives.
+"""The contents of a picture: floor plan, lost robot, merges; and from the map groups, names,
+drives.
 
 Lengths in metres, angles in radians.
 """
@@ -14,7 +15,7 @@ from projections.model.view import MapView
 
 _NEAR_M = 1.0
 _MOST_LETTERS = 24
-"""Of a place's name; longer ones are cut."""
+"""Most letters of a place's name; longer names are cut."""
 
 Line = tuple[float, float, float, float]
 Box = tuple[float, float, float, float]
@@ -127,8 +128,8 @@ def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None
 
 
 def place_names(view: MapView) -> dict[int, str]:
-    """What to write on each place, also absorbed ones: the name that a command gave it, else its
-    short id: p3, or run_p3 where two runs have a p3. Of places with one name each has its id too.
+    """The label of each place, absorbed ones too: the name that a command gave it, else its short
+    id: p3, or run_p3 where two runs have a p3. Places that share a name have their ids too.
     """
     short = {p.ordinal: p.place_id.rpartition("_")[2] for p in view.all_places}
     used = Counter(short.values())
@@ -147,7 +148,7 @@ def place_names(view: MapView) -> dict[int, str]:
 
 
 def place_badges(view: MapView) -> dict[int, str]:
-    """`place_names`, and below an id what kind of room it is, where that is known."""
+    """`place_names`, with the type of the place below an id, if it is known."""
     labels = place_names(view)
     for place in view.places.values():
         kind = view.type_of(place.ordinal) if place.name is None else None

@@ -85,7 +85,7 @@ class CurrentMap:
         return self._view
 
     def set_view(self, view: MapView) -> None:
-        """Take ``view`` for the map instead of folding it."""
+        """Use ``view`` as the map instead of folding it."""
         self._view = view
 
     @cached_property
@@ -114,7 +114,7 @@ class CurrentMap:
 
     @cached_property
     def _objects(self) -> dict[str, ObjectRecord]:
-        """Those of the map, and the absorbed."""
+        """The objects of the map and the absorbed ones, by id."""
         return {o.object_id: o for o in self.view.all_objects}
 
     def run(self, run_id: str) -> list[KeyframeRecord]:
@@ -164,7 +164,8 @@ class CurrentMap:
         return keyframe
 
     def _named(self, name: str) -> PlaceOrdinal | None:
-        """The place that is called so; None if none is. Raises MisuseError if several are."""
+        """The place with this name; None if there is none. Raises MisuseError if there are
+        several."""
         named = [place for place in self.view.places.values() if place.name == name]
         if len(named) > 1:
             ids = ", ".join(place.place_id for place in named)

@@ -1,4 +1,4 @@
-"""What a command changes in the map of the events before it: counts, and the whole difference."""
+"""The effect of a command on the map of the events before it: counts, and the whole difference."""
 
 import contextlib
 import json
@@ -26,12 +26,12 @@ from .current import CurrentMap
 _CACHE = "effects.json"
 _COMPARING = "comparing the maps"
 _VERSION = 1
-"""Of the effects in it; a fold that gives another map of the same log needs another."""
+"""The version of cached effects; to be raised when a fold gives another map of the same log."""
 _MAX_CACHE_BYTES = 16 * 1024 * 1024
 
 
 class Effect(NamedTuple):
-    """How many places, objects and keyframes are new, gone or changed."""
+    """The numbers of places, objects and keyframes that are new, gone or changed."""
 
     places: int
     objects: int
@@ -53,9 +53,9 @@ class Effect(NamedTuple):
 
 
 class Change:
-    """A map, and the map that it becomes when its log has other commands.
+    """The change from a map to that of the same log with other commands.
 
-    Folds only what it must: names of places alone need no fold.
+    Folds only if needed: names of places alone need no fold.
     """
 
     def __init__(self, current: CurrentMap, commands: Sequence[RecordedCommand]) -> None:
@@ -66,7 +66,7 @@ class Change:
 
     @classmethod
     def by(cls, current: CurrentMap, command: Command) -> "Change":
-        """The change by one more command."""
+        """The change made by one further command."""
         return cls(current, [*current.commands, RecordedCommand(current.end, command)])
 
     @property
@@ -95,7 +95,7 @@ class Change:
         return same_settings and folds[0] == folds[1]
 
     def effect(self) -> Effect:
-        """How much changes."""
+        """The counts of changes."""
         before = self.current.corrections
         if self._same_fold(before.without_names(), self.corrections.without_names()):
             names = [_names(self.current, c) for c in (before, self.corrections)]
@@ -103,7 +103,7 @@ class Change:
         return effect_of(self.current.view, self.after)
 
     def difference(self) -> Difference:
-        """All that changes."""
+        """The whole difference."""
         before, after = self.current.view, self.after
         with working(_COMPARING):
             return difference_of(before, after, {}, ())
@@ -132,7 +132,7 @@ def _differing(first: dict[Any, Any], second: dict[Any, Any]) -> set[Any]:
 
 
 class EffectCache:
-    """Effects that were worked out before: ``<log>.snapshots/effects.json``, safe to delete."""
+    """A cache of effects: ``<log>.snapshots/effects.json``, safe to delete."""
 
     def __init__(self, current: CurrentMap) -> None:
         self._note = current.note
@@ -161,7 +161,8 @@ class EffectCache:
                 beside.unlink(missing_ok=True)
 
     def _read(self) -> dict[str, Effect]:
-        """What is kept; nothing if the file is of another log or was not written by this code."""
+        """The cached effects; none if the file is of another log or was not written by this
+        code."""
         try:
             if self._path.stat().st_size > _MAX_CACHE_BYTES:
                 return {}

@@ -75,7 +75,7 @@ _OPTIONS = {"command_id": "--command-id", "issued_by": "--issued-by", "reason": 
 
 
 def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> NamePlace:
-    """The place is called ``name``."""
+    """The command that names a place."""
     anchor = current.find_place(place)
     number = current.place_of(anchor)
     if any(unicodedata.category(character) == "Cf" for character in name):
@@ -90,7 +90,7 @@ def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> Name
 
 
 def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> KeepApart:
-    """The two places are never one."""
+    """The command that keeps two places apart."""
     pair = _two_places(current, first, second)
     if tuple(sorted(pair)) in current.corrections.apart:
         raise EditRefused(f"{first} and {second} are kept apart already")
@@ -99,7 +99,7 @@ def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Ke
 
 
 def undo_merge(current: CurrentMap, stamp: Stamp, offset: int) -> UndoMerge:
-    """The places that the merge at ``offset`` made one are never one."""
+    """The command that keeps apart the places merged at ``offset``."""
     anchors = merged_at(current, offset)
     check_apart(current, anchors)
     return build(
@@ -108,7 +108,7 @@ def undo_merge(current: CurrentMap, stamp: Stamp, offset: int) -> UndoMerge:
 
 
 def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
-    """The two places are one."""
+    """The command that joins two places."""
     pair = _two_places(current, first, second)
     if current.place_of(pair[0]) == current.place_of(pair[1]):
         raise EditRefused(
@@ -120,7 +120,7 @@ def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
 
 
 def _check_floor(what: str, one: str | None, other: str | None) -> None:
-    """Raises EditRefused for things on two floors, which are never one."""
+    """Raise EditRefused for things on two floors, which can never be one."""
     if one != other:
         names = " and ".join(
             "none" if name is None else repr(visible(name)) for name in (one, other)
@@ -143,7 +143,7 @@ def _anchor(keyframe: Keyframe) -> Anchor:
 
 
 def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> SameObject:
-    """The two objects are one."""
+    """The command that makes two objects one."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.object == other.object:
         raise EditRefused(f"{first} and {second} are one object already")
@@ -162,7 +162,8 @@ def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> S
 def different_objects(
     current: CurrentMap, stamp: Stamp, first: str, second: str
 ) -> DifferentObjects:
-    """The two objects are never one. Two observations of one object are named by their det_ids."""
+    """The command that keeps two objects apart. Two observations of one object are named by their
+    det_ids."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.det_id == other.det_id:
         raise EditRefused(
@@ -176,14 +177,14 @@ def different_objects(
 
 
 def drop_object(current: CurrentMap, stamp: Stamp, thing: str) -> DropObject:
-    """The observations that an object has now are left out of the map."""
+    """The command that leaves an object's present observations out of the map."""
     found = current.find_object(thing)
     det_ids = tuple(current.view.observations[number].det_id for number in found.observations)
     return build(DropObject, stamp, det_ids=det_ids)
 
 
 def drop_detection(current: CurrentMap, stamp: Stamp, det_ids: Sequence[str]) -> DropDetection:
-    """These detections are left out of the map."""
+    """The command that leaves detections out of the map."""
     named = tuple(dict.fromkeys(map(DetId, det_ids)))
     for det_id in named:
         if det_id not in current.observations:
@@ -193,7 +194,7 @@ def drop_detection(current: CurrentMap, stamp: Stamp, det_ids: Sequence[str]) ->
 
 
 def forget_run(current: CurrentMap, stamp: Stamp, run_id: str) -> ForgetRun:
-    """The run is left out of every fold."""
+    """The command that leaves a run out of every fold."""
     check_run_in_map(current, run_id)
     current.run(run_id)
     return build(ForgetRun, stamp, run_id=run_id)
@@ -203,7 +204,7 @@ _RANGE = re.compile(r"(-?[0-9]{1,19})\.\.(-?[0-9]{1,19})")
 
 
 def forget_keyframes(current: CurrentMap, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
-    """Keyframes ``A..B`` of a run, both included, are left out of every fold."""
+    """The command that leaves keyframes ``A..B`` of a run, both included, out of every fold."""
     found = _RANGE.fullmatch(span)
     if found is None:
         raise MisuseError(f"{span!r} is no range of keyframes; write it as 40..72")
@@ -227,7 +228,7 @@ def keyframes_of(current: CurrentMap, run_id: str) -> str:
 
 
 def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSettings:
-    """The map has these settings from here on."""
+    """The command that changes the settings of the map from here on."""
     if settings == (current.corrections.settings or Settings()):
         raise EditRefused("these are the settings of the log already")
     plain = settings.model_dump()
@@ -235,7 +236,7 @@ def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSe
 
 
 def undo(current: CurrentMap, stamp: Stamp, command_id: str) -> Undo:
-    """As if the command had never been given."""
+    """The command that undoes another one."""
     found = current.find_command(command_id)
     if found is None:
         raise NoSuchThing("command", command_id, (c.command.command_id for c in current.commands))

@@ -63,7 +63,7 @@ def outcome_of(current: CurrentMap, command: Command, *, recorded: bool) -> Outc
 
 
 def _is_the_cause(change: Change) -> bool:
-    """Whether the map can be folded without the command and not with it."""
+    """Whether the map can be folded without the command but not with it."""
     try:
         _ = change.current.view
     except (FoldError, LogError):
@@ -131,7 +131,7 @@ class Located(NamedTuple):
 
     @classmethod
     def of(cls, view: MapView) -> "Located":
-        """Of a map."""
+        """The places and objects of a map."""
         return cls(
             {Keyframe(k.run_id, k.keyframe_id): k.place for k in view.keyframes},
             {o.det_id: o.object for o in view.observations},

@@ -27,7 +27,7 @@ from .make import Stamp
 from .outcome import Outcome, outcome_of
 
 MakeCommand = Callable[[CurrentMap, Stamp], Command]
-"""Makes the command from the map as it is. Raises MisuseError."""
+"""A function that makes the command from the current map. Raises MisuseError."""
 OpenSession = Callable[[], AbstractContextManager[Session]]
 TIMEOUT_S: Final = 10.0
 _TRIES: Final = 10
@@ -142,7 +142,7 @@ def _send(log: Path, made: Made, open_session: OpenSession, busy: str) -> Offset
 
 
 def _check_held(log: Path) -> None:
-    """Raises _LogFree if the writer was another `edit`, say, and has ended."""
+    """Raise _LogFree if the writer that held the log, such as another `edit`, has ended."""
     if not is_held(log):
         raise _LogFree
 

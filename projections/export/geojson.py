@@ -16,7 +16,7 @@ from projections.model.view import MapView
 _WGS84_A_M: Final = 6_378_137.0
 _WGS84_E2: Final = 6.694_379_990_141_316e-3
 _DECIMALS: Final = 9
-"""Of a degree: 0.1 mm."""
+"""Decimals of a degree: 0.1 mm."""
 
 Point = tuple[float, float]
 

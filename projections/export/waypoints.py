@@ -13,7 +13,8 @@ from projections.model.records import PlaceRecord
 from projections.model.view import MapView
 
 NEAR_M: Final = 0.5
-"""A centroid further from every pose of its Place may lie in a wall or in furniture."""
+"""Most metres from a centroid to the nearest pose of its Place; farther ones may lie in a wall or
+in furniture."""
 
 
 def nav2_waypoints(view: MapView) -> str:

@@ -48,12 +48,12 @@ from .scene import FRAME, height, map_scene, timestamp
 
 ROBOT_FRAME: Final = "base_link"
 _ANY_OBJECT: Final = {"type": "object", "properties": {}}
-"""The JSON schema of states: Foxglove shows what a message holds without more, but reads no schema
-without properties."""
+"""The JSON schema of states: Foxglove shows all fields of a message, but refuses a schema without
+properties."""
 
 _OWN_TOPICS: Final = ("/tf",)
 _RECORDED: Final = "/recorded"
-"""Before the topic of a verbatim message that is on one of ours."""
+"""Prefix of the topic of a verbatim message that clashes with one of ours."""
 
 
 class MapTopics:
@@ -104,7 +104,7 @@ class MapTopics:
         )
 
     def changes(self, lines: Iterable[str], time_ns: int) -> None:
-        """What changed the map, a message a line."""
+        """The changes of the map, a message for each line."""
         for line in lines:
             message = Log(
                 timestamp=timestamp(time_ns), level=LogLevel.Info, name="mapfold", message=line
@@ -112,7 +112,7 @@ class MapTopics:
             self._changes.log(message, log_time=time_ns)
 
     def robot(self, view: MapView, time_ns: int) -> None:
-        """Where the robot of the latest keyframe with a pose is."""
+        """The robot's pose at the latest keyframe that has one."""
         posed = (k for k in reversed(view.keyframes) if k.pose is not None)
         latest = next(posed, None)
         if latest is not None and latest.pose is not None:

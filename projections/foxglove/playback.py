@@ -1,7 +1,7 @@
 """A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was;
 and a layout for its panels.
 
-The SDK calls the ``on_`` methods in its own thread; they only note what is asked. The thread that
+The SDK calls the ``on_`` methods in its own thread; they only store the request. The thread that
 runs `Playback.run` folds and publishes.
 """
 
@@ -129,7 +129,7 @@ class PastMaps:
         return list(self._latest.maps)
 
     def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:
-        """What the events from ``start`` to before ``end`` changed, each line with its event."""
+        """The changes of the events from ``start`` to before ``end``: offset and line of each."""
         first, last = (
             bisect_left(self._lines, at, key=lambda each: each[0]) for at in (start, end)
         )
@@ -143,7 +143,7 @@ class PastMaps:
 
 
 class Playback(ServerListener):
-    """A server of past maps, which listens from its making until `run` has ended.
+    """A server of past maps, which listens from its construction until `run` has ended.
 
     Raises OSError where it cannot listen. At first it shows the end of the log, paused.
     """
@@ -152,7 +152,7 @@ class Playback(ServerListener):
         self._maps = maps
         self._first_ns, self._last_ns = maps.moments.span_ns
         self._changed = threading.Condition()
-        # What the SDK's thread writes, too, is read and written under _changed.
+        # The fields below are shared with the SDK's thread, under _changed.
         self._now_ns, self._shown = self._last_ns, Offset(len(maps.moments.times_ns))
         self._playing, self._speed = False, 1.0
         self._to_show, self._ended = False, False
@@ -181,7 +181,7 @@ class Playback(ServerListener):
     def on_playback_control_request(
         self, playback_control_request: PlaybackControlRequest
     ) -> PlaybackState | None:
-        """Take over what a client asks; the SDK answers with what this returns."""
+        """Apply a client's request; the SDK answers with the returned state."""
         asked = playback_control_request
         with self._changed:
             self._playing = asked.playback_command is PlaybackCommand.Play

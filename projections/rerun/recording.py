@@ -101,7 +101,7 @@ def _record(fold: RecordedFold, recording: rerun.RecordingStream) -> int:
 
 
 class _Shown:
-    """What a recording shows now: an entity is logged again only where its part is another."""
+    """The parts last logged in a recording; an entity is logged again only if its part changed."""
 
     def __init__(self, recording: rerun.RecordingStream) -> None:
         self._recording = recording

@@ -10,7 +10,7 @@
 | ``map/robot`` | the robot at the latest keyframe with a pose |
 | ``graph`` | Places and Objects as nodes, ADJACENT_TO and LOCATED_IN as edges |
 
-What is on a floor that has a name is below ``floors/NAME`` instead of ``map``.
+Entities of a named floor are below ``floors/NAME`` instead of ``map``.
 """
 
 import math
@@ -27,9 +27,9 @@ from projections.model.view import MapView
 from projections.wall_segments import wall_segments
 
 Path = tuple[str, ...]
-"""Of an entity: its parts, not escaped."""
+"""The path of an entity: its parts, not escaped."""
 _MOST_POSES: Final = 2_000
-"""Of a run's path, and of a floor's keyframes: more are thinned out."""
+"""Most poses of a run's path, and of a floor's keyframes; more are thinned out."""
 _MISSING: Final = "#d91a26"
 _GRAPH_PX_PER_M: Final = 110.0
 _RING_PX: Final = 62.0
@@ -93,7 +93,7 @@ def map_parts(view: MapView) -> dict[Path, Part]:
 
 
 def robot_parts(view: MapView) -> dict[Path, Part]:
-    """Where the robot of the latest keyframe with a pose is, and looks."""
+    """The robot's position and heading at the latest keyframe with a pose."""
     latest = next((k for k in reversed(view.keyframes) if k.pose is not None), None)
     if latest is None or latest.pose is None:
         return {}
@@ -103,7 +103,7 @@ def robot_parts(view: MapView) -> dict[Path, Part]:
 
 
 def place_label(view: MapView, place: PlaceRecord) -> str:
-    """The name of a Place or what kind of room it likely is, and its id."""
+    """The name of a Place or its likely type, and its id."""
     kind = view.type_of(place.ordinal)
     told = place.name or (kind.type if kind is not None else None)
     return place.place_id if told is None else f"{told} ({place.place_id})"

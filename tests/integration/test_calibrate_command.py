@@ -51,7 +51,7 @@ def test_constants_are_printed_with_their_priors_and_what_they_rest_on(mapfold: 
     assert rows["bearing_rad"].endswith(" observations")
     assert rows["sizes_m.lamp"].endswith(" whole boxes")
     assert rows["sizes_m.lamp"].split()[2] == "-"
-    assert rest[-1].startswith("the map is folded by the page's rule")
+    assert rest[-1].startswith("the map is folded with fusion=page")
     assert "hint" not in said.err
     assert mapfold("edits", "log", "--json").json == []
 
@@ -137,7 +137,7 @@ def test_the_map_says_how_it_would_do_and_a_second_write_records_nothing(
 
 def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> None:
     said = mapfold("calibrate", "log", "--write", *BY_EVIDENCE, "--reason", "try it").out
-    assert "folded by the page's rule" not in said
+    assert "folded with fusion=page" not in said
     assert f"use-settings recorded at offset {2 * COUNT}, command " in said.splitlines()[-1]
     settings = _settings(mapfold.folder / "log")
     assert (settings.fusion, settings.evidence.range_m != EvidenceConstants().range_m) == (

@@ -13,7 +13,7 @@ from tests.logs import write_log
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """A corridor of 30 m, which the page's rule makes one place."""
+    """A corridor of 30 m, which the preset page makes one place."""
     return write_log(tmp_path / "log", [envelope(k, 0.5 * k, 0.0) for k in range(60)])
 
 

@@ -143,7 +143,7 @@ def test_walls_are_worked_out_when_a_pose_needs_them(monkeypatch: pytest.MonkeyP
     page = Folded.start(Settings())
     page.map.use_map(0, maps[0])
     page.extend([envelope(0)])
-    assert len(built) == 2, "the page's rule has no use for walls"
+    assert len(built) == 2, "places=page does not use walls"
 
 
 def test_a_map_of_a_floor_that_no_pose_is_on_is_kept_and_waits() -> None:

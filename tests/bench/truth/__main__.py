@@ -1,4 +1,4 @@
-"""One table: Objects by the page's rule and by evidence, side by side, against the truth.
+"""One table: Objects with fusion=page and by evidence, side by side, against the truth.
 
 python -m tests.bench.truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
     [--moved FRACTION] [--calibrated] [--places [--walls] | --types]

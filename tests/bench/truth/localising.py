@@ -105,7 +105,7 @@ def later_runs(case: Case) -> list[Accepted]:
 
 
 def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
-    """Run a by the page's rule, uncalibrated, or by evidence with the map's own constants; those of
+    """Run a with fusion=page, uncalibrated, or by evidence with the map's own constants; those of
     re-localisation too, unless the map is not to be asked."""
     events = first_run(case)
     settings = Settings(camera=case.camera, **PLACES)
