@@ -1,8 +1,9 @@
 """The files of a rosbag2: SQLite or MCAP, compressed or not, with or without a metadata.yaml.
 
-A bag is a folder of files, or one of them. Order and kinds of the files follow from their names and
-first bytes, whether messages are compressed from the messages', so a recording that was cut off
-before its metadata.yaml was written is read like any other.
+A bag is a folder of files, or one of them. The order of the files follows from their names, their
+kind and compression from their first bytes, and compression of single messages from those of the
+messages. So a recording that was cut off before its metadata.yaml was written is read like any
+other.
 """
 
 import re
@@ -33,7 +34,7 @@ _SEGMENT_OF_A_LOG: Final = re.compile(r"\d{20}\.mcap")
 
 
 class BagMessage(NamedTuple):
-    """A message as the bag has it. ``received_ns`` is its log time."""
+    """A message of a bag, undecoded. ``received_ns`` is its log time."""
 
     topic: str
     type_name: str
@@ -56,27 +57,27 @@ class Topic:
 
 
 Sampled = Callable[[str, int], bool]
-"""Whether to keep a message of a type, by its number among those of its topic."""
+"""Returns whether to keep a message of this type with this number on its topic as a sample."""
 
 
 @dataclass
 class BagContents:
-    """What a look through a bag found. ``first_ns`` and ``last_ns`` are when its first and last
+    """Topics and time span of a bag. ``first_ns`` and ``last_ns`` are when its first and last
     messages were received; None without any."""
 
     topics: dict[str, Topic] = field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int | None = None
     damage: str | None = None
-    """The reason why it could not be read to its end."""
+    """The reason why the bag could not be read to its end."""
 
     @property
     def count(self) -> int:
-        """Messages of all topics."""
+        """Number of messages on all topics."""
         return sum(topic.count for topic in self.topics.values())
 
     def topic(self, new: Topic) -> Topic:
-        """The topic of its name: that one, if there is none yet."""
+        """The topic with the name of ``new``, which is added if there is none."""
         return self.topics.setdefault(new.name, new)
 
     def span(self, received_ns: int) -> None:
@@ -88,7 +89,7 @@ class BagContents:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a folder holds a bag, not a log of mapfold."""
+    """Whether a folder holds a bag and not a mapfold log."""
     try:
         names = [each.name for each in path.iterdir()]
     except OSError:
@@ -99,18 +100,19 @@ def is_bag(path: Path) -> bool:
 
 
 def is_file_of_a_bag(start: bytes) -> bool:
-    """Whether a file that begins so is one of a bag: SQLite, or MCAP that says it is of ROS 2."""
+    """Whether a file with these first bytes is of a bag: SQLite, or MCAP with a ROS 2 profile."""
     if start.startswith(SQLITE_MAGIC):
         return True
     return start.startswith(MCAP_MAGIC) and start[_PROFILE_AT:].startswith(_ROS2_PROFILE)
 
 
 START_BYTES: Final = _PROFILE_AT + len(_ROS2_PROFILE)
-"""How many first bytes `is_file_of_a_bag` looks at."""
+"""The number of first bytes that `is_file_of_a_bag` needs."""
 
 
 def bag_name(path: Path) -> str:
-    """The bag's name: of a folder its own, of a file that of the folder it was recorded in."""
+    """The name of the bag's folder, or of its file without suffixes and number: rosbag2 names both
+    alike."""
     if path.is_dir():
         return path.resolve().name
     return re.sub(r"_\d+$", "", path.name.split(".")[0]) or path.name
@@ -129,15 +131,14 @@ class Bag:
         self._at = 0
 
     def bytes_read(self) -> int:
-        """About how many of ``size_bytes`` `messages` has read."""
+        """An estimate of how many of ``size_bytes`` `messages` has read."""
         if self._at == len(self._parts):
             return self.size_bytes
         share = self._parts[self._at].share_read()
         return sum(self._sizes[: self._at]) + int(share * self._sizes[self._at])
 
     def look(self, sampled: Sampled) -> BagContents:
-        """What is in the bag: its topics, and messages of which ``sampled(type, number)`` is true,
-        where ``number`` is that of the message among those of its topic."""
+        """Read the whole bag: its topics, with the messages for which ``sampled`` returns True."""
         contents = BagContents()
         for part in self._parts:
             try:
@@ -179,7 +180,7 @@ class _Part(Protocol):
 
     path: Path
     advice: str
-    """How more of a damaged file may be saved."""
+    """The end of messages about damage: how more of the file may be saved."""
 
     def look(self, contents: BagContents, sampled: Sampled) -> None: ...
 
@@ -189,7 +190,7 @@ class _Part(Protocol):
 
 
 class _McapPart:
-    """An MCAP file, also a compressed one; checked as `eventsrc.log.foreign_mcap` does."""
+    """An MCAP file, compressed or not, read and checked by `eventsrc.log.foreign_mcap`."""
 
     advice = ""
 
@@ -280,7 +281,7 @@ class _SqlitePart:
             else:
                 _refuse_unwritten(path)
                 if path.suffix != _SQLITE_SUFFIX or any(mark in str(path) for mark in "?#%"):
-                    # rosbags goes by the suffix, and makes a URI of the path as it stands
+                    # rosbags needs the suffix, and puts the path into a URI without quoting it
                     folder = self._files.enter_context(tempfile.TemporaryDirectory())
                     path = Path(folder, f"bag{_SQLITE_SUFFIX}")
                     path.symlink_to(self.path.resolve())
@@ -290,7 +291,7 @@ class _SqlitePart:
 
 
 def _refuse_unwritten(path: Path) -> None:
-    """Raise MisuseError where SQLite has messages beside the file that are not in it."""
+    """Raise MisuseError if the file's write-ahead log has messages that are not in the file."""
     journal = path.with_name(path.name + "-wal")
     if journal.exists() and journal.stat().st_size:
         raise MisuseError(
@@ -325,7 +326,7 @@ def _first_bytes(file: BinaryIO) -> bytes:
 
 
 def _decompressed(payload: bytes) -> bytes:
-    """A message that a bag may have compressed by itself. CDR never begins as zstd does."""
+    """A message, decompressed if the bag compresses single messages: no CDR begins like zstd."""
     if not payload.startswith(ZSTD_MAGIC):
         return payload
     with zstandard.ZstdDecompressor().stream_reader(payload) as stream:

@@ -1,8 +1,8 @@
-"""Which topics of a bag are used, and for what: by option, else by their types, names and frames.
+"""Choose the topics of a bag and their uses: by option, else by their types, names and frames.
 
-Where several topics would do, the one whose name has most of its first parts in common with the
-detections' is taken (``/robot1/tf`` for ``/robot1/camera/detections``); where that leaves two, none
-is, and a note says which option chooses.
+Of several candidates the one whose name shares the most leading parts with the detections' topic is
+used (``/robot1/tf`` for ``/robot1/camera/detections``). If two share as many, neither is used, and
+a note names the option that chooses.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,9 +21,9 @@ from eventsrc.text import visible
 from .bag_files import BagContents, Topic
 
 TF_POSE: Final = "tf"
-"""``--pose`` of transforms."""
+"""The value of ``--pose`` for transforms instead of a topic of poses."""
 NONE: Final = "none"
-"""The value that switches a kind of topic off."""
+"""The value of an option that switches its kind of topic off."""
 _BASES: Final = ("base_link", "base_footprint")
 _MAP: Final = "map"
 _FIRST_TRANSFORMS: Final = 300
@@ -38,7 +38,7 @@ _Read = TypeVar("_Read")
 
 @dataclass(frozen=True)
 class BagOptions:
-    """What the user chose of a bag; None or empty where the bag's topics decide."""
+    """The user's choices for a bag; what is None or empty follows from the bag's topics."""
 
     detections: tuple[str, ...] = ()
     pose: str | None = None
@@ -57,8 +57,8 @@ class BagOptions:
 
 @dataclass
 class Choice:
-    """The streams of a bag, the topics of its occupancy grids, what each topic is used for, and
-    what a user should know."""
+    """The streams of a bag, the topics of its occupancy grids, the uses of each topic, and notes
+    for the user."""
 
     streams: list[Stream] = field(default_factory=list)
     grids: list[str] = field(default_factory=list)
@@ -66,18 +66,18 @@ class Choice:
     notes: list[str] = field(default_factory=list)
 
     def use(self, topic: str | None, what: str) -> None:
-        """Note what a topic is for."""
+        """Add a use to those of a topic."""
         if topic is not None:
-            said = self.uses.get(topic)
-            if said is None:
+            uses = self.uses.get(topic)
+            if uses is None:
                 self.uses[topic] = what
-            elif what not in said.split(", "):
-                self.uses[topic] = f"{said}, {what}"
+            elif what not in uses.split(", "):
+                self.uses[topic] = f"{uses}, {what}"
 
 
 def sampled(type_name: str, number: int) -> bool:
-    """Whether `choose` needs a message of a type, by its number on its topic. Of transforms those
-    later on too: a localiser publishes the map frame only once it is localised."""
+    """Whether `choose` needs the message of a type with this number on its topic. Of transforms it
+    needs later ones too: a localiser publishes the map frame only once it is localised."""
     if type_name == ros.TF:
         few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
         return few or number < _FIRST_TRANSFORMS
@@ -85,8 +85,8 @@ def sampled(type_name: str, number: int) -> bool:
 
 
 def choose(name: str, contents: BagContents, types: MessageTypes, options: BagOptions) -> Choice:
-    """What to use of a bag of that name. Raises MisuseError for an option that names a topic which
-    is not there, or of another type."""
+    """Choose the topics of a bag and their uses. Raises MisuseError for an option that names a
+    missing topic, or one of another type."""
     return _Chooser(name, contents, types, options).choose()
 
 
@@ -163,7 +163,7 @@ class _Chooser:
             if found and _last(map_frame) != _MAP and options.map_frame is None:
                 made.notes.append(
                     f"poses are in the frame {map_frame!r}: no transform leads to a frame "
-                    f"{_MAP!r}; what odometry alone tells drifts, so give --map-frame or --pose "
+                    f"{_MAP!r}; odometry alone drifts, so give --map-frame or --pose "
                     "if there is something better"
                 )
             elif not found:
@@ -270,7 +270,7 @@ class _Chooser:
         return map_ or _first(frames, (_MAP,)) or _MAP, base or _BASES[0]
 
     def _tree(self, *topics: str | None) -> TransformBuffer:
-        """The frames that the first transforms tell of, as if they held for all times."""
+        """The tree of frames of the sampled transforms, all of them taken as static."""
         tree = TransformBuffer(0)
         for topic in topics:
             for each in self._samples(topic, lambda message: [*message.transforms]):
@@ -293,7 +293,7 @@ class _Chooser:
             try:
                 yield ros.read(reader, self._types.decode(payload, known.type_name))  # type: ignore[union-attr]
             except (Undecodable, BadMessage):
-                continue  # kept as rejected, or counted, where it is read
+                continue  # counted or kept as rejected when the bag is imported
 
     def _transforms(self, *, static: bool) -> list[str]:
         return [t for t in self._of_type(ros.TF) if (_last(t) == "tf_static") is static]
@@ -306,8 +306,8 @@ class _Chooser:
     def _nearest(
         self, topic: str, candidates: Sequence[str], what: str, option: str | None = None
     ) -> str | None:
-        """The candidate that shares most of the first parts of ``topic``, and has the fewest
-        others."""
+        """The candidate that shares the most leading parts with ``topic``, of several the one with
+        the fewest parts; None, with a note, if that leaves several."""
         if not candidates:
             return None
         parts = topic.strip("/").split("/")
@@ -344,7 +344,7 @@ class _Chooser:
             )
 
     def _run_id(self) -> str:
-        """The bag's name and when it begins, so that the same bag has the same."""
+        """The run id: the bag's name and time, so that importing it again gives the same id."""
         name = "".join(char if char.isprintable() else "_" for char in self._name)[:_MOST_NAME]
         first_ns = self._contents.first_ns or 0
         try:
@@ -359,7 +359,7 @@ def _last(name: str) -> str:
 
 
 def _first(frames: Iterable[str], names: Sequence[str]) -> str | None:
-    """The first frame with the first of these names that there is, whatever stands before it."""
+    """The first frame that has the first of these names that any frame has, prefixes ignored."""
     known = [*frames]
     for name in names:
         for frame in known:
@@ -372,7 +372,7 @@ _MOST_NAMED: Final = 8
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first few names."""
+    """The first few names, and the number of the others."""
     shown = ", ".join(visible(name)[:_MOST_NAME] for name in names[:_MOST_NAMED]) or "none"
     more = len(names) - _MOST_NAMED
     return shown if more <= 0 else f"{shown} and {more} more"

@@ -1,5 +1,5 @@
-"""JSON lines, plain or gzip, from a file or a stream; also records of Zenoh loggers and of
-``mapfold log cat --json``.
+"""Import JSON lines, plain or gzip, from a file or a stream: envelopes, records of Zenoh loggers,
+and the output of ``mapfold log cat --json``.
 
 A Zenoh logger writes one object a line: ``{"ts": 1740000000.123, "iso": "2025-…Z",
 "key": "tb/detections", "payload": …}``. The payload is parsed JSON, or a string: the raw text if it
@@ -8,8 +8,8 @@ was no JSON, in some loggers always, in some as base64. An older logger wrote
 
 ``mapfold log cat --json`` writes ``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``; the
 payload is parsed JSON, text that is no JSON, or null beside ``payload_base64``. An older envelope
-has its ``version`` beside it. Of a verbatim message the text of the schema is missing, so it is not
-read.
+has its ``version`` beside it. Verbatim messages are passed over, because the text of their schema
+is missing.
 
 A JSON payload is cut out of the line as it stands, never parsed and written again, so that numbers,
 spaces and escapes reach the log unchanged.
@@ -37,7 +37,7 @@ _MAX_NS = 2**63
 
 
 def read_line(line: bytes) -> ImportedMessage:
-    """The message in one line: the payload of a record, else the line itself."""
+    """The message in one line: the payload if the line is a record, else the line itself."""
     if b'"ts"' not in line and b'"logged_ns"' not in line:
         return ImportedMessage(line)
     if not any(b'"%s"' % f.encode() in line for f in _PAYLOAD_FIELDS):
@@ -66,8 +66,8 @@ def read_line(line: bytes) -> ImportedMessage:
 
 
 def _shown_event(line: bytes, fields: dict[str, tuple[object, str]]) -> ImportedMessage:
-    """An event as `mapfold log cat --json` shows it; the line itself if a field is of another type,
-    which is kept as rejected."""
+    """The message in a line of `mapfold log cat --json`. If a field is of another type it is the
+    line itself, which validation then rejects."""
     values = {name: value for name, (value, _) in fields.items()}
     key, logged_ns, stamp_ns = values["key"], values["logged_ns"], values["stamp_ns"]
     if not (isinstance(key, str) and key and _is_time(logged_ns) and _is_time(stamp_ns)):
@@ -135,7 +135,7 @@ def _payload(value: object, text: str) -> bytes:
 
 
 def _nanoseconds(seconds: str) -> int | None:
-    """Exact for the decimal text; None if it is no time within int64."""
+    """A decimal text of seconds as exact int nanoseconds; None if it does not fit int64."""
     try:
         value = int(Decimal(seconds).scaleb(9).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError):

@@ -1,11 +1,11 @@
-"""Log times of imported messages that do not say when they were received.
+"""Log times of imported messages without a time of receipt.
 
 A viewer plays a log by its log times. So an imported envelope has its stamp as its log time, and a
-drive of eight minutes plays eight minutes; when it was imported is in the head of the segment.
+drive of eight minutes plays eight minutes; the time of the import is in the segment's metadata.
 
-Log times are those of the moment at which a message came: they do not run backwards because a
-keyframe was sent late, or because the clocks of two robots differ a little. They do where an older
-drive follows, and where a robot's clock was set back.
+Log times imitate times of receipt. They do not go back for a keyframe that was sent late, or where
+the clocks of two robots differ a little. They go back where an older drive follows, and where a
+robot's clock was set back.
 """
 
 from bisect import bisect_left
@@ -14,9 +14,9 @@ from typing import Final
 from eventsrc.envelope import RunId
 
 TOGETHER_NS: Final = 10 * 1_000_000_000
-"""A run that begins up to this long before the message before it drives at the same time."""
+"""A run whose first stamp is at most this long before the last log time counts as simultaneous."""
 CLOCK_SET_NS: Final = 24 * 3600 * 1_000_000_000
-"""A keyframe is not sent later than this: the robot's clock was set back."""
+"""A keyframe with a stamp older than this means that the robot's clock was set back."""
 
 
 class LogTimes:
@@ -31,11 +31,12 @@ class LogTimes:
         """The number of the first message of each run, or of the first since its clock was set."""
         self._numbers: list[int] = []
         self._peaks: list[int] = []
-        """The log times that no later message has reached, falling, and their numbers."""
+        """The log times that are higher than those of all later messages, so in falling order;
+        ``_numbers`` are the numbers of their messages."""
         self.last_ns: int | None = None
 
     def add(self, logged_ns: int) -> int:
-        """Add a message that was logged at ``logged_ns``; returns that."""
+        """Add a message with the log time ``logged_ns``, which is returned."""
         while self._peaks and self._peaks[-1] <= logged_ns:
             self._peaks.pop()
             self._numbers.pop()
@@ -46,7 +47,7 @@ class LogTimes:
         return logged_ns
 
     def add_stamped(self, run_id: RunId, stamp_ns: int) -> int:
-        """Add a keyframe; returns its log time."""
+        """Add a keyframe of a run by its stamp; return its log time."""
         start = self._starts.get(run_id)
         if start is None:
             together = self.last_ns is not None and 0 <= self.last_ns - stamp_ns <= TOGETHER_NS

@@ -1,4 +1,4 @@
-"""The map.yaml of a map server (Nav2, ROS 1) and its image: from files to an occupancy map.
+"""Read the map.yaml of a map server (Nav2, ROS 1) and its image as an occupancy map.
 
 ``mode`` says how a pixel becomes a cell, as in Nav2's map_io. With p the mean of red, green and
 blue from 0 (black) to 1, a pixel is occupied by 1 - p, by p if ``negate`` is set:
@@ -7,7 +7,8 @@ blue from 0 (black) to 1, a pixel is occupied by 1 - p, by p if ``negate`` is se
 ``scale``    the same, but between the two thresholds 1 to 99 in proportion
 ``raw``      the pixel's own value where it is 0 to 100, else unknown
 
-A pixel that is not opaque is unknown, but for ``raw``; Nav2 averages its alpha in for ``trinary``.
+A pixel that is not opaque is unknown, except with ``raw``; with ``trinary`` Nav2 averages its alpha
+with the colours instead.
 """
 
 from pathlib import Path
@@ -46,8 +47,8 @@ class _MapFile(BaseModel):
 
 
 def read_map_yaml(path: Path, floor: str | None = None) -> OccupancyMap:
-    """The map of a map.yaml, of this floor; its image's path is relative to it. Raises
-    MisuseError."""
+    """The map of a map.yaml, for the floor ``floor``. The image's path is relative to the file.
+    Raises MisuseError."""
     described = _described(path)
     image = path.parent / described.image
     try:
@@ -88,7 +89,7 @@ def _described(path: Path) -> _MapFile:
 
 
 def _fault(error: ValidationError, text: bytes) -> str:
-    """The first field that is wrong: the rule, its value and line, and what to write instead."""
+    """The first invalid field: the rule, its value and line, and what to write instead."""
     first = error.errors(include_url=False)[0]
     name = str(first["loc"][0])
     field = visible(".".join(map(str, first["loc"])))
@@ -129,7 +130,7 @@ def _content(path: Path, limit: int) -> bytes:
 
 
 def _cells(pixels: NDArray[np.uint8], described: _MapFile) -> NDArray[np.uint8]:
-    """Cells of the rows of red, green, blue and alpha, shape (height, width)."""
+    """The cells, shape (height, width), of pixels of red, green, blue and alpha."""
     total = pixels[..., :3].sum(axis=-1, dtype=np.uint16)
     table = _raw_values() if described.mode == "raw" else _threshold_values(described)
     cells: NDArray[np.uint8] = table[total]

@@ -1,4 +1,4 @@
-"""Messages of MCAP files and of other mapfold logs, in file order."""
+"""Import messages of MCAP files and of other mapfold logs, in file order."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +16,8 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
 class McapFile:
-    """Any MCAP file. Messages that are neither ``json`` nor occupancy grids in ``cdr`` (images,
-    other messages of ROS) are not read."""
+    """An MCAP file that is no bag of ROS 2. Messages that are neither ``json`` nor occupancy grids
+    in ``cdr`` (images, other messages) are passed over."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
         self.name = name
@@ -67,7 +67,7 @@ class McapFile:
 
 
 class OtherLog:
-    """A mapfold log, from its first event to its last durable one."""
+    """Another mapfold log, from its first event to its last durable one."""
 
     def __init__(self, path: Path) -> None:
         self.name = str(path)
@@ -79,7 +79,7 @@ class OtherLog:
         self._read = 0
 
     def bytes_read(self) -> int:
-        """Bytes of payload read."""
+        """Bytes of payloads read so far."""
         return self._read
 
     def messages(self) -> Iterator[ImportedMessage]:

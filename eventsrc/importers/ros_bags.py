@@ -1,4 +1,4 @@
-"""A rosbag2 as a source: its detections as envelopes, its occupancy grids as maps."""
+"""Import a rosbag2: its detections as envelopes, its occupancy grids as maps."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -24,8 +24,7 @@ _CDR: Final = "cdr"
 
 @dataclass(frozen=True)
 class BagTopicReport:
-    """A topic of a bag, how many messages it has, and what they were used for; empty for
-    nothing."""
+    """A topic of a bag, its number of messages, and their use; empty if unused."""
 
     topic: str
     type: str
@@ -35,7 +34,8 @@ class BagTopicReport:
 
 @dataclass
 class BagReport:
-    """What a bag held, and what was imported. ``streams`` are by topic of detections."""
+    """The topics of a bag and what was imported. ``streams`` are the counts by topic of
+    detections."""
 
     name: str
     messages: int
@@ -43,9 +43,9 @@ class BagReport:
     topics: list[BagTopicReport] = field(default_factory=list)
     streams: dict[str, Counts] = field(default_factory=dict)
     frames: dict[str, str | None] = field(default_factory=dict)
-    """The frame of the poses of each stream."""
+    """The frame of the poses of each stream, by topic of detections."""
     unchanged_grids: int = 0
-    """Occupancy grids with the cells of the one before."""
+    """Number of occupancy grids left out because they equal the one before on their topic."""
     notes: list[str] = field(default_factory=list)
 
     is_useless: bool = False
@@ -53,7 +53,7 @@ class BagReport:
 
 
 class RosBag:
-    """A bag. Nothing of it is read before `messages` is called."""
+    """A bag of ROS 2 as a `Source`. Messages are read when `messages` is called."""
 
     def __init__(self, path: Path, files: ExitStack, options: BagOptions) -> None:
         self.name = str(path)
@@ -70,11 +70,11 @@ class RosBag:
         self._numbers: deque[int] = deque()
 
     def bytes_read(self) -> int:
-        """Bytes of the bag's files read, about."""
+        """An estimate of the bytes read so far."""
         return self._bag.bytes_read()
 
     def messages(self) -> Iterator[ImportedMessage]:
-        """Envelopes in the order of the detections, and maps."""
+        """Envelopes and maps, in the order in which detections and grids were received."""
         contents = self._bag.look(sampled)
         notes = self._define(contents)
         choice = choose(bag_name(self._path), contents, self._types, self._options)
@@ -125,7 +125,7 @@ class RosBag:
                 yield self._imported(each)
 
     def _imported(self, each: Assembled | ImportedMessage) -> ImportedMessage:
-        """What comes out of the assembler; `at` becomes the number of the message it is made of."""
+        """An output of the assembler as a message; sets `at` to the number of its source."""
         self.at = self._numbers.popleft()
         if isinstance(each, ImportedMessage):
             return each
@@ -134,7 +134,7 @@ class RosBag:
     def _grid(
         self, topic: str, received_ns: int, payload: bytes, report: BagReport
     ) -> ImportedMessage | None:
-        """An occupancy grid; None if it has the cells of the one before on its topic."""
+        """An occupancy grid; None if its map equals the one before on its topic."""
         try:
             map_ = read_grid_message(payload, topic)
             digest = bytes.fromhex(map_.digest())
@@ -147,7 +147,7 @@ class RosBag:
         return ImportedMessage(payload, _key(topic), received_ns)
 
     def _define(self, contents: BagContents) -> list[str]:
-        """Take over the bag's own definitions of the types that may be used."""
+        """Define the types that may be used as the bag does; return notes on those that fail."""
         notes = []
         done = set()
         for topic in contents.topics.values():

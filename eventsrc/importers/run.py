@@ -53,14 +53,14 @@ OnReject = Callable[[str, str], None]
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """Counts of an import; it appended ``first_offset`` to ``next_offset`` - 1."""
+    """Counts of an import, which appended the events ``first_offset`` to ``next_offset`` - 1."""
 
     accepted: int
     rejected: int
     system: int
     """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
     skipped: int
-    """Messages that were passed over, in all."""
+    """Number of messages that were passed over."""
     first_offset: Offset
     next_offset: Offset
     maps: int = 0
@@ -71,21 +71,21 @@ class ImportReport:
     """Messages that were passed over, by topic and what they are, in the order of the first."""
 
     @property
-    def nothing_of_something(self) -> bool:
-        """Whether there were messages and none of them is in the log as what it is."""
+    def imported_nothing(self) -> bool:
+        """Whether there were messages, all of them rejected or passed over."""
         imported = self.accepted + self.system + self.maps + self.verbatim
         return not imported and bool(self.rejected or self.skipped)
 
     bags: tuple[BagReport, ...] = ()
-    """What was in the bags of ROS 2, and what was used."""
+    """The reports of the ROS 2 bags."""
     repeated: int | None = None
-    """How many of the accepted envelopes are of keyframes that the log had already, of which the
-    fold takes the first; None where it is not known which it had."""
+    """How many accepted envelopes are of keyframes that the log had already and the fold ignores;
+    None if no ledger was given."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
-    """Ctrl-C. ``report`` counts what is in the log and synced; ``place`` is the place of its last
-    message (``line 17 of run.jsonl``), None without any."""
+    """An import was ended by Ctrl-C. ``report`` counts what is synced to the log; ``place`` is the
+    place of the last message (``line 17 of run.jsonl``), None without any."""
 
     def __init__(self, report: ImportReport, place: str | None) -> None:
         super().__init__()
@@ -107,13 +107,13 @@ def import_files(
     ledger: GapLedger[RunId] | None = None,
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
-    without a key get ``key``. An envelope that does not say when it was received gets its stamp as
-    its log time (`log_times`), anything else that of the message before it.
+    without a key get ``key``. Without a time of receipt the log time of an envelope is its stamp
+    (`log_times`), that of anything else the log time of the message before it.
 
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
-    envelopes. ``bags`` says what to use of bags of ROS 2. The map is appended when the first
-    message was read. ``ledger`` knows the keyframes of the log, and learns those that are appended.
+    envelopes. ``bags`` has the choices for bags of ROS 2. The map is appended when the first
+    message was read. ``ledger`` is the gap ledger of the log, to which new keyframes are added.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
@@ -150,7 +150,7 @@ class _Keyframe(NamedTuple):
 
 
 def _keyframe(checked: Checked) -> _Keyframe | None:
-    """Run and stamp of a payload; None if it is no envelope, or one of a form without them."""
+    """Run and stamp of a payload; None if it is no envelope, or of a version without them."""
     stamp_ns, envelope = checked.stamp_ns, checked.result
     if stamp_ns is None or not isinstance(envelope, CheckedEnvelope):
         return None
@@ -179,8 +179,8 @@ class _Import:
         self._passed_over: Counter[tuple[str, str]] = Counter()
         self._times = LogTimes()
         self.begins = False
-        """Whether the next message is the first of a file: log times may go back there, and the
-        segment that then begins says why."""
+        """Whether the next message is the first of a source. If log times go back there, a new
+        segment is begun."""
         self._logged_ns: int | None = None
         self._first = writer.next_offset
         self._last: tuple[Source, int | None] | None = None
@@ -210,8 +210,8 @@ class _Import:
         self._last = source, source.at
 
     def append_given_map(self, next_ns: int | None) -> None:
-        """Append the map that comes from no message, once; ``next_ns`` is when the message after it
-        was logged. The map gets that time if it is past, so that log times grow."""
+        """Append the given map, once. ``next_ns`` is the log time of the message after it, which
+        the map gets too unless it is in the future, so that log times do not go back."""
         if self._given_map is None:
             return
         now_ns = self._writer.now_ns()
@@ -221,7 +221,7 @@ class _Import:
         self._given_map = None
 
     def _time_of(self, message: ImportedMessage, keyframe: _Keyframe | None = None) -> int:
-        """The log time of the next message, before which the given map is appended."""
+        """The log time of the next message. Appends the given map before it."""
         if message.logged_ns is not None:
             logged_ns = self._times.add(message.logged_ns)
         elif keyframe is not None:
@@ -237,7 +237,7 @@ class _Import:
         return logged_ns
 
     def _append_map_event(self, source: Source, message: ImportedMessage) -> None:
-        """Append the map of another log, or its rejection."""
+        """Append a map event of another log, or its rejection."""
         try:
             decode_map(message.payload)
         except InvalidMap as error:
@@ -301,7 +301,7 @@ class _Import:
                 self._ledger.record(envelope.run_id, envelope.keyframe_id, 0)
 
     def _is_for_others(self, message: ImportedMessage) -> bool:
-        """Whether a message that is no envelope was never meant to be one."""
+        """Whether to pass over a message that is no envelope and does not look like one."""
         return message.is_foreign and not self._topics and not looks_like_envelope(message.payload)
 
     @property
@@ -329,7 +329,8 @@ class _Import:
 
 
 def check_sources(names: Sequence[str]) -> None:
-    """Raise MisuseError for the first that cannot be reached; call it before a log is created."""
+    """Raise MisuseError for the first source that cannot be read; call it before a log is
+    created."""
     for name in names:
         if name == STDIN:
             continue
@@ -342,8 +343,8 @@ def check_sources(names: Sequence[str]) -> None:
 
 
 def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -> Source:
-    """Open ``name``: a folder is a bag of ROS 2 or a log, ``-`` standard input, a file JSON lines,
-    MCAP or a file of a bag."""
+    """Open the source ``name``: a folder is a bag of ROS 2 or a log, ``-`` is standard input, a
+    file is JSON lines, MCAP or part of a bag. Raises MisuseError."""
     if name != STDIN and Path(name).is_dir():
         return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
     if Path(name).name == METADATA:

@@ -1,4 +1,4 @@
-"""What an importer implements: a source of messages."""
+"""The interface that an importer implements: a source of messages."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ class ImportedMessage:
     ``stamp_ns`` is used for system events of another mapfold log only: the event of an envelope is
     stamped with the envelope's own time. ``version`` is the envelope version that another mapfold
     log has it in; None if there is none. ``form`` is the format of a verbatim message of another
-    mapfold log, which is kept as it is, on topic ``key``. ``is_foreign`` says that another program
-    may have meant it for something else: if it does not look like an envelope, it is passed over.
-    ``unread`` is what a message is that no importer reads; it is passed over, and its payload
-    may be left out. ``refused`` is the reason if the source could not read the message: it is kept
-    as rejected. ``begins`` says that an import begins here in another mapfold log, so that log
-    times may be older than before.
+    mapfold log, which is kept as it is, on topic ``key``. ``is_foreign`` marks a message that may
+    belong to another program: if it does not look like an envelope, it is passed over. ``unread``
+    is the format of a message that no importer reads; it is passed over, and its payload may be
+    left out. ``refused`` is the reason if the source could not read the message: it is kept as
+    rejected. ``begins`` marks the begin of an import in another mapfold log, from which log times
+    may be older than before.
     """
 
     payload: bytes
@@ -46,8 +46,7 @@ class Source(Protocol):
     """Number of the message that `messages` yielded last."""
     size_bytes: int | None
     skipped: int
-    """Messages not yielded because they are in a format that is not read, such as MCAP channels
-    that are not declared as JSON."""
+    """Number of messages not yielded because their format is not read."""
 
     def messages(self) -> Iterator[ImportedMessage]:
         """The messages in order."""

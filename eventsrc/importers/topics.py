@@ -1,4 +1,4 @@
-"""Which topics of a file are imported, and what was passed over."""
+"""The choice of the topics of a file to import, and counts of messages passed over."""
 
 import re
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ _CLASS_FIELDS: Final = ("class", "class_name")
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """The topics that match one of ``patterns`` as file names match those of a shell; all topics
-    if there is none. ``*`` stands for any characters, ``/`` included."""
+    """The topics that match one of the shell patterns ``patterns``; all topics if there is none.
+    ``*`` matches any characters, also ``/``."""
 
     patterns: tuple[str, ...] = ()
     _expressions: list[re.Pattern[str]] = field(default_factory=list, compare=False)
 
     @classmethod
     def of(cls, patterns: Sequence[str]) -> "TopicChoice":
-        """Raises MisuseError for an empty pattern."""
+        """The choice by these patterns. Raises MisuseError for an empty one."""
         if not all(patterns):
             raise MisuseError("--topic is empty; give a topic, or a pattern such as 'tb/*'")
         return cls(tuple(patterns), [re.compile(translate(pattern)) for pattern in patterns])
@@ -42,8 +42,8 @@ class TopicChoice:
 
 @dataclass(frozen=True, slots=True)
 class PassedOver:
-    """Messages of one topic that are not in the log, and what they are: their encoding and schema,
-    `NO_ENVELOPES` or `NOT_CHOSEN`."""
+    """The number of messages of one topic that were not imported. ``what`` is their encoding and
+    schema, `NO_ENVELOPES` or `NOT_CHOSEN`."""
 
     topic: str
     what: str
@@ -51,8 +51,8 @@ class PassedOver:
 
 
 def looks_like_envelope(payload: bytes) -> bool:
-    """Whether a payload that is no valid envelope was meant to be one, by its fields; True for what
-    is no JSON, because a torn envelope may look like that."""
+    """Whether an invalid payload has enough fields of an envelope to be kept as rejected. True also
+    for text that is no JSON, because it may be a torn envelope."""
     try:
         value = from_json(payload)
     except (ValueError, RecursionError):

@@ -1,9 +1,9 @@
-"""From decoded ROS messages, in the order in which they were received, to envelopes.
+"""Assemble envelopes from decoded ROS messages, given in the order in which they were received.
 
 Each message of a stream's detections becomes one envelope, a keyframe with the next number of its
-run. It waits for what it lacks, at most until a message was received ``wait_ns`` after it or
-``max_waiting`` others wait behind it; then it is made without. What comes out keeps the order in
-which it came in. There is no clock and no chance: the same messages make the same envelopes.
+run. It waits for its pose, camera and embeddings, at most until a message was received ``wait_ns``
+after it or ``max_waiting`` others wait behind it; then it is made without those missing. Output has
+the order of the input. There is no clock and no chance: equal messages make equal envelopes.
 """
 
 import json
@@ -34,7 +34,7 @@ from .stream import Counts, Stream
 from .transforms import TransformBuffer
 
 _MOST_EMBEDDINGS: Final = 1_000
-"""Messages of embeddings that are kept for detections that have not come yet."""
+"""Bound of the messages of embeddings kept for detections that have not been received."""
 _UNCLAIMED: Final = "no detections of its stamp came, or they came too late"
 _NS: Final = 1_000_000_000
 
@@ -43,7 +43,7 @@ Item = TypeVar("Item")
 
 class RosMessage(NamedTuple):
     """A decoded message. ``type_name`` is such as ``tf2_msgs/msg/TFMessage``; ``received_ns`` is
-    when it was received, the log time of a bag; ``content`` has the attributes of the type."""
+    the time of receipt, in a bag its log time; ``content`` has the attributes of the type."""
 
     topic: str
     type_name: str
@@ -62,112 +62,114 @@ class Assembled(NamedTuple):
 
 @dataclass(slots=True)
 class _Picture:
-    """Detections that wait for the rest."""
+    """Detections of one picture that wait for their pose, camera and embeddings."""
 
     received_ns: int
-    track: "_Track"
+    state: "_StreamState"
     detected: Detected
     keyframe_id: int
     pose: PicturePose | None = None
-    asked_at: int = -1
-    """How many messages the source of poses had taken when it was asked last."""
+    checked_at: int = -1
+    """`PoseSource.received` when the pose was looked up last."""
 
 
 @dataclass(slots=True)
 class _Passed(Generic[Item]):
-    """Something else that keeps its place in the order."""
+    """An item given to `Assembler.put`, in the queue to keep its place in the order."""
 
     received_ns: int
     item: Item
 
 
 class Assembler(Generic[Item]):
-    """Makes envelopes of messages. An ``Item`` given to `put` comes out as it is, after what came
-    before it."""
+    """Makes envelopes of messages. An ``Item`` given to `put` is returned unchanged, in its place
+    in the order."""
 
     def __init__(self, streams: Iterable[Stream]) -> None:
         self._queue: deque[_Picture | _Passed[Item]] = deque()
-        self._tracks: dict[str, _Track] = {}
-        self._takers: dict[str, list[_Taker]] = {}
+        self._states: dict[str, _StreamState] = {}
+        self._handlers: dict[str, list[_Handler]] = {}
         self._latest_ns: int | None = None
         buffers: dict[tuple[str | None, str | None, int], TransformBuffer] = {}
         for stream in streams:
             key = stream.tf, stream.tf_static, stream.max_gap_ns
             is_first = key not in buffers
             buffer = buffers.setdefault(key, TransformBuffer(stream.max_gap_ns))
-            track = _Track(stream, buffer, shares_transforms=not is_first)
-            self._tracks[stream.detections] = track
-            for topic, taker in track.takers(with_transforms=is_first).items():
-                self._takers.setdefault(topic, []).append(taker)
+            state = _StreamState(stream, buffer, shares_transforms=not is_first)
+            self._states[stream.detections] = state
+            for topic, handler in state.handlers(with_transforms=is_first).items():
+                self._handlers.setdefault(topic, []).append(handler)
 
     @property
     def topics(self) -> frozenset[str]:
         """The topics of which messages are used."""
-        return frozenset(self._tracks) | frozenset(self._takers)
+        return frozenset(self._states) | frozenset(self._handlers)
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """By topic of detections. Transforms are counted where the first stream uses them."""
-        return {topic: track.counts for topic, track in self._tracks.items()}
+        """The counts of each stream, by topic of detections. Transforms that several streams use
+        are counted for the first of them."""
+        return {topic: state.counts for topic, state in self._states.items()}
 
     def frames(self) -> dict[str, str | None]:
-        """The frame of the poses by topic of detections; None where it is not known yet."""
-        return {topic: track.poses.frame for topic, track in self._tracks.items()}
+        """The frame of the poses of each stream, by topic of detections; None if still unknown."""
+        return {topic: state.poses.frame for topic, state in self._states.items()}
 
     def add(self, message: RosMessage) -> list[Assembled | Item]:
-        """Take a message; returns what is ready now.
+        """Process a message; return the envelopes and items that are ready.
 
-        Raises BadMessage for detections that are not what their type says: no keyframe is made of
-        them. Any other message that cannot be used is counted.
+        Raises BadMessage for detections that do not fit their type, of which no keyframe is made.
+        Any other message that cannot be used is counted.
         """
         topic, type_name, received_ns, content = message
-        self._see(received_ns)
-        for taker in self._takers.get(topic, ()):
-            taker(topic, type_name, content)
-        track = self._tracks.get(topic)
-        if track is not None:
-            self._queue.append(track.picture(type_name, received_ns, content))
+        self._advance(received_ns)
+        for handler in self._handlers.get(topic, ()):
+            handler(topic, type_name, content)
+        state = self._states.get(topic)
+        if state is not None:
+            self._queue.append(state.picture(type_name, received_ns, content))
         return self._ready() if self._queue else []
 
     def put(self, item: Item, received_ns: int) -> list[Assembled | Item]:
-        """Pass ``item`` on, after what came before it; returns what is ready now."""
-        self._see(received_ns)
+        """Queue ``item`` behind all that was given before; return the envelopes and items that are
+        ready."""
+        self._advance(received_ns)
         self._queue.append(_Passed(received_ns, item))
         return self._ready()
 
     def finish(self) -> list[Assembled | Item]:
-        """What still waits, without what it waits for; no message comes any more."""
-        rest = [self._take_first() for _ in range(len(self._queue))]
-        for track in self._tracks.values():
-            track.count_unclaimed()
+        """End the input: return all waiting envelopes, made without what they lack, and items."""
+        rest = [self._pop_first() for _ in range(len(self._queue))]
+        for state in self._states.values():
+            state.count_unclaimed()
         return rest
 
-    def _see(self, received_ns: int) -> None:
+    def _advance(self, received_ns: int) -> None:
         if self._latest_ns is None or received_ns > self._latest_ns:
             self._latest_ns = received_ns
 
     def _ready(self) -> list[Assembled | Item]:
         ready: list[Assembled | Item] = []
         while self._queue and self._is_due(self._queue[0]):
-            ready.append(self._take_first())
+            ready.append(self._pop_first())
         return ready
 
     def _is_due(self, first: _Picture | _Passed[Item]) -> bool:
         if isinstance(first, _Passed):
             return True
-        stream = first.track.stream
+        stream = first.state.stream
         late = self._latest_ns is not None and self._latest_ns - first.received_ns > stream.wait_ns
-        return late or len(self._queue) > stream.max_waiting or first.track.has_all(first)
+        return late or len(self._queue) > stream.max_waiting or first.state.has_all(first)
 
-    def _take_first(self) -> Assembled | Item:
+    def _pop_first(self) -> Assembled | Item:
         first = self._queue.popleft()
-        return first.item if isinstance(first, _Passed) else first.track.envelope(first)
+        return first.item if isinstance(first, _Passed) else first.state.envelope(first)
 
 
-_Taker = Callable[[str, str, Any], None]
+_Handler = Callable[[str, str, Any], None]
 
 
-class _Track:
+class _StreamState:
     """The state of one stream."""
 
     def __init__(self, stream: Stream, buffer: TransformBuffer, *, shares_transforms: bool) -> None:
@@ -179,27 +181,33 @@ class _Track:
         self._embeddings: dict[int, Embeddings] = {}
         self._next = stream.first_keyframe
 
-    def takers(self, *, with_transforms: bool) -> dict[str, _Taker]:
-        """What takes the messages of each topic that the stream listens to."""
+    def handlers(self, *, with_transforms: bool) -> dict[str, _Handler]:
+        """The handler of each topic that the stream uses besides its detections."""
         stream = self.stream
-        takers: dict[str | None, _Taker] = {}
+        handlers: dict[str | None, _Handler] = {}
         if with_transforms:
-            takers |= dict.fromkeys((stream.tf, stream.tf_static), self.poses.take_transforms)
-        takers |= dict.fromkeys((stream.pose, stream.covariance), self.poses.take_pose)
-        takers |= {stream.camera: self._take_lens, stream.embeddings: self._take_embeddings}
-        return {topic: self._counting(take) for topic, take in takers.items() if topic is not None}
+            handlers |= dict.fromkeys((stream.tf, stream.tf_static), self.poses.add_transforms)
+        handlers |= dict.fromkeys((stream.pose, stream.covariance), self.poses.add_pose)
+        handlers |= {stream.camera: self._set_lens, stream.embeddings: self._keep_embeddings}
+        return {
+            topic: self._counting(handler)
+            for topic, handler in handlers.items()
+            if topic is not None
+        }
 
-    def _counting(self, take: _Taker) -> _Taker:
+    def _counting(self, handler: _Handler) -> _Handler:
+        """``handler``, which counts a message instead of raising BadMessage."""
+
         def counting(topic: str, type_name: str, content: Any) -> None:
             try:
-                take(topic, type_name, content)
+                handler(topic, type_name, content)
             except BadMessage as error:
                 self.counts.refuse(topic, str(error))
 
         return counting
 
     def picture(self, type_name: str, received_ns: int, content: Any) -> _Picture:
-        """Number the detections. Raises BadMessage."""
+        """The detections of a message, with the next keyframe id. Raises BadMessage."""
         if type_name != DETECTIONS:
             raise BadMessage(f"it is {type_name:.80}, not {DETECTIONS}")
         labels = self.stream.labels
@@ -208,11 +216,11 @@ class _Track:
         return _Picture(received_ns, self, detected, self._next - 1)
 
     def has_all(self, picture: _Picture) -> bool:
-        """Whether it has everything that its stream has topics for."""
+        """Whether everything that the stream has topics for is there; looks up the pose."""
         if picture.pose is None and self.stream.has_poses:
-            if picture.asked_at == self.poses.received and not self._shares_transforms:
+            if picture.checked_at == self.poses.received and not self._shares_transforms:
                 return False
-            picture.asked_at = self.poses.received
+            picture.checked_at = self.poses.received
             detected = picture.detected
             picture.pose = self.poses.at(detected.stamp_ns, detected.frame, final=False)
             if picture.pose is None:
@@ -223,7 +231,7 @@ class _Track:
         return stream.embeddings is None or picture.detected.stamp_ns in self._embeddings
 
     def envelope(self, picture: _Picture) -> Assembled:
-        """The envelope, with what there is."""
+        """The envelope of the detections, with as much of the rest as is there."""
         stream, counts, detected = self.stream, self.counts, picture.detected
         counts.keyframes += 1
         counts.detections += len(detected.detections)
@@ -247,7 +255,7 @@ class _Track:
                 "height_px": self._lens.height_px,
                 "yaw_rad": 0.0 if pose is None else pose.camera_yaw,
             }
-        self._add_embeddings(detected)
+        self._attach_embeddings(detected)
         document["detections"] = detected.detections
         payload = _encode(document)
         return Assembled(stream.detections, picture.received_ns, detected.stamp_ns, payload)
@@ -265,7 +273,7 @@ class _Track:
             fields["pose_covariance"] = list(pose.covariance)
         return fields
 
-    def _add_embeddings(self, detected: Detected) -> None:
+    def _attach_embeddings(self, detected: Detected) -> None:
         given = self._embeddings.pop(detected.stamp_ns, None)
         if given is None:
             return
@@ -289,12 +297,12 @@ class _Track:
                 if model is not None:
                     detection["embedding_model"] = model
 
-    def _take_lens(self, _topic: str, type_name: str, content: Any) -> None:
+    def _set_lens(self, _topic: str, type_name: str, content: Any) -> None:
         if type_name != CAMERA_INFO:
             raise BadMessage(f"it is {type_name:.80}, not {CAMERA_INFO}")
         self._lens = read(lens_of, content)
 
-    def _take_embeddings(self, topic: str, type_name: str, content: Any) -> None:
+    def _keep_embeddings(self, topic: str, type_name: str, content: Any) -> None:
         reader = {TEXT: embeddings_of_text, FLOATS: embeddings_of_floats}.get(type_name)
         if reader is None:
             raise BadMessage(f"it is {type_name:.80}, not {TEXT} or {FLOATS}")
@@ -314,8 +322,8 @@ class _Track:
 
 
 def _encode(document: dict[str, Any]) -> bytes:
-    """JSON, with NaN and infinity as Python writes them; the log's validation rejects and names
-    them."""
+    """JSON with NaN and infinity as Python writes them, so that validation rejects the envelope and
+    names the field."""
     try:
         payload = msgspec.json.encode(document)
     except (UnicodeError, ValueError):  # a lone surrogate
@@ -327,5 +335,5 @@ def _encode(document: dict[str, Any]) -> bytes:
 
 
 def _dimension(text: str) -> int:
-    """How many float32 a base64 text holds, rounded down."""
+    """The number of float32 in a base64 text, rounded down."""
     return max(len(text.rstrip("=")) * 3 // 16, 1)

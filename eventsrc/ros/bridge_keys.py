@@ -1,4 +1,4 @@
-"""What a zenoh-bridge-ros2dds puts on Zenoh: its keys, its tokens of types, its caches.
+"""Keys, type tokens and caches of a zenoh-bridge-ros2dds.
 
 A message of topic ``/tf`` comes under the key ``tf``, or ``bot1/tf`` from a bridge whose namespace
 is ``/bot1``. Its payload is the message in CDR, with the four bytes of encapsulation before it. In
@@ -10,8 +10,8 @@ The type is in a liveliness token that the bridge declares for each topic that i
     @/<zenoh id>/@ros2_lv/MP/bot1§tf/tf2_msgs§msg§TFMessage/<quality of service>
     @ros2_lv/<zenoh id>/MP/…                                     (older bridges)
 
-What a topic has that keeps its last message for those who come late (``/tf_static``), the bridge
-keeps in a cache, which is asked by a query::
+The last messages of a transient-local topic (``/tf_static``) are in a cache of the bridge, which
+answers queries::
 
     bot1/tf_static/@adv/pub/**
     @/<zenoh id>/@ros2_pub_cache/bot1/tf_static  (older bridges)
@@ -26,7 +26,7 @@ from eventsrc.text import visible
 SLASH: Final = "§"
 MAX_TOKEN: Final = 4_096
 _ANY_KEY: Final = "?_anyke"
-"""Lets a query be answered under other keys than its own."""
+"""The parameter of a query that accepts answers under other keys than its own."""
 _TOKEN: Final = re.compile(r"(?:@/[^/]+/@ros2_lv|@ros2_lv/[^/]+)/MP/([^/]+)/([^/]+)(?:/.*)?")
 _TYPE: Final = re.compile(r"[A-Za-z]\w{0,99}/msg/[A-Za-z]\w{0,99}", re.ASCII)
 _NAME: Final = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
@@ -34,8 +34,9 @@ _MAX_NAME: Final = 500
 
 
 def topic_of(namespace: str, topic: str, option: str) -> str:
-    """The topic that the messages of ``topic`` have in a log. Raises MisuseError for what is no
-    name of a topic of ROS 2."""
+    """The topic in a log of messages of the ROS topic ``topic`` from a bridge with ``namespace``.
+    Raises MisuseError, which names ``option``, for an invalid name.
+    """
     name = topic.removeprefix("/")
     if not _is_name(name):
         raise MisuseError(
@@ -55,18 +56,18 @@ def _is_name(text: str) -> bool:
 
 
 def key_of(topic: str) -> str:
-    """The key of a log's topic."""
+    """The Zenoh key of a topic in a log."""
     return topic.removeprefix("/")
 
 
 def token_selectors(key: str) -> tuple[str, ...]:
-    """The key expressions of the tokens for a key."""
+    """The key expressions that match the type tokens of a key, of current and older bridges."""
     escaped = key.replace("/", SLASH)
     return f"@/*/@ros2_lv/MP/{escaped}/**", f"@ros2_lv/*/MP/{escaped}/**"
 
 
 def cache_selectors(key: str) -> tuple[str, ...]:
-    """What to ask for the messages of a key that a bridge keeps."""
+    """The queries for the cached messages of a key, of current and older bridges."""
     return f"{key}/@adv/pub/**{_ANY_KEY}", f"@/*/@ros2_pub_cache/{key}{_ANY_KEY}"
 
 

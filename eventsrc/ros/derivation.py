@@ -1,14 +1,13 @@
-"""Envelopes and maps made of the messages of ROS in a log: a pure function of its events.
+"""Derive envelopes and maps from the ROS messages in a log: a pure function of its events.
 
-An event on ``mapfold/ros`` begins a recording: it says which topics are used for what, and which
-run their keyframes are of. Each verbatim message behind it is given to the `Derivation`, with the
-time when it was logged, and completes none, one or several envelopes. Another event on
-``mapfold/ros`` ends it: what still waited is then made without what it lacks.
+An event on ``mapfold/ros`` begins a recording: it names the topics, their uses and the run of the
+keyframes. Each verbatim message behind it is added to the `Derivation` with its log time, and
+completes none, one or several envelopes. The next event on ``mapfold/ros`` ends the recording:
+envelopes that still wait are then made without what they lack.
 
-The recorder does this while it records, and appends each envelope right behind the message that
-completed it. So a log holds them, and its readers need no types of ROS, and get no other
-numbers on another machine. `derive` makes them again of the events of a log: the next recorder
-after one that was killed, and the tests.
+The recorder derives while it records, and appends each envelope right behind the message that
+completed it. So readers of the log need no ROS types, and get the same numbers on every machine.
+`derive` derives them again from a log: for the recorder that follows a killed one, and for tests.
 """
 
 import json
@@ -63,7 +62,7 @@ def read_recording(payload: bytes) -> RosRecording:
 
 class Derived(NamedTuple):
     """An event made of messages: the JSON of an envelope, or with ``key`` ``mapfold/map`` of a map.
-    ``stamp_ns`` is that of its picture; None for a map."""
+    ``stamp_ns`` is the stamp of the detections; None for a map."""
 
     key: str
     stamp_ns: int | None
@@ -71,7 +70,7 @@ class Derived(NamedTuple):
 
 
 class Derivation:
-    """Makes the envelopes and maps of one recording, of its messages in the order of the log."""
+    """Makes the envelopes and maps of one recording from its messages, in the order of the log."""
 
     def __init__(self, recording: RosRecording, types: MessageTypes) -> None:
         self._key = recording.key
@@ -80,9 +79,9 @@ class Derivation:
         self._types = types
         self._defined: dict[str, str] = {}
         self.refused: dict[str, int] = {}
-        """Messages that cannot be read, by topic."""
+        """Number of messages that cannot be read, by topic."""
         self.reasons: dict[str, str] = {}
-        """Why the first of each topic cannot."""
+        """The reason for the first of them, by topic."""
 
     @property
     def topics(self) -> frozenset[str]:
@@ -91,14 +90,14 @@ class Derivation:
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """What the envelopes have and what they lack, by topic of detections."""
+        """The counts of each stream, by topic of detections."""
         return self._assembler.counts
 
     def add(
         self, topic: str, type_name: str, definition: str, logged_ns: int, payload: bytes
     ) -> list[Derived]:
-        """Take a message; returns what it completes. One that cannot be read completes nothing and
-        is counted."""
+        """Add a message; return the envelopes and maps that it completes. One that cannot be read
+        is counted. ``definition`` is the text that defines its type, empty if unknown."""
         try:
             if topic in self._grids:
                 return self._finished(self._map(topic, type_name, logged_ns, payload))
@@ -115,7 +114,7 @@ class Derivation:
             return []
 
     def finish(self) -> list[Derived]:
-        """What still waits: the recording ends here."""
+        """End the recording: return the envelopes that still wait, made without what they lack."""
         return self._finished(self._assembler.finish())
 
     def _map(
@@ -127,7 +126,7 @@ class Derivation:
         return self._assembler.put(Derived(MAP_KEY, None, encoded), logged_ns)
 
     def _define(self, type_name: str, definition: str) -> None:
-        """Use the definition that came with the messages."""
+        """Use the type definition that came with the messages."""
         if definition and self._defined.get(type_name) != definition:
             known = self._types.knows(type_name) and self._types.definition(type_name)
             if known != definition:
@@ -142,7 +141,7 @@ class Derivation:
 
 
 class LoggedEvent(Protocol):
-    """What is needed of an event of a log."""
+    """The fields of a log's event that are used here."""
 
     @property
     def offset(self) -> int: ...
@@ -155,13 +154,14 @@ class LoggedEvent(Protocol):
 
 
 class MessageOf(Protocol):
-    """Type and definition of an event that is a message of ROS in CDR; None for others."""
+    """Returns type and definition of an event that is a ROS message in CDR, None for others."""
 
     def __call__(self, event: Any, /) -> tuple[str, str] | None: ...
 
 
 class DerivedFrom(NamedTuple):
-    """``derived`` was completed by the message at ``offset``; None where its recording ended."""
+    """A derived event, and the offset of the message that completed it; None for the end of its
+    recording."""
 
     offset: int | None
     derived: Derived
@@ -170,8 +170,8 @@ class DerivedFrom(NamedTuple):
 def derive(
     events: Iterable[LoggedEvent], types: MessageTypes, message_of: MessageOf
 ) -> Iterator[DerivedFrom]:
-    """Everything that the messages among ``events`` make, in their order. Raises LogDamaged for an
-    event on ``mapfold/ros`` that cannot be read."""
+    """Yield the envelopes and maps of all recordings among ``events``, in the order of the log.
+    Raises LogDamaged for an event on ``mapfold/ros`` that cannot be read."""
     derivation: Derivation | None = None
     for event in events:
         if event.key == ROS_KEY:

@@ -1,7 +1,7 @@
-"""The one user of rosbags: types of messages, messages in CDR, and bags.
+"""Message types, messages in CDR, and SQLite bags, by rosbags. Only this module imports it.
 
-rosbags is of the extra ``[ros]`` and imported when it is needed. It decodes by code that it makes
-from definitions of messages, so a bag's own definitions are parsed, never run as they stand.
+rosbags is in the extra ``[ros]`` and imported when it is first used. It decodes with code generated
+from message definitions, so names in a bag's definitions are checked before they get into code.
 """
 
 import re
@@ -49,8 +49,8 @@ _FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
 def _checked(type_name: str, fields: list[tuple[str, Any]]) -> tuple[list[Any], list[Any]]:
-    """A type without its constants, of which all names can stand in the code that rosbags makes
-    and runs; it does not check all of them itself. Raises ValueError."""
+    """Check the names of a type, which rosbags puts into generated code without checking all of
+    them. Returns the type without its constants. Raises ValueError."""
     for name in (type_name, *(name for _, kind in fields for name in _names_in(kind))):
         if not _TYPE_NAME.fullmatch(name):
             raise ValueError(f"{name[:80]!r} is no name of a type")
@@ -61,8 +61,8 @@ def _checked(type_name: str, fields: list[tuple[str, Any]]) -> tuple[list[Any], 
 
 
 def _names_in(kind: Any) -> Iterator[str]:
-    """The names of types in rosbags' description of a field: a pair of the kind of its node, and
-    a name, or a basic type and its length, or another description and its length."""
+    """The type names in rosbags' description of a field: a pair of a node kind and a name, a basic
+    type with its length, or an inner description with its length."""
     node, inner = kind
     if isinstance(inner, str):
         yield inner
@@ -80,7 +80,7 @@ def _not_installed(error: ImportError) -> NoRosbags:
 
 
 class Undecodable(ValueError):
-    """Bytes that are no message of the type, or of a type that is not known."""
+    """Bytes that are no message of the type, or a type or definition that is unknown or invalid."""
 
 
 class MessageTypes:
@@ -106,8 +106,8 @@ class MessageTypes:
             self.define(name, text)
 
     def define(self, type_name: str, text: str, *, is_idl: bool = False) -> None:
-        """Add a type, and those whose definitions follow in the same text, of which this one is
-        used although there is another. Raises Undecodable for a text that defines nothing."""
+        """Add a type and all others that the same text defines, in place of known types of these
+        names. Raises Undecodable for a text that cannot be read or defines nothing."""
         try:
             parsed = self._types_of_idl(text) if is_idl else self._parse(text, type_name)
             types = {name: _checked(name, fields) for name, (_, fields) in parsed.items()}
@@ -121,7 +121,7 @@ class MessageTypes:
             raise Undecodable(f"the definition of {type_name} cannot be read: {reason}") from None
 
     def _types_of_idl(self, text: str) -> dict[str, Any]:
-        """The types of a text in IDL, or of several after lines as bags put them between."""
+        """The types of a text in IDL, or of several texts with the separator lines of bags."""
         if not text.startswith(_IDL_MARK):
             return dict(self._parse_idl(text))
         types: dict[str, Any] = {}
@@ -130,7 +130,7 @@ class MessageTypes:
         return types
 
     def definition(self, type_name: str) -> str:
-        """The text of a type and all that it is made of, as bags keep it. Raises Undecodable."""
+        """The text that defines a type and all types in it, as bags keep it. Raises Undecodable."""
         try:
             text, _ = self._store.generate_msgdef(type_name, ros_version=2)
         except self._faults as error:
@@ -138,7 +138,7 @@ class MessageTypes:
         return text
 
     def knows(self, type_name: str) -> bool:
-        """Whether there is a definition of that name."""
+        """Whether the type has a definition."""
         return type_name in self._store.fielddefs
 
     def decode(self, payload: bytes, type_name: str) -> Any:
@@ -155,12 +155,12 @@ class MessageTypes:
         return bytes(self._store.serialize_cdr(message, type_name))
 
     def make(self, type_name: str, **fields: Any) -> Any:
-        """A message of a type."""
+        """A message of a type with these fields."""
         return self._store.types[type_name](**fields)
 
 
 class BadBag(ValueError):
-    """A bag's database that cannot be read, from here on."""
+    """A bag's database cannot be read, or not to its end; the message is the reason."""
 
 
 class BagTopic(NamedTuple):
@@ -209,8 +209,8 @@ class SqliteBag:
         )
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes]]:
-        """Topic, type, time of receipt and bytes of the messages, by that time. Raises BadBag
-        after the last good one."""
+        """Yield topic, type, time of receipt and bytes of each message, in order of receipt. Raises
+        BadBag after the last readable one."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if not chosen:
             return
@@ -224,7 +224,7 @@ class SqliteBag:
             raise BadBag(str(error)) from None
 
     def span(self) -> tuple[int, ...]:
-        """When its first and last messages were received; empty without messages."""
+        """The times of receipt of first and last message, int nanoseconds; empty without any."""
         if not self._reader.message_count:
             return ()
         return self._reader.start_time, self._reader.end_time - 1
@@ -243,4 +243,4 @@ _FAULTS: Final = (
     TypeError,
     UnicodeError,
 )
-"""What rosbags raises for files that are not what they say."""
+"""Exceptions of rosbags for damaged files."""

@@ -1,8 +1,8 @@
-"""Fields of ROS messages: from a decoded message to plain values.
+"""Read the fields of decoded ROS messages as plain values.
 
-A message is any object with the attributes of its definition, such as one that rosbags decodes.
-What is missing or of another type raises BadMessage; NaN is passed on, for the log's validation to
-refuse with its reason.
+A message is any object with the attributes of its definition, such as one that rosbags decodes. A
+field that is missing or of another type raises BadMessage; NaN is kept, and the log's validation
+refuses it.
 """
 
 import math
@@ -29,7 +29,7 @@ FLOATS: Final = "std_msgs/msg/Float32MultiArray"
 UNCLASSIFIED: Final = "unclassified"
 """The class of a detection without a hypothesis."""
 _POSE_OF_6D: Final = (0, 1, 5, 6, 7, 11, 30, 31, 35)
-"""x, y and yaw of the covariance of x, y, z, roll, pitch and yaw, row by row."""
+"""Indices of x, y and yaw in the covariance of x, y, z, roll, pitch and yaw, row by row."""
 _NS: Final = 1_000_000_000
 _NS_DIGITS: Final = 9
 
@@ -40,11 +40,11 @@ Covariance = tuple[float, ...]
 
 
 class BadMessage(ValueError):
-    """A message that is not what its type says, or holds what no such message may hold."""
+    """A message that does not fit its type or has an invalid value; the text is the reason."""
 
 
 class Stamped(NamedTuple):
-    """A transform of a TFMessage."""
+    """One transform of a TFMessage, with its stamp."""
 
     parent: str
     child: str
@@ -53,8 +53,8 @@ class Stamped(NamedTuple):
 
 
 class StampedPose(NamedTuple):
-    """A pose of odometry or localisation. ``child`` is empty where the message names none.
-    ``fault`` is why it has no covariance; None where the sender left it at zeros."""
+    """A pose of odometry or localisation. ``child`` is empty if the message names no child frame.
+    ``fault`` is the reason why its covariance is unusable; None if it is usable or all zeros."""
 
     parent: str
     child: str
@@ -65,7 +65,7 @@ class StampedPose(NamedTuple):
 
 
 class Lens(NamedTuple):
-    """A camera, of CameraInfo."""
+    """Field of view and picture size of a camera, from CameraInfo."""
 
     frame: str
     hfov_deg: float
@@ -81,7 +81,7 @@ class Embeddings(NamedTuple):
     dim: int | None
     by_index: Sequence[str | None]
     by_id: Mapping[str, str | None] | None
-    """None where they are by index."""
+    """By Detection2D.id; None if they are by index."""
 
 
 class Detected(NamedTuple):
@@ -101,14 +101,14 @@ def stamp_of(stamp: Any) -> int:
 
 
 def frame_name(name: Any) -> str:
-    """A frame's name without the slash that ROS 1 put before it."""
+    """A frame's name without the leading slash of ROS 1."""
     if not isinstance(name, str):
         raise BadMessage(f"a frame's name is {type(name).__name__}, not text")
     return name.removeprefix("/")
 
 
 def read(reader: Callable[[Any], _Read], message: Any) -> _Read:
-    """``reader(message)``; BadMessage where the message has not the fields of its type."""
+    """``reader(message)``; raises BadMessage if the message lacks a field of its type."""
     try:
         return reader(message)
     except (
@@ -229,7 +229,7 @@ def _best(results: Sequence[Any], labels: Mapping[str, str]) -> tuple[str, float
 
 
 def _box(bbox: Any) -> list[float]:
-    """Left, top, right and bottom of what a box covers that may be turned."""
+    """Left, top, right and bottom of the upright box around a box that may be rotated."""
     center, width, height = bbox.center, float(bbox.size_x), float(bbox.size_y)
     at = getattr(center, "position", center)  # a geometry_msgs/Pose2D before vision_msgs 4
     theta = float(center.theta)

@@ -1,8 +1,8 @@
-"""Where a picture was taken: from transforms, odometry or a localiser's poses.
+"""The pose at which a picture was taken, from transforms, odometry or a localiser's poses.
 
-The pose is that of the picture's own stamp. ``x``, ``y`` are where the camera is, since bearings
-start there; ``yaw`` is the heading of the robot's base, ``camera_yaw`` the angle from it to where
-the camera looks. Results are rounded to micrometres and nanoradians.
+The pose is interpolated at the picture's stamp. ``x``, ``y`` are the camera's position, since
+bearings start there; ``yaw`` is the heading of the robot's base, ``camera_yaw`` the angle from it
+to the camera's heading. Results are rounded to micrometres and nanoradians.
 """
 
 import math
@@ -21,11 +21,11 @@ from .messages import (
     transform_of,
 )
 from .stream import Counts, Stream
-from .transforms import History, Transform, TransformBuffer, compose, interpolate, rotate
+from .transforms import TimeSeries, Transform, TransformBuffer, compose, interpolate, rotate
 
 _MOST_POSES: Final = 50_000
 _UPRIGHT: Final = 0.5
-"""A z axis that points up or down more than that is not the one that the camera looks along."""
+"""A z axis with a larger vertical component is not a camera's optical axis."""
 _METRES, _RADIANS = 6, 9
 _Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
 """The base, the camera and the error of the pose."""
@@ -33,7 +33,8 @@ _Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
 
 @dataclass(frozen=True, slots=True)
 class PicturePose:
-    """Metres and radians in the map's frame; ``z`` is the base's height."""
+    """A pose in the map frame, metres and radians; ``z`` is the base's height. ``has_base`` and
+    ``has_camera`` say which of the two frames were known."""
 
     x: float
     y: float
@@ -52,13 +53,14 @@ class PoseSource:
         self._stream = stream
         self._buffer = buffer
         self._counts = counts
-        self._given: History[StampedPose] = History()
+        self._given: TimeSeries[StampedPose] = TimeSeries()
         self._frame: str | None = None
         self.received = 0
-        """Messages taken. Without another one, what is not known yet stays so."""
+        """Number of messages added, without those that other streams added to a shared buffer."""
 
-    def take_transforms(self, topic: str, type_name: str, message: Any) -> None:
-        """Take a TFMessage, static if it is of the stream's topic of such."""
+    def add_transforms(self, topic: str, type_name: str, message: Any) -> None:
+        """Add the transforms of a TFMessage; they are static if ``topic`` is the stream's
+        ``tf_static``."""
         self.received += 1
         _expect(type_name, TF)
         static = topic == self._stream.tf_static
@@ -73,8 +75,8 @@ class PoseSource:
             else:
                 self._buffer.add(parent, child, stamp_ns, pose)
 
-    def take_pose(self, topic: str, type_name: str, message: Any) -> None:
-        """Take a pose of odometry or of a localiser."""
+    def add_pose(self, topic: str, type_name: str, message: Any) -> None:
+        """Add a pose of odometry or of a localiser. Raises BadMessage."""
         self.received += 1
         _expect(type_name, ODOMETRY, POSE)
         pose = read(pose_of, message)
@@ -95,8 +97,10 @@ class PoseSource:
         return self._stream.map_frame if self._stream.pose is None else self._frame
 
     def at(self, stamp_ns: int, camera: str, *, final: bool) -> PicturePose | None:
-        """The pose of a picture; None while it is not known. ``final`` takes what there is: the
-        base's pose where no transform leads to the camera, or the other way round."""
+        """The pose of a picture; None while it is unknown. ``camera`` is the frame of the camera.
+
+        With ``final`` the base's pose stands for an unknown camera's, and the other way round.
+        """
         of = self._of_transforms if self._stream.pose is None else self._of_poses
         base, there, covariance = of(stamp_ns, camera, final=final)
         if base is None or there is None:
@@ -150,9 +154,9 @@ def heading(t: Transform) -> float:
 
 
 def heading_of_camera(t: Transform, frame: str) -> float:
-    """Where a camera looks, on the ground: along z in an optical frame, as of pictures, along x in
-    one of the robot's body. A frame without ``optical`` in its name is taken for an optical one if
-    its z axis lies nearer to the ground than upright."""
+    """The heading of a camera on the ground, radians: along z in an optical frame, along x in a
+    frame of the robot's body. A frame without ``optical`` in its name counts as optical if its z
+    axis is nearer to horizontal than to vertical."""
     x, y, z = rotate(t, 0.0, 0.0, 1.0)
     if "optical" in frame or abs(z) < _UPRIGHT:
         return math.atan2(y, x)

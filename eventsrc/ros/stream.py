@@ -1,4 +1,4 @@
-"""What a topic of detections goes with: its run, and the topics and frames of its poses."""
+"""Streams: a topic of detections with its run, and the topics and frames of its poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ MAX_WAITING: Final = 1_000
 
 @dataclass(frozen=True)
 class Stream:
-    """A topic of detections, and where what belongs to them comes from.
+    """A topic of detections, and the topics that complete its envelopes.
 
     ``pose`` is the topic of an Odometry or PoseWithCovarianceStamped, whose frame is then the
     map's; None for the transforms from ``map_frame`` down to ``base_frame`` and the camera.
@@ -48,7 +48,7 @@ class Stream:
 
 @dataclass
 class Counts:
-    """What the envelopes of a stream have, and what they lack."""
+    """Counts of a stream's keyframes and detections, by what they have or lack."""
 
     keyframes: int = 0
     detections: int = 0
@@ -60,15 +60,15 @@ class Counts:
     without_camera: int = 0
     """Keyframes without field of view and picture size."""
     without_covariance: int = 0
-    """Keyframes that have a pose, but no error of it."""
+    """Keyframes that have a pose without a covariance."""
     with_embedding: int = 0
-    """Detections that have one."""
+    """Detections that have an embedding."""
     unclassified: int = 0
     """Detections without a hypothesis."""
     unused: dict[str, int] = field(default_factory=dict)
-    """Messages, or transforms of them, that could not be used, by topic."""
+    """Number of messages, or transforms in them, that could not be used, by topic."""
     reasons: dict[str, str] = field(default_factory=dict)
-    """Why the first of each topic could not."""
+    """The reason for the first of them, by topic."""
 
     def refuse(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used."""

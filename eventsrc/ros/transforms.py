@@ -1,10 +1,10 @@
-"""The tree of frames of ROS over time: what /tf and /tf_static say, interpolated at a stamp.
+"""The tree of ROS frames over time: transforms of /tf and /tf_static, interpolated at a stamp.
 
 A transform is the pose of a child frame in its parent: x, y, z in metres and a unit quaternion.
 Between two samples of a link the position is interpolated linearly and the rotation by slerp, as
-tf2 does; beyond the first and last sample there is nothing. Samples may come in any order. Unlike
-tf2, two samples farther apart than ``max_gap_ns`` are not interpolated, and memory is bounded by a
-number of samples, not by time, so that one stamp in the far future removes no samples.
+tf2 does; before the first and after the last sample there is no result. Samples may come in any
+order. Unlike tf2, two samples farther apart than ``max_gap_ns`` are not interpolated, and memory is
+bounded by a number of samples, not by time, so that a stamp in the far future removes no samples.
 """
 
 import math
@@ -18,7 +18,7 @@ MAX_SAMPLES: Final = 200_000
 """Samples that a buffer keeps. When there are more, the older half of each link is deleted."""
 MAX_FRAMES: Final = 2_000
 _MAX_DEPTH: Final = 100
-"""Links from a frame up to the root; more is a circle."""
+"""Bound of the links from a frame up to the root; more is a cycle."""
 _NORM_TOLERANCE: Final = 0.01
 _PARALLEL: Final = 0.9999995
 """Cosine of half the angle above which slerp and linear interpolation are the same to 1e-10."""
@@ -42,13 +42,14 @@ IDENTITY: Final = Transform(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class BadTransform(ValueError):
-    """A pose that is none: not finite, out of bounds, or without a rotation."""
+    """An invalid pose: not finite, out of bounds, or without a unit quaternion."""
 
 
 def unit_transform(
     x: float, y: float, z: float, qx: float, qy: float, qz: float, qw: float
 ) -> Transform:
-    """A transform whose quaternion has length 1. Raises BadTransform unless it had nearly so."""
+    """A transform with its quaternion normalised. Raises BadTransform if its length is not near 1,
+    or the position is out of bounds."""
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise BadTransform(f"the rotation ({qx:g}, {qy:g}, {qz:g}, {qw:g}) is no unit quaternion")
@@ -58,7 +59,7 @@ def unit_transform(
 
 
 def rotate(t: Transform, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The vector turned by the rotation of a transform."""
+    """The vector (x, y, z) turned by the rotation of ``t``."""
     _, _, _, qx, qy, qz, qw = t
     # v + 2 q × (q × v + w v)
     ax = qy * z - qz * y + qw * x
@@ -72,7 +73,7 @@ def rotate(t: Transform, x: float, y: float, z: float) -> tuple[float, float, fl
 
 
 def compose(a: Transform, b: Transform) -> Transform:
-    """The pose in the parent of ``a`` of what ``b`` places in the child of ``a``."""
+    """The product ``a`` · ``b``: a pose ``b`` in the child frame of ``a``, in the parent frame."""
     dx, dy, dz = rotate(a, b.x, b.y, b.z)
     _, _, _, ax, ay, az, aw = a
     _, _, _, bx, by, bz, bw = b
@@ -88,14 +89,14 @@ def compose(a: Transform, b: Transform) -> Transform:
 
 
 def invert(t: Transform) -> Transform:
-    """The parent's pose in the child."""
+    """The inverse: the parent's pose in the child frame."""
     turned_back = Transform(0.0, 0.0, 0.0, -t.qx, -t.qy, -t.qz, t.qw)
     x, y, z = rotate(turned_back, -t.x, -t.y, -t.z)
     return Transform(x, y, z, -t.qx, -t.qy, -t.qz, t.qw)
 
 
 def interpolate(a: Transform, b: Transform, share: float) -> Transform:
-    """``a`` at share 0, ``b`` at 1; the rotation takes the shorter way."""
+    """Between ``a`` (share 0) and ``b`` (share 1): linear, and slerp by the shorter way."""
     dot = a.qx * b.qx + a.qy * b.qy + a.qz * b.qz + a.qw * b.qw
     sign = -1.0 if dot < 0.0 else 1.0
     dot = abs(dot)
@@ -120,8 +121,8 @@ def interpolate(a: Transform, b: Transform, share: float) -> Transform:
     )
 
 
-class History(Generic[Value]):
-    """Values by stamp, in ascending order, in whatever order they come."""
+class TimeSeries(Generic[Value]):
+    """Values by stamp, kept in ascending order; they may be added in any order."""
 
     __slots__ = ("stamps", "values")
 
@@ -130,7 +131,7 @@ class History(Generic[Value]):
         self.values: list[Value] = []
 
     def add(self, stamp_ns: int, value: Value) -> bool:
-        """Enter a value; False, and nothing is changed, where there is one of that stamp."""
+        """Add a value; return False, without a change, if the stamp has one already."""
         stamps = self.stamps
         if not stamps or stamp_ns > stamps[-1]:
             stamps.append(stamp_ns)
@@ -144,8 +145,9 @@ class History(Generic[Value]):
         return True
 
     def around(self, stamp_ns: int, max_gap_ns: int) -> tuple[Value, Value, float] | None:
-        """The values before and after a stamp, and its share of the way from the one to the other.
-        None where there is nothing on one side, or more than ``max_gap_ns`` between them."""
+        """The values before and after a stamp, and the share, 0 to 1, of the time between them that
+        has passed at the stamp. None if one is missing or they are more than ``max_gap_ns`` apart.
+        """
         stamps = self.stamps
         after = bisect_left(stamps, stamp_ns)
         if after == len(stamps):
@@ -162,12 +164,12 @@ class History(Generic[Value]):
         return self.values[after - 1], self.values[after], share
 
     def latest(self, stamp_ns: int) -> Value | None:
-        """The last value up to a stamp."""
+        """The last value at or before a stamp."""
         at = bisect_right(self.stamps, stamp_ns)
         return self.values[at - 1] if at else None
 
     def forget_half(self) -> int:
-        """Drop the older half; returns how many that were."""
+        """Drop the older half; return the number of dropped values."""
         half = len(self.stamps) // 2
         del self.stamps[:half]
         del self.values[:half]
@@ -176,11 +178,11 @@ class History(Generic[Value]):
 
 @dataclass(slots=True)
 class _Link:
-    """A child's poses in ``parent``; one that holds for all times if it is static."""
+    """A child's poses in ``parent``: one for all times if it is static, else samples by stamp."""
 
     parent: str
     static: Transform | None = None
-    moving: "History[Transform]" = field(default_factory=lambda: History())
+    moving: "TimeSeries[Transform]" = field(default_factory=lambda: TimeSeries())
 
     def at(self, stamp_ns: int, max_gap_ns: int) -> Transform | None:
         if self.static is not None:
@@ -190,7 +192,7 @@ class _Link:
 
 
 def _merged(links: list[_Link]) -> list[_Link]:
-    """The same way with one link for each row of static ones; the first is the lowest."""
+    """The same path with consecutive static links composed into one; the first is the lowest."""
     merged: list[_Link] = []
     for link in links:
         below = merged[-1].static if merged else None
@@ -212,11 +214,11 @@ class TransformBuffer:
         self._samples = 0
         self._paths: dict[tuple[str, str], tuple[list[_Link], list[_Link]] | None] = {}
         self.ignored = 0
-        """Samples that were not taken: of a frame in itself, of more than MAX_FRAMES frames, older
-        than a change of parent, moving of a static child."""
+        """Number of samples not kept: of a frame in itself, of more than MAX_FRAMES frames, older
+        than a change of parent, or moving ones of a static child."""
 
     def add(self, parent: str, child: str, stamp_ns: int, pose: Transform) -> None:
-        """A sample of a moving link. Of two with one stamp the first counts."""
+        """Add a sample of a moving link. Of two with the same stamp the first is kept."""
         link = self._link(parent, child)
         if link is None or link.static is not None:
             self.ignored += 1
@@ -227,14 +229,14 @@ class TransformBuffer:
                 self.ignored += 1
                 return
             self._samples -= len(stamps)
-            link.parent, link.moving = parent, History()
+            link.parent, link.moving = parent, TimeSeries()
             self._paths.clear()
         self._samples += link.moving.add(stamp_ns, pose)
         if self._samples > self._max_samples:
             self._forget()
 
     def add_static(self, parent: str, child: str, pose: Transform) -> None:
-        """A link that holds for all times; the last one said counts."""
+        """Add a link for all times, in place of an earlier one of the child."""
         link = self._link(parent, child)
         if link is None:
             self.ignored += 1
@@ -259,19 +261,19 @@ class TransformBuffer:
         return None if back is None else compose(invert(back), there)
 
     def is_connected(self, target: str, source: str) -> bool:
-        """Whether links lead from the one to the other, whatever their times."""
+        """Whether links join the two frames at any time."""
         return target == source or self._path(target, source) is not None
 
     def above(self, frame: str) -> list[str]:
-        """The frame, and those that links lead up to; empty for a circle."""
+        """The frame and all its ancestors, from below; empty for a cycle."""
         return [name for name, _ in self._upwards(frame)]
 
     def frames(self) -> set[str]:
-        """All frames that a link names."""
+        """All parents and children of links."""
         return {name for child, link in self._links.items() for name in (child, link.parent)}
 
     def _link(self, parent: str, child: str) -> _Link | None:
-        """The child's link, made if there is none; None if it may not have one."""
+        """The child's link, added if there is none; None if it is not allowed."""
         if parent == child or not parent or not child:
             return None
         link = self._links.get(child)
@@ -283,7 +285,7 @@ class TransformBuffer:
         return link
 
     def _path(self, target: str, source: str) -> tuple[list[_Link], list[_Link]] | None:
-        """Links from the source up, and from the target up, to the frame that they share first."""
+        """Links from the source and from the target up to their lowest common ancestor."""
         key = target, source
         if key not in self._paths:
             if len(self._paths) > MAX_FRAMES:
@@ -307,7 +309,7 @@ class TransformBuffer:
         return None
 
     def _upwards(self, frame: str) -> list[tuple[str, _Link | None]]:
-        """A frame and those above it, each with its link; the topmost has none."""
+        """A frame and its ancestors, each with its link, None for the root; empty for a cycle."""
         way: list[tuple[str, _Link | None]] = []
         while len(way) < _MAX_DEPTH:
             link = self._links.get(frame)
@@ -315,7 +317,7 @@ class TransformBuffer:
             if link is None:
                 return way
             frame = link.parent
-        return []  # a circle
+        return []
 
     def _chain(self, links: list[_Link], stamp_ns: int) -> Transform | None:
         """The pose of the lowest child of a chain in its highest parent."""

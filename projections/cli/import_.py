@@ -174,7 +174,7 @@ def import_(
     for line in _passed_over(report):
         say(line)
     useless = any(bag.is_useless for bag in report.bags)
-    finish(findings=report.rejected > 0 or report.nothing_of_something or useless)
+    finish(findings=report.rejected > 0 or report.imported_nothing or useless)
 
 
 def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
@@ -252,9 +252,9 @@ def _passed_over(report: ImportReport) -> Iterator[str]:
     if len(report.passed_over) > _MOST_TOPICS:
         yield f"… and {counted(len(report.passed_over) - _MOST_TOPICS, 'topic')} more"
     chosen_away = any(each.what == NOT_CHOSEN for each in report.passed_over)
-    if report.nothing_of_something and not report.rejected and chosen_away:
+    if report.imported_nothing and not report.rejected and chosen_away:
         yield "nothing was imported: --topic chooses none of these topics"
-    elif report.nothing_of_something and not report.rejected:
+    elif report.imported_nothing and not report.rejected:
         yield (
             "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
             "imports a topic of JSON nevertheless and reports what is wrong with each message"
