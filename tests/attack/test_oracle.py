@@ -1,5 +1,6 @@
 """The attack's own judgement: it must notice what it is there to notice."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -78,7 +79,7 @@ def test_a_traceback_and_the_memory_of_a_command_are_seen(
 ) -> None:
     failing = _MAPFOLD.replace("main()", "bytearray(100_000_000); 1 / 0")
     monkeypatch.setattr("tests.attack.attacked_command._MAPFOLD", failing)
-    attacked = AttackedCommand("reader", [], env={}, cwd=tmp_path)
+    attacked = AttackedCommand("reader", [], env=os.environ, cwd=tmp_path)
     try:
         assert attacked.wait() == 1
         assert attacked.faults() == ["Traceback (most recent call last):"]
@@ -88,7 +89,7 @@ def test_a_traceback_and_the_memory_of_a_command_are_seen(
 
 
 def test_a_command_leaves_its_numbers_behind(tmp_path: Path) -> None:
-    attacked = AttackedCommand("reader", ["--help"], env={"PATH": ""}, cwd=tmp_path)
+    attacked = AttackedCommand("reader", ["--help"], env={**os.environ, "PATH": ""}, cwd=tmp_path)
     try:
         assert attacked.wait() == 0, attacked.lines
         assert "record" in attacked.output()
