@@ -99,7 +99,8 @@ class PoseCorrection(NamedTuple):
 
 
 class Corrections(msgspec.Struct, frozen=True, eq=False):
-    """What the fold obeys; `compile_corrections` makes it. Pairs are in ascending order.
+    """The compiled corrections of a fold; `compile_corrections` makes them. Pairs are in ascending
+    order.
 
     ``settings`` are those of the log, None if it names none. ``in_force`` are the commands that
     were not undone or replaced, in the order of the log.
@@ -213,7 +214,7 @@ def map_fingerprint(settings: Settings, corrections: Corrections) -> str:
 
 
 def commands_in_force(commands: Iterable[RecordedCommand]) -> list[RecordedCommand]:
-    """Those that no later command in force undoes (rule 1), in order; undos are not among them.
+    """The commands that no later command in force undoes (rule 1), in order; undos are left out.
 
     Of commands with one command_id the first counts: the others are the same one, sent again.
     """

@@ -40,7 +40,7 @@ def pooled(mask: _Mask, step: int) -> _Mask:
 
 
 def _turns(mask: _Mask) -> _Mask:
-    """Where the horizontal parts of the outline begin and end: by corners of cells."""
+    """The corners of cells at which horizontal parts of the outline begin or end."""
     framed = np.pad(mask, ((1, 1), (0, 0)))
     edges = np.pad(framed[1:] != framed[:-1], ((0, 0), (1, 1)))
     return np.asarray(edges[:, 1:] != edges[:, :-1])

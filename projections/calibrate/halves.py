@@ -85,7 +85,8 @@ def _disagreement(
 def _position(
     thing: Thing, seen: Sightings, rows: Ints, bearing_var: Floats, pose_var: float
 ) -> tuple[float, float, Floats]:
-    """Where these lines of sight meet, from where all of them do, and the information matrix."""
+    """The point in which these lines of sight meet, starting from that of all of them, and the
+    information matrix."""
     x, y, sight = seen.x[rows], seen.y[rows], seen.sight[rows]
     normals = np.stack([-np.sin(sight), np.cos(sight)], axis=1)
     offset = normals[:, 0] * x + normals[:, 1] * y

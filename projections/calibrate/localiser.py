@@ -37,11 +37,12 @@ class Line(NamedTuple):
 
 KNOWN_USUAL = Line(0.81, 0.62)
 CONFIDENCE_USUAL = Line(0.93, -0.24)
-"""Of the own questions of the maps that the weights were fitted on (`scripts/fit_confidence`)."""
+"""The lines fitted to own questions of the maps that the weights were fitted on
+(`scripts/fit_confidence`)."""
 KNOWN_FIRMNESS, CONFIDENCE_FIRMNESS = 12.0, 64.0
-"""How firmly a map's line is drawn towards the usual one: the precision of its shift, of its scale
-four times as much. A question whose logit is near 0 has a precision of a quarter. How near poses
-are on own questions hangs on the tour as much as on the map, so that line hardly moves."""
+"""The precision of the prior of a map's line: that of its shift; that of its scale is four times as
+much. A question whose logit is near 0 has a precision of a quarter. How near poses are on own
+questions hangs on the tour as much as on the map, so that line hardly moves."""
 _FIRM = 1e-9
 _ROUNDS = 60
 _ENOUGH = 1e-12

@@ -105,10 +105,10 @@ def _bounds(name: str) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a log shows. ``settings`` are those that it was calibrated under; `calibrated` are the
-    same with its constants. Counts are of the last fold: keyframes with a pose, observations that
-    were fused, Objects, runs. ``unboxed`` observations have an empty box; ``beyond`` boxes reach
-    beyond the picture. ``own`` are the results of its own questions."""
+    """The calibration of a log. ``settings`` are those that it was calibrated under; `calibrated`
+    are the same with its constants. Counts are of the last fold: keyframes with a pose,
+    observations that were fused, Objects, runs. ``unboxed`` observations have an empty box;
+    ``beyond`` boxes reach beyond the picture. ``own`` are the results of its own questions."""
 
     settings: Settings
     last: Round

@@ -95,7 +95,7 @@ def finish(*, findings: bool) -> None:
 
 
 class _Listeners:
-    """What `reading_bar` wants to know."""
+    """The functions that `reading_bar` has registered."""
 
     output: Callable[[], None] | None = None
     own_bar: Callable[[int], None] | None = None

@@ -100,7 +100,7 @@ def changing_rows(view: MapView) -> dict[Label, list[Any]]:
 
 
 def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
-    """What to insert, upsert and delete after a batch."""
+    """The rows to insert, upsert and delete after a batch."""
     upserted: dict[Label, list[Any]] = {
         "Run": list(run_rows(view, changes.runs)),
         "Object": list(object_rows(view, filter(view.objects.__contains__, changes.objects))),

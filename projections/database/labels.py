@@ -27,7 +27,7 @@ OLD_GRAPH: Final = "semantic_map_old"
 """The graph that a shadow replaced, until its last reader has ended."""
 TABLE: Final = "detection_embeddings"
 MAP_TABLE: Final = "occupancy_map"
-"""Of the graph's sink, in the schema ``mapfold``."""
+"""The table of occupancy maps of the graph's sink, in the schema ``mapfold``."""
 
 VertexLabel: TypeAlias = Literal[
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "Floor", "Building"

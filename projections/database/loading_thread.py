@@ -17,7 +17,7 @@ Job: TypeAlias = Callable[[], None]
 
 WAITING_JOBS: Final = 4
 SWITCH_S: Final = 0.0005
-"""How long the fold may hold the interpreter while this thread waits for it. Python's own 5 ms
+"""Seconds that the fold may hold the interpreter while this thread waits for it. Python's own 5 ms
 would add up, as a COPY asks for it with every 128 kB."""
 
 

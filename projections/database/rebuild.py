@@ -47,7 +47,7 @@ OnProgress: TypeAlias = Callable[[RebuildProgress], None]
 
 @dataclass(frozen=True, slots=True)
 class RebuildReport:
-    """What a rebuild did. ``rows`` is by graph label and table; times are seconds.
+    """The outcome of a rebuild. ``rows`` is by graph label and table; times are seconds.
 
     ``foreign`` is the first embedding that was left out because it is outside the map's space.
     ``workers`` is how many processes were started to parse the log, ``lost_workers`` how many of

@@ -80,7 +80,7 @@ class LostCommits(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SinkBatch:
-    """What is written to one sink in one transaction, and its checkpoint before and after."""
+    """The write to one sink in one transaction, and its checkpoint before and after."""
 
     sink: DatabaseSink
     write: PreparedWrite[Connection]

@@ -102,7 +102,7 @@ def place_rooms(view: MapView, run: SimulatedRun) -> dict[str, str]:
 
 
 def _first_question(run: SimulatedRun) -> int:
-    """Of the keyframes at the start the first with the most detections, counting at most three.
+    """The first keyframe near the start with the most detections, counting at most three.
 
     If those have none, the first keyframe of the run that has any.
     """

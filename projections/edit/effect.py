@@ -110,7 +110,7 @@ class Change:
 
 
 def effect_of(before: MapView, after: MapView) -> Effect:
-    """How much differs between two maps of the same events."""
+    """The counts of differences between two maps of the same events."""
     with working(_COMPARING):
         first, second = rows_of(before), rows_of(after)
         return Effect(

@@ -134,7 +134,7 @@ def _id_of(recorded: RecordedCommand | None) -> str | None:
 
 
 def _first_offsets(found: Found) -> dict[str, Offset]:
-    """Of each command_id the offset of the command that counts."""
+    """The offset of the command that counts, for each command_id."""
     first: dict[str, Offset] = {}
     for recorded, _ in found:
         first.setdefault(recorded.command.command_id, recorded.offset)

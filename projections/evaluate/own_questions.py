@@ -147,7 +147,7 @@ def _by_class(view: MapView) -> dict[str, list[ObjectRecord]]:
 def _visit(
     runs: dict[RunId, list[KeyframeRecord]], keyframe: KeyframeRecord
 ) -> set[ObservationOrdinal]:
-    """What was observed within `VISIT` keyframes of one, by their numbers in the run."""
+    """The observations of keyframes within `VISIT` of one, counted in the order of the run."""
     own, number = runs[keyframe.run_id], keyframe.keyframe_id
     first = bisect_left(own, number - VISIT, key=lambda each: each.keyframe_id)
     last = bisect_right(own, number + VISIT, key=lambda each: each.keyframe_id)

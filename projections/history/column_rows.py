@@ -108,7 +108,7 @@ class StripeBuilder:
 
     @property
     def events(self) -> int:
-        """How many events the next stripe has so far."""
+        """The number of events in the next stripe so far."""
         return self._end - self._start
 
     def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:

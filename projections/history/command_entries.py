@@ -235,7 +235,7 @@ def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
 
 
 def _moved(history: History, command: CorrectPoses, place: PlaceOrdinal, end: Offset) -> int:
-    """How many keyframes of a place have a pose that the command corrects."""
+    """The number of keyframes of a place whose pose the command corrects."""
     given = {pose.keyframe_id for pose in command.poses}
     first, last = command.first, command.last
     return sum(

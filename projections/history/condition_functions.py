@@ -21,7 +21,7 @@ class Type(Enum):
 
 
 class Names(Enum):
-    """What a text argument names; the value is its name in messages."""
+    """The kind of thing that a text argument names; the value is its name in messages."""
 
     KEYFRAME = "keyframe"
     PLACE = "place"
@@ -91,7 +91,7 @@ class Facts(Protocol):
         """Whether a place was absorbed by another."""
 
     def name(self, place_id: str) -> str | None:
-        """What a place is called; None once it was absorbed."""
+        """The name of a place; None once it was absorbed."""
 
     def place_called(self, name: str) -> str | None:
         """The place that stands and is called so, of several the one founded first."""

@@ -33,7 +33,7 @@ from .condition_functions import FUNCTIONS, Direction, Facts, Function, Names, T
 MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
 MAX_DIGITS = 4300
-"""Of a number: as many as Python converts by default."""
+"""Most digits of a number: as many as Python converts by default."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>-?\d+)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),])"

@@ -1,4 +1,4 @@
-"""Why a place or an object is what it is: what happened to it, event by event."""
+"""Explain a place or an object: its history, event by event."""
 
 from bisect import bisect_right
 from collections import Counter
@@ -44,7 +44,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What happened to ``subject``, in order, and in ``summary`` its state afterwards.
+    """The history of ``subject`` in ``entries``, in order, and its state afterwards in ``summary``.
 
     ``kind`` is ``place``, ``object`` or ``same``.
     """
@@ -73,7 +73,7 @@ def with_entries(found: Explanation, entries: Sequence[Entry]) -> Explanation:
 
 
 def explain_place(history: History, record: PlaceHistory, end: Offset) -> Explanation:
-    """What happened to a place in the events below ``end``."""
+    """Explain a place by the events below ``end``."""
     entries = sorted(
         (e for e in _place_entries(history, record) if e.cause.offset < end),
         key=lambda e: e.cause.offset,
@@ -225,7 +225,7 @@ def explain_object(
     record: ObjectHistory,
     end: Offset,
 ) -> Explanation:
-    """What happened to an object in the events below ``end``."""
+    """Explain an object by the events below ``end``."""
     seen = [observation(each.observation) for each in sightings_of(history, record, end)]
     votes = Counter(each.class_name for each in seen)
     entries = sorted(

@@ -183,7 +183,7 @@ class ObjectMerge:
 
 @dataclass(slots=True)
 class PlaceHistory:
-    """What happened to a place, from its founding on. The lists are in order of offset."""
+    """The history of a place, from its founding on. The lists are in order of offset."""
 
     formed: PlaceFormed
     cause: Cause
@@ -211,14 +211,14 @@ class PlaceHistory:
         return last_before(self.changes, end)
 
     def name(self, end: Offset) -> str | None:
-        """What it is called after the events below ``end``; None without a name."""
+        """Its name after the events below ``end``; None without a name."""
         named = last_before(self.names, end)
         return None if named is None else named.name
 
 
 @dataclass(slots=True)
 class ObjectHistory:
-    """What happened to an object, from its first sighting on. The lists are in order of offset."""
+    """The history of an object, from its first sighting on. The lists are in order of offset."""
 
     found: ObjectFound
     cause: Cause

@@ -162,7 +162,7 @@ class Tables:
         return found
 
     def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
-        """These rows; of each stripe only the rows asked for are read."""
+        """`rows_at`; of each stripe only the requested rows are read."""
         bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in self.stripes)])
         within = np.searchsorted(bounds, numbers, "right") - 1
         found: list[tuple[Any, ...]] = []
@@ -228,7 +228,7 @@ class Groups:
         self._ends = np.concatenate([[0], np.cumsum(counts)])
 
     def __getitem__(self, value: int) -> Array:
-        """Those with this value, in order."""
+        """The items with this value, in order."""
         if value + 1 >= len(self._ends):
             return self._order[:0]
         return self._order[self._ends[value] : self._ends[value + 1]]
@@ -243,7 +243,7 @@ def _stripe_lists(stripe: Stripe, table: str, first: int, last: int) -> Iterator
 
 
 def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
-    """These rows of a stripe."""
+    """The rows of a stripe with these indices."""
     columns: list[Any] = []
     for column, kind in TABLES[table].items():
         if kind == "text":

@@ -1,4 +1,4 @@
-"""Which rows of a `MapView` a batch of events added or changed.
+"""The rows of a `MapView` that a batch of events added or changed.
 
 `ChangeTracker` applies events to a view and collects the ordinals that they touch; a sink reads the
 values from the view afterwards. So a thousand changes of one Object in a batch are one ordinal.
@@ -43,7 +43,7 @@ are none if the view keeps no embeddings."""
 
 @dataclass(frozen=True, slots=True)
 class BatchChanges:
-    """What a batch added or changed, as ordinals in ascending order; `MapView` has the values.
+    """The changes of a batch, as ordinals in ascending order; `MapView` has the values.
 
     ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
     keyframe and the object of an observation: ``placed`` are the keyframes that joined a place or
@@ -97,7 +97,7 @@ class ChangeTracker:
 
     @property
     def added(self) -> int:
-        """How many keyframes and observations are new since the last `drain`."""
+        """The number of new keyframes and observations since the last `drain`."""
         view = self.view
         return len(view.keyframes) - self._keyframes + len(view.observations) - self._observations
 

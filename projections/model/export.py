@@ -1,4 +1,4 @@
-"""What ``mapfold state`` prints: the map as a JSON document or as text."""
+"""Output of ``mapfold state``: the map as a JSON document or as text."""
 
 from statistics import median
 from typing import Any

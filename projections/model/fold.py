@@ -28,7 +28,7 @@ SNAPSHOT_MIN_EVENTS = 5_000
 
 
 class FoldedEvent(NamedTuple):
-    """What the event at ``offset`` changed; of mapfold's own events only a map changes anything."""
+    """The deltas of the event at ``offset``; of mapfold's own events only maps have any."""
 
     offset: Offset
     deltas: list[Delta]

@@ -8,7 +8,7 @@ from eventsrc.text import visible
 from .view import MapView
 
 UNNAMED = "-"
-"""What `--floor` calls the floor of poses whose envelopes name none."""
+"""The value of `--floor` for the floor of poses whose envelopes name none."""
 
 
 def view_of_floor(view: MapView, floor: str) -> MapView:

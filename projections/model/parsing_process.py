@@ -30,7 +30,7 @@ SLOT_BYTES: Final = 8 * 1024 * 1024
 """Bytes of a slot: five times those of a range of detections with embeddings only. Memory is used
 only as far as it is written."""
 PATIENCE_S: Final = 60.0
-"""How long to wait for one range, of which an idle machine parses a hundred a second."""
+"""Seconds to wait for one range; an idle machine parses a hundred a second."""
 _PROGRAM: Final = (
     "import sys; from projections.model.parsing_process import main; main(*sys.argv[1:])"
 )

@@ -47,9 +47,9 @@ class RecordedFold:
         self._every = every or max(1, -(-end // SCENES))
         self.moments = Moments(reader.read(FIRST_OFFSET, end))
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
-        """Of the events given so far."""
+        """The map of the events yielded so far."""
         self.merges: list[PlacesMerged] = []
-        """Of the events given so far."""
+        """The merges of places in the events yielded so far."""
 
     def __iter__(self) -> Iterator[Step]:
         """Raises FoldError at an event that cannot be folded."""

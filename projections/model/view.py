@@ -133,7 +133,7 @@ class MapView:
         return [each.det_id for each in self.observations]
 
     def class_counts(self, found: ObjectRecord) -> dict[str, int]:
-        """How many observations of an Object are of each class, most first; ties by name."""
+        """The number of an Object's observations by class, most first; ties by name."""
         names = (self.observations[number].class_name for number in found.observations)
         return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
@@ -380,7 +380,8 @@ class MapView:
         } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}
 
     def _sums(self) -> tuple[int, int, int]:
-        """How many keyframes have a pose, observations an Object, and a foreign embedding."""
+        """The numbers of keyframes with a pose, and of observations with an Object and with a
+        foreign embedding."""
         return (
             sum(k.pose is not None for k in self.keyframes),
             sum(o.object is not None for o in self.observations),

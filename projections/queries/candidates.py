@@ -240,7 +240,8 @@ class _Along(NamedTuple):
     def of(
         cls, edges: Sequence[list[int]], things: dict[str, str], places: dict[str, str]
     ) -> "_Along":
-        """Of the edges in the statement ``graph``, and the properties of Objects and Places."""
+        """Made from the edges in the statement ``graph`` and the properties of Objects and
+        Places."""
         observes, located, has, in_place = (
             dict(zip(starts, ends, strict=True))
             for starts, ends in zip(edges[::2], edges[1::2], strict=True)
@@ -263,7 +264,7 @@ class _Along(NamedTuple):
         )
 
     def and_more(self, more: "_Along") -> "_Along":
-        """These and those of ``more``."""
+        """The union with ``more``."""
         return _Along(self.ids | more.ids, self.things | more.things, self.places | more.places)
 
 

@@ -147,7 +147,8 @@ def _nearest(
     spot: tuple[float, float],
     radius: float,
 ) -> list[dict[str, Any]]:
-    """Those within ``radius`` of ``spot``; a thing's position is under the first key it has."""
+    """The things within ``radius`` of ``spot``, nearest first; a thing's position is under the
+    first key it has."""
 
     def distance(thing: dict[str, Any]) -> float:
         at = [next(thing[key] for key in keys if key in thing) for keys in (x_keys, y_keys)]

@@ -134,7 +134,7 @@ class DrivenCells:
                 yield cell, distance + length
 
     def with_a_way_to(self, cell: int) -> list[int]:
-        """Where walls are known, the cells that are linked to a new one without being driven."""
+        """The cells that are linked to a new one by a straight way, where walls are known."""
         at = self.centres[cell]
         way = None if self.way_at is None else self.way_at(at)
         if way is None:

@@ -19,7 +19,7 @@ from .camera import Camera
 SAMPLED: Final = 1_024
 """The most observations that are compared with others of their picture."""
 FOLLOWERS: Final = 3
-"""How many of the observations after it each one is compared with."""
+"""The number of following observations that each one is compared with."""
 _GUESS: Final = 0.5
 _GUESS_WEIGHT: Final = 0.5
 _SPREAD_WEIGHT: Final = 10.0

@@ -66,7 +66,8 @@ _INDEPENDENT_M: Final = 3.0
 _INDEPENDENT_RAD: Final = 5.0
 _LEAST_COUNT: Final = 0.1
 _LEAST_COUNT_OF_KNOWN: Final = 0.25
-"""The same of `known`: whether a thing is in the map hardly depends on where it is seen from."""
+"""The least power for `known`: whether a thing is in the map hardly depends on where it is seen
+from."""
 _WITHIN_M: Final = 1.5
 _AROUND_M: Final = 1.0
 _TRIED: Final = 80

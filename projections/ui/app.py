@@ -92,7 +92,8 @@ HEADERS: Final = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Of every response that does not set them: own host only, no inline code, no sniffed types."""
+"""Security headers of every response that does not set them: own host only, no inline code, no
+sniffed types."""
 
 _SETTINGS: Final = ("set", "eps_m", "min_samples")
 _AT_W: Final = ("at", "known_at", *_SETTINGS)

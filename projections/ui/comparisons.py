@@ -34,8 +34,8 @@ _WORDS: Final = ("and", "or", "not", "none")
 
 
 def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """What changed from ``from`` to ``to``, each map under the commands before it, or both under
-    those before ``known_at``."""
+    """The difference between the maps at ``from`` and ``to``, each map under the commands before
+    it, or both under those before ``known_at``."""
     start, end = (shown.point(text_of(query, name)) for name in ("from", "to"))
     known_at = shown.point(query["known_at"]) if query.get("known_at") else None
     found = shown.timeline.diff(start, end, known_at=known_at)

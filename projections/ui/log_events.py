@@ -64,7 +64,7 @@ class LogEvents:
 
     @property
     def left_out(self) -> int:
-        """How many rejected payloads and losses are not among the events."""
+        """The number of rejected payloads and losses that are not among the events."""
         return max(0, self._reports - self._most)
 
     def read_on(self, reader: LogReader, end: Offset) -> None:
@@ -87,7 +87,7 @@ class LogEvents:
             self.events.append(document)
 
     def count_before(self, offset: int) -> int:
-        """How many are of events below ``offset``."""
+        """The number of events below ``offset``."""
         return bisect_left(self.events, offset, key=itemgetter("offset"))
 
 

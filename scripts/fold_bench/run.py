@@ -110,10 +110,10 @@ def rooms() -> None:
             count,
             lambda accepted, of=of: of.fold(of.next_offset, accepted),
         )
-        for name, of in (("page rule, no detections", page), ("by rooms", by_rooms))
+        for name, of in (("places=page, no detections", page), ("by rooms", by_rooms))
     ]
     print(f"memory of the two: {(_resident() - before) / 1e6:.0f} MB")
-    report("fold by rooms / fold by the page rule", took[1] / took[0], 1.5)
+    report("fold by rooms / fold with places=page", took[1] / took[0], 1.5)
 
 
 def _tenths(name: str, stream, count: int, fold_one: Callable) -> float:
@@ -158,10 +158,8 @@ def evidence() -> None:
                 few = by_evidence.seconds
     memory = (_resident() - before) / 1e6
     each = by_page.seconds / by_page.folded * 1e6, by_evidence.seconds / large * 1e6
-    print(
-        f"pictures of a camera: by the page's rule {each[0]:.0f} µs, by evidence {each[1]:.0f} µs"
-    )
-    report("fold by evidence / fold by the page's rule", few / by_page.seconds, 2.5)
+    print(f"pictures of a camera: with fusion=page {each[0]:.0f} µs, by evidence {each[1]:.0f} µs")
+    report("fold by evidence / fold with fusion=page", few / by_page.seconds, 2.5)
     report(f"by evidence: time({large}) / time({small})", by_evidence.seconds / few, 12)
     print(f"memory of the fold by evidence and its view: {memory:.0f} MB")
 
