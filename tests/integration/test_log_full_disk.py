@@ -42,6 +42,20 @@ except LogError as error:
 """
 
 
+def run(program: str, log: Path) -> str:
+    """What a program prints in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(log)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 @pytest.mark.parametrize(
     ("limit", "fsync"),
     mostly_slow(
@@ -57,16 +71,8 @@ except LogError as error:
 )
 def test_synced_events_stay(log_path: Path, limit: int, fsync: str) -> None:
     program = FILL.format(limit=limit, fsync=fsync)
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(log_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    durable, message, refused = done.stdout.splitlines()
+    printed = run(program, log_path)
+    durable, message, refused = printed.splitlines()
     assert "File too large" in message
     assert str(log_path) in message
     assert "Free space" in message
@@ -99,16 +105,8 @@ try:
 except LogError as error:
     print(error)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(log_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "could not be sealed" in done.stdout
+    printed = run(program, log_path)
+    assert "could not be sealed" in printed
     events = read_log(log_path)
     assert len(events) == 100
     LogWriter(log_path).close()

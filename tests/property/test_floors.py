@@ -126,14 +126,7 @@ def test_snapshots_with_floors_go_on_as_the_fold_does(
 ) -> None:
     raw, documents = building
     settings = Settings(**raw)
-    whole, restored = Folded.start(settings), Folded.start(settings)
-    for document in documents:
-        whole.extend([document])
-        restored.extend([document])
-        assert map_digest(restored.view) == map_digest(whole.view)
-        kept = snapshot(restored.map, restored.view, "log")
-        restored = Folded(*restore(kept, settings, "log"), [])
-        assert restored.view.floors == whole.view.floors
+    check_snapshots(settings, documents)
 
 
 @given(documents=drives(), seed=st.integers(0, 2**32), places=st.sampled_from(["page", "rooms"]))
@@ -145,6 +138,16 @@ def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
     few = rng.sample(FLOORS, 3)
     documents = [{**document, **rng.choice(few)} for document in documents]
     settings = Settings(fusion="evidence", eps_m=1.0, places=places)
+    view = check_snapshots(settings, documents)
+    check_floors(view)
+    for found in view.objects.values():
+        estimate = found.estimate
+        assert estimate is not None
+        assert abs(estimate.x_um) < 10**8, "as far as a picture shows, on its own floor"
+
+
+def check_snapshots(settings: Settings, documents: list[dict[str, Any]]) -> MapView:
+    """A fold that is stored and restored after each event is one that is not; returns its view."""
     whole, restored = Folded.start(settings), Folded.start(settings)
     for document in documents:
         whole.extend([document])
@@ -152,11 +155,8 @@ def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
         assert map_digest(restored.view) == map_digest(whole.view)
         kept = snapshot(restored.map, restored.view, "log")
         restored = Folded(*restore(kept, settings, "log"), [])
-    check_floors(whole.view)
-    for found in whole.view.objects.values():
-        estimate = found.estimate
-        assert estimate is not None
-        assert abs(estimate.x_um) < 10**8, "as far as a picture shows, on its own floor"
+        assert restored.view.floors == whole.view.floors
+    return whole.view
 
 
 def check_floors(view: MapView) -> None:

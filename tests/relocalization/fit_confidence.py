@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from projections.calibrate.localiser import Line, fit_line, logit
 from projections.evaluate.own_questions import ask_own_questions
-from projections.evaluate.questions import make_questions, make_view_questions, spread
 from projections.evaluate.scores import (
     auroc,
     calibration_floor,
@@ -38,12 +37,12 @@ from projections.relocalize import ExactIndex, certainty, features
 from projections.relocalize.likelihood import Scene
 from projections.relocalize.model import MODEL
 from projections.relocalize.pose import locate
-from tests.bench.truth.localising import later_runs, make_map, stranger_of
+from tests.bench.truth.localising import asked, make_map, stranger_of
 from tests.bench.truth.worlds import CACHE, WORLDS, Case, load_generator, make_case, pairs
 
 HELD_OUT = ("rmf_hotel", "aws_hospital")
 RIDGE = 0.3
-CROPS, VIEWS = (1, 2, 3), (1, 3, 5)
+CROPS = (1, 2, 3)
 Floats = NDArray[np.float64]
 
 
@@ -82,24 +81,18 @@ def ask(every: int, cache: Path, pair: tuple[str, str]) -> list[Row]:
     scene = Scene(index.constants, index.constants.camera, MODEL)
     instances = {i for _, i in instances_of(view, case.truth) if i is not None}
     rows = []
-    for word, make, counts in (
-        ("crop", make_questions, CROPS),
-        ("view", make_view_questions, VIEWS),
-    ):
-        for count in counts:
-            own = make(later_runs(case), case.truth, count)[::every]
-            others = make(later_runs(stranger), stranger.truth, count)
-            for question in [*own, *spread(others, len(own))]:
-                matches = index.search(question.crops).matches
-                alike = certainty.known_features(question.crops, matches, index.constants)
-                posterior = locate(question.asked.views, matches, scene)
-                if alike is None or posterior is None:
-                    continue
-                known = any(i in instances for i in question.instances if i is not None)
-                off = math.hypot(posterior.x - question.x, posterior.y - question.y)
-                found = astuple(posterior.features)
-                right = known and off <= RIGHT_WITHIN_M
-                rows.append(Row(pair, f"{count} {word}", alike, found, known, right))
+    for kind, (own, others) in asked(case, stranger, every, CROPS).items():
+        for question in [*own, *others]:
+            matches = index.search(question.crops).matches
+            alike = certainty.known_features(question.crops, matches, index.constants)
+            posterior = locate(question.asked.views, matches, scene)
+            if alike is None or posterior is None:
+                continue
+            known = any(i in instances for i in question.instances if i is not None)
+            off = math.hypot(posterior.x - question.x, posterior.y - question.y)
+            found = astuple(posterior.features)
+            right = known and off <= RIGHT_WITHIN_M
+            rows.append(Row(pair, kind, alike, found, known, right))
     return rows
 
 

@@ -118,11 +118,14 @@ def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
     return view
 
 
-def asked(case: Case, stranger: Case, every: int) -> dict[str, tuple[list[Question], ...]]:
-    """By kind: every n-th question of the case's later runs, and as many of the stranger's."""
+def asked(
+    case: Case, stranger: Case, every: int, crops: Sequence[int] = CROPS
+) -> dict[str, tuple[list[Question], ...]]:
+    """By kind, of as many crops or views: every n-th question of the case's later runs, and as many
+    of the stranger's."""
     found = {}
     for word, make, counts in (
-        ("crop", make_questions, CROPS),
+        ("crop", make_questions, crops),
         ("view", make_view_questions, VIEWS),
     ):
         for count in counts:
