@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 Boxes = NDArray[np.float64]
-"""x0, y0, x1 and y1 of each, shape (n, 4)."""
+"""Pixels x0, y0, x1 and y1 of each box, shape (n, 4)."""
 
 
 class Candidates(NamedTuple):
-    """What a head read from a model's answer: boxes in pixels of its input, with their best class.
+    """Boxes decoded from a model's answer, in pixels of its input, with their best class.
 
-    ``not_finite`` counts what was left out because a number of it is NaN or infinite.
+    ``not_finite`` counts the boxes left out because a number of theirs is NaN or infinite.
     """
 
     boxes: Boxes
@@ -22,7 +22,7 @@ class Candidates(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """Indices of the boxes that are kept, best first, and how many more there would have been."""
+    """Indices of the boxes that are kept, best first, and the number of boxes cut by the limit."""
 
     indices: list[int]
     cut: int
@@ -36,10 +36,10 @@ def suppress(
     max_overlap: float,
     most: int,
 ) -> Kept:
-    """Keep boxes from the best score on, and drop each that overlaps a kept one of its class by
-    more than ``max_overlap``, the area of both that they share.
+    """Non-maximum suppression: keep boxes in order of falling score, and drop each whose
+    intersection over union with a kept one of its class is over ``max_overlap``.
 
-    Of equal scores the earlier comes first. After ``most`` boxes the others are cut.
+    Of equal scores the earlier comes first. At most ``most`` boxes are kept.
     """
     order = np.argsort(-scores, kind="stable")
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])

@@ -1,6 +1,7 @@
 """Encode crops with an ONNX image tower (CLIP, SigLIP or the like), and prepare pictures for it.
 
-A JSON file beside the model, of the same name, says how; docs/detector.md has it for common ones:
+A JSON file beside the model, of the same name, describes the preparation; docs/detector.md has it
+for common models:
 
     {"model": "ViT-B-32/laion2b_s34b_b79k", "size": 224, "resize": "crop",
      "mean": [0.4815, 0.4578, 0.4082], "std": [0.2686, 0.2613, 0.2758]}
@@ -22,18 +23,18 @@ from .picture import Pixels
 from .vision import Fit, Scaling, fitted, planes
 
 BATCH: Final = 32
-"""Crops at once, of a model that takes any number."""
+"""Crops in one batch, for a model that takes any number."""
 _Side = Annotated[int, Field(ge=1, le=2048)]
 _Channel = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Spread = Annotated[float, Field(ge=1e-3, le=1000.0)]
 
 
 class Preparation(BaseModel):
-    """What is in the JSON file beside a model.
+    """The content of the JSON file beside a model.
 
-    ``size`` is width and height or the side of a square. Values from 0 to 1 have ``mean`` taken
-    off and are divided by ``std``, for red, green and blue. ``resize``: the middle of a crop
-    (``crop``), all of it stretched, or all of it with black around (``pad``).
+    ``size`` is width and height or the side of a square. From values of 0 to 1 ``mean`` is
+    subtracted, and the result divided by ``std``, for red, green and blue. ``resize`` uses the
+    middle of a crop (``crop``), all of it stretched, or all of it with black around (``pad``).
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
@@ -75,8 +76,8 @@ def read_preparation(model: Path) -> Preparation:
 
 
 class Encoder:
-    """An opened image tower. The constructor tries it on a grey crop and raises ModelError where it
-    does not answer one vector a crop."""
+    """An opened image tower. The constructor runs it on a grey crop, and raises ModelError if the
+    output is not one vector a crop."""
 
     def __init__(self, model: OnnxModel, preparation: Preparation) -> None:
         self._model, self._preparation = model, preparation
@@ -99,7 +100,7 @@ class Encoder:
         return self._preparation.model
 
     def encode(self, crops: Sequence[Pixels]) -> list[NDArray[np.float32] | None]:
-        """A vector for each crop, in batches; None where the model's is not finite or zero.
+        """The vectors of crops, computed in batches; None where one is zero or not finite.
 
         Raises ModelError.
         """
@@ -114,7 +115,7 @@ class Encoder:
         wanted = self._preparation
         cubic = wanted.interpolation == "bicubic"
         small = [fitted(crop, self._size, wanted.resize, cubic=cubic) for crop in crops]
-        if self._model.batch is not None:  # a fixed number: repeat the last one
+        if self._model.batch is not None:  # a fixed number: repeat the last crop
             small += small[-1:] * (self._model.batch - len(small))
         answer = self._model.run(planes(small, self._scaling), self._output)
         if (

@@ -1,12 +1,12 @@
 """Pictures from files: a folder, a video, or stdin with a stream of pictures or a list of paths.
 
-When a picture was taken:
+The time at which a picture was taken:
 
-* `PictureFiles` (a folder, a list of paths) reads it from the file's name, in seconds with a point
-  or in nanoseconds, as TUM's and EuRoC's data sets name theirs: ``1777885200.05.jpg``,
-  ``1403636579763555584.png``. Other names need a number of pictures a second.
-* Frames of a video count from a start by the video's rate; pictures of a stream were taken when
-  they came in, unless a rate is given.
+* Of a folder or a list of paths it is in the file's name, in seconds with a point or in
+  nanoseconds, as in the data sets of TUM and EuRoC: ``1777885200.05.jpg``,
+  ``1403636579763555584.png``. For other names a rate in pictures a second must be given.
+* Of a video's frames it follows from a start and the video's rate. Of a stream's pictures it is the
+  time of receipt, unless a rate is given.
 """
 
 import re
@@ -32,16 +32,16 @@ from .vision import Video, decode
 
 SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
 _TIME: Final = re.compile(r"[0-9]{1,10}\.[0-9]{1,9}|[0-9]{10}|[0-9]{16,19}", re.ASCII)
-"""``000017`` is the number of a picture, not a time."""
+"""A time in a file's name. ``000017`` is the number of a picture, not a time."""
 _NANOSECOND_DIGITS: Final = 16
 _PARTS: Final = re.compile(r"([0-9]+)", re.ASCII)
 _MAX_PATH: Final = 8_192
 Read: TypeAlias = Callable[[int], bytes]
-"""Up to so many bytes, none at the end."""
+"""Returns up to so many bytes, none at the end."""
 
 
 class Timing(NamedTuple):
-    """When pictures without a time of their own were taken: ``per_s`` a second from ``start_s``."""
+    """The times of pictures without one of their own: ``per_s`` a second from ``start_s`` on."""
 
     start_s: float = 0.0
     per_s: float | None = None
@@ -79,7 +79,7 @@ def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[Picture]:
 
 
 def _in_order(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts numbers in names by their value: 2.png before 10.png."""
+    """A sort key that orders numbers in names by value: 2.png before 10.png."""
     return [
         (0, int(part), "") if part.isascii() and part.isdigit() else (1, 0, part)
         for part in _PARTS.split(path.name)
@@ -136,7 +136,7 @@ def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[Picture]:
 
 
 def _from_stdin(read: Read, timing: Timing, clock: Clock = system_clock) -> Iterator[Picture]:
-    """A stream of pictures if it begins as one, else a path a line."""
+    """The pictures of a stream if it begins like a picture, else those of a path a line."""
     start = b""
     while len(start) < len(PNG_START) and b"\n" not in start:
         piece = read(len(PNG_START) - len(start))

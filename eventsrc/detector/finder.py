@@ -41,8 +41,9 @@ COCO: Final = (
 
 
 class FinderOptions(NamedTuple):
-    """What is a detection: its least confidence, how much two boxes of a class may overlap, and how
-    many a picture may have. ``size`` is the side of the input where the model leaves it open."""
+    """The ``head`` of the model, the least ``confidence`` of a detection, the greatest ``overlap``
+    (intersection over union) of two boxes of a class, and the most detections in a picture.
+    ``size`` is the side of the input in pixels if the model does not fix it."""
 
     head: str = "yolov8"
     confidence: float = CONFIDENCE
@@ -52,10 +53,10 @@ class FinderOptions(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The detections in one picture, best first, and what was left out of them.
+    """The detections in one picture, best first, and counts of the boxes left out.
 
-    ``not_finite`` boxes have NaN or infinite numbers, ``too_small`` are no pixel wide or high
-    within the picture, ``cut`` are beyond the most that a picture may have.
+    ``not_finite`` boxes have NaN or infinite numbers, ``too_small`` ones are less than a pixel wide
+    or high within the picture, ``cut`` ones are beyond the most that a picture may have.
     """
 
     boxes: Boxes
@@ -67,8 +68,8 @@ class Found(NamedTuple):
 
 
 class Finder:
-    """An opened detector. The constructor tries it on a grey picture and raises ModelError where it
-    does not fit its head or its labels, MisuseError where options are wrong."""
+    """An opened detector. The constructor runs it on a grey picture, and raises ModelError if its
+    output does not fit head or labels, MisuseError for wrong options."""
 
     def __init__(
         self, model: OnnxModel, labels: Sequence[str] | None, options: FinderOptions
@@ -118,7 +119,7 @@ class Finder:
         )
 
     def _advice(self, shape: tuple[int, ...]) -> str:
-        """What else the answer may be, as the end of a message."""
+        """What to try for an output of this shape, as the end of a message."""
         count = len(self.labels)
         fits = {
             "yolov8": len(shape) == 3 and shape[1] == 4 + count,

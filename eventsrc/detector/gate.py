@@ -26,7 +26,8 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class GateLimits:
-    """What makes a keyframe; without ``after_s`` no time does."""
+    """The distance, turn and time after which a keyframe is due; None for ``after_s`` for no time
+    limit."""
 
     moved_m: float = MOVED_M
     turned_rad: float = math.radians(TURNED_DEG)
@@ -34,16 +35,15 @@ class GateLimits:
 
 
 class KeyframeGate:
-    """Decides for each picture in turn whether it is a keyframe, and keeps the last one that was
-    taken."""
+    """Decides for each picture in turn whether it is a keyframe, from the last keyframe."""
 
     def __init__(self, limits: GateLimits) -> None:
         self._limits = limits
         self._stamp_s: float | None = None
         self._pose: Pose | None = None
 
-    def take(self, stamp_s: float, pose: Pose | None) -> None:
-        """A picture is a keyframe: the last one from now on."""
+    def set_last(self, stamp_s: float, pose: Pose | None) -> None:
+        """Set the last keyframe."""
         self._stamp_s = stamp_s
         self._pose = pose or self._pose
 
@@ -53,7 +53,7 @@ class KeyframeGate:
             return True
         after_s = self._limits.after_s
         if after_s is not None and abs(stamp_s - self._stamp_s) >= after_s:
-            return True  # a stamp that jumps back, as of a log that begins again, counts too
+            return True  # also for a stamp that jumps back, as of a recording that starts again
         if pose is None or self._pose is None:
             return False
         moved = math.hypot(pose.x - self._pose.x, pose.y - self._pose.y)

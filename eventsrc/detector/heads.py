@@ -1,7 +1,7 @@
-"""Decoders: what the answers of families of object detectors mean, and what they take.
+"""Heads: how families of object detectors take pictures, and decoders of their outputs.
 
-Each head states how a picture is prepared for its models and turns an answer into candidates: of
-each anchor the best class, when its score reaches the threshold. Boxes are in pixels of the input.
+A decoder turns the output into candidates: the best class of each anchor whose score reaches the
+threshold. Boxes are in pixels of the input.
 
     yolov8    1 × (4 + classes) × N      centre, size; YOLOv8, v9, v11, v12 as Ultralytics exports
     yolov10   1 × N × 6                  corners, score, class; without suppression
@@ -25,11 +25,11 @@ _SURE: Final = 1.001
 """Scores are probabilities; half precision may round them up."""
 _BINS: Final = 8
 _LARGEST_EXPONENT: Final = 20.0
-"""Of a side in cells: a larger one is as wide as any picture."""
+"""Bound of a box's side in cells, beyond the width of any picture."""
 
 
 class HeadError(ValueError):
-    """An answer that is not of this head; the message says what it is instead."""
+    """A model's output does not fit the head; the message says what it is instead."""
 
 
 Decode: TypeAlias = Callable[[Array, Size, int, float], Candidates]
@@ -37,8 +37,8 @@ Decode: TypeAlias = Callable[[Array, Size, int, float], Candidates]
 
 class Head(NamedTuple):
     """A decoder, and how pictures are prepared: the order of colours, (value * scale - mean) / std,
-    and whether the picture lies in the middle of the input or at its top left. Boxes of the same
-    thing are ``suppressed`` unless the model does that."""
+    and whether the picture is in the middle of the input or at its top left. ``suppressed`` says
+    whether the boxes need non-maximum suppression, because the model does none."""
 
     decode: Decode
     rgb: bool
@@ -122,7 +122,7 @@ HEADS: Final[Mapping[str, Head]] = {
 
 
 def _check_shape(answer: Array, shape: Sequence[int | None], name: str) -> None:
-    """Raise HeadError unless the sizes of ``answer`` are those of ``shape``, where it has some."""
+    """Raise HeadError unless ``answer`` has the ``shape``, in which None is any size."""
     fits = len(answer.shape) == len(shape) and all(
         wanted in (None, size) for size, wanted in zip(answer.shape, shape, strict=True)
     )
@@ -134,7 +134,8 @@ def _check_shape(answer: Array, shape: Sequence[int | None], name: str) -> None:
 
 
 def _finite_columns(rows: Array) -> NDArray[np.bool_] | None:
-    """Which anchors, of shape (values, anchors), have only finite numbers; None if all."""
+    """Which anchors (columns) of ``rows``, shape (values, anchors), have only finite numbers; None
+    if all have."""
     if math.isfinite(float(rows.sum(dtype=np.float64))):
         return None
     usable: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(rows), axis=0)

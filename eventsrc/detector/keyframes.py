@@ -1,4 +1,4 @@
-"""From pictures to envelopes: the gate, the detector, the encoder, and what is counted."""
+"""Make envelopes from pictures by the keyframe gate, the detector and the encoder."""
 
 import base64
 import math
@@ -22,7 +22,7 @@ FIRST_KEYFRAME: Final = 1
 CROP_SIDE: Final = 640
 """Largest width and height of kept crops: more than encoders take, and always under the 1 MiB that
 a log keeps."""
-_TOLD: Final = 5
+_MOST_NOTES: Final = 5
 """Messages for each kind of fault; further ones are only counted."""
 
 
@@ -36,14 +36,14 @@ class Counts:
     unreadable: int = 0
     keyframes: int = 0
     without_pose: int = 0
-    """Detections in the keyframes."""
     detections: int = 0
+    """Detections in the keyframes."""
     not_encoded: int = 0
     """Detections without an embedding, because the encoder's answer was not finite or zero."""
     not_finite: int = 0
     """Boxes left out because the detector's answer was not finite."""
     too_small: int = 0
-    """Boxes left out because they are no pixel wide or high in the picture."""
+    """Boxes left out because they are less than a pixel wide or high in the picture."""
     cut: int = 0
     """Boxes beyond the most that a picture may have."""
 
@@ -54,14 +54,14 @@ class Counts:
 
 
 class Crop(NamedTuple):
-    """A detection cut out, as JPEG."""
+    """The JPEG of a detection's box."""
 
     det_id: DetId
     jpeg: bytes
 
 
 class Keyframe(NamedTuple):
-    """An envelope, and the crops of its detections if they are kept."""
+    """The JSON document of an envelope, and the crops of its detections if they are kept."""
 
     envelope: dict[str, Any]
     crops: list[Crop]
@@ -85,15 +85,15 @@ class Keyframes:
         self._finder, self._encoder, self._gate, self._poses = finder, encoder, gate, poses
         self._run_id, self._hfov_deg, self._keep_crops = run_id, hfov_deg, keep_crops
         self._note = note
-        self._told: dict[str, int] = {}
+        self._noted: dict[str, int] = {}
         self.counts = Counts()
 
-    def look(self, picture: Picture) -> Keyframe | None:
-        """The keyframe of a picture; None if it is none. Raises ModelError."""
+    def process(self, picture: Picture) -> Keyframe | None:
+        """The keyframe of a picture; None if it is left out. Raises ModelError."""
         counts = self.counts
         counts.pictures += 1
         if not 0.0 <= picture.stamp_s <= MAX_TIMESTAMP_S:
-            self._skip(picture, f"its time, {picture.stamp_s:g} s, is none that an envelope takes")
+            self._skip(picture, f"its time, {picture.stamp_s:g} s, is out of range")
             return None
         pose = self._poses.at(picture.stamp_s)
         if not self._gate.is_due(picture.stamp_s, pose):
@@ -104,7 +104,7 @@ class Keyframes:
         except PictureError as error:
             self._skip(picture, str(error))
             return None
-        self._gate.take(picture.stamp_s, pose)
+        self._gate.set_last(picture.stamp_s, pose)
         found = self._finder.find(pixels)
         self._count(picture, found)
         counts.keyframes += 1
@@ -113,7 +113,7 @@ class Keyframes:
 
     def _skip(self, picture: Picture, reason: str) -> None:
         self.counts.unreadable += 1
-        self._tell("unreadable", f"{picture.name}: left out: {reason}")
+        self._note_fault("unreadable", f"{picture.name}: left out: {reason}")
 
     def _count(self, picture: Picture, found: Found) -> None:
         counts = self.counts
@@ -122,16 +122,16 @@ class Keyframes:
         counts.too_small += found.too_small
         counts.cut += found.cut
         if found.not_finite:
-            self._tell(
+            self._note_fault(
                 "not_finite",
                 f"{picture.name}: the detector answered NaN or infinity for {found.not_finite:,} "
                 "boxes, which are left out",
             )
         if found.cut:
-            self._tell(
+            self._note_fault(
                 "cut",
                 f"{picture.name}: {found.cut:,} boxes too many, of which some may show the same"
-                " thing; --max-detections and --confidence say how many a picture has",
+                " thing; change --max-detections or --confidence to keep more or find fewer",
             )
 
     def _keyframe(
@@ -143,7 +143,7 @@ class Keyframes:
         missing = sum(vector is None for vector in vectors)
         if missing:
             self.counts.not_encoded += missing
-            self._tell(
+            self._note_fault(
                 "not_encoded",
                 f"{picture.name}: the encoder answered NaN or zero for {missing:,} crops, which"
                 " have no embedding",
@@ -195,10 +195,10 @@ class Keyframes:
         height, width = pixels.shape[:2]
         return {"camera": {"hfov_deg": self._hfov_deg, "width_px": width, "height_px": height}}
 
-    def _tell(self, kind: str, text: str) -> None:
-        times = self._told[kind] = self._told.get(kind, 0) + 1
-        if times <= _TOLD:
-            last = "; others like it are only counted" if times == _TOLD else ""
+    def _note_fault(self, kind: str, text: str) -> None:
+        times = self._noted[kind] = self._noted.get(kind, 0) + 1
+        if times <= _MOST_NOTES:
+            last = "; others like it are only counted" if times == _MOST_NOTES else ""
             self._note(text + last)
 
 

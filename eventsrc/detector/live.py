@@ -22,16 +22,16 @@ _POLL_S: Final = 0.25
 
 
 class NewestQueue:
-    """Pictures that wait, at most ``size``; one without room takes the place of the oldest."""
+    """A queue of at most ``size`` pictures; one more replaces the oldest. Thread-safe."""
 
     def __init__(self, size: int) -> None:
         self._size = size
         self._waiting: deque[tuple[Received, float]] = deque()
         self._filled = threading.Condition()
         self.dropped = 0
-        """How many were dropped for newer ones."""
+        """Number of pictures dropped for newer ones, or when the queue was closed."""
         self.too_large = 0
-        """How many were too large to be taken."""
+        """Number of pictures refused because they are too large."""
 
     def put(self, message: Received, received_s: float) -> None:
         """Add a picture."""
@@ -43,13 +43,14 @@ class NewestQueue:
             self._filled.notify()
 
     def close(self) -> None:
-        """Drop what waits."""
+        """Drop the pictures in the queue."""
         with self._filled:
             self.dropped += len(self._waiting)
             self._waiting.clear()
 
     def get(self, timeout_s: float) -> tuple[Received, float] | None:
-        """The oldest that waits; None if none came in time."""
+        """Remove and return the oldest picture with its time of receipt; None after ``timeout_s``
+        without one."""
         with self._filled:
             if not self._waiting:
                 self._filled.wait(timeout_s)
@@ -114,7 +115,7 @@ class LivePictures:
 
 
 class _Failing:
-    """``pixels`` of a picture that cannot be read."""
+    """The ``pixels`` function of a picture that cannot be read; raises PictureError."""
 
     def __init__(self, reason: str) -> None:
         self._reason = reason

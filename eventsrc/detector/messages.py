@@ -1,7 +1,7 @@
-"""Pictures and poses as robots publish them over Zenoh.
+"""Read messages with pictures and poses that robots publish over Zenoh.
 
 Pictures: a JPEG or PNG as it is, or in CDR sensor_msgs/CompressedImage or sensor_msgs/Image, as a
-bridge of ROS 2 forwards them. A picture without a stamp of its own was taken when it came in.
+bridge of ROS 2 forwards them. Without a stamp of its own a picture has its time of receipt.
 
 Poses: JSON with ``x``, ``y``, ``yaw`` (or ``map_x`` …) and ``stamp`` or ``timestamp``, or in CDR
 geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry. The type of a message
@@ -35,7 +35,7 @@ class MessageError(ValueError):
 
 
 def picture_of(payload: bytes, name: str, received_s: float) -> Picture:
-    """The picture of a message. Raises MessageError when its head cannot be read."""
+    """The picture of a message, not decoded. Raises MessageError if its header cannot be read."""
     if not is_cdr(payload):
         return Picture(name, received_s, lambda: decode(payload))
     try:
@@ -87,7 +87,7 @@ def _raw(payload: bytes, name: str, received_s: float) -> Picture:
 
 
 def pose_of(payload: bytes, received_s: float) -> tuple[float, Pose]:
-    """Stamp and pose of a message. Raises MessageError."""
+    """Stamp, in seconds, and pose of a message. Raises MessageError."""
     if is_cdr(payload):
         try:
             return _pose_of_cdr(CdrFields(payload), received_s)
@@ -110,12 +110,12 @@ def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, Pose]:
 
 
 def _is_length(left: int, *lengths: int) -> bool:
-    """Whether so many bytes are the numbers of a message, with what pads the last."""
+    """Whether ``left`` bytes are one of ``lengths``, or that plus padding."""
     return any(length <= left <= length + _MOST_PADDING for length in lengths)
 
 
 def _stamp(fields: CdrFields, received_s: float) -> float:
-    """The stamp of a header, whose frame is passed over; a zero one means now."""
+    """The stamp of a header in seconds, ``received_s`` if it is zero. Skips the frame."""
     seconds, nanoseconds = fields.numbers("iI", "header.stamp")
     fields.text("header.frame_id")
     if seconds < 0 or nanoseconds >= 1_000_000_000:

@@ -1,4 +1,4 @@
-"""ONNX models and what runs them. Only this module imports onnxruntime, when a model is opened.
+"""Run ONNX models by onnxruntime. Only this module imports it, when the first model is opened.
 
 docs/decisions/onnxruntime.md says why onnxruntime.
 """
@@ -22,11 +22,11 @@ _TYPES: Final[Mapping[str, type[np.floating[Any]]]] = {
 
 
 class ModelError(MapfoldError):
-    """A model cannot be used: its file, its inputs, or what it answers."""
+    """A model cannot be used: its file, its inputs or its outputs are wrong."""
 
 
 class Tensor(NamedTuple):
-    """An input or output; a size that is not fixed is None."""
+    """The name, type and sizes of an input or output; a size that is not fixed is None."""
 
     name: str
     type: str
@@ -34,12 +34,12 @@ class Tensor(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Its sizes for people: ``1 × 3 × 640 × 640``."""
+        """The sizes as text: ``1 × 3 × 640 × 640``."""
         return shape_text(self.shape)
 
 
 def shape_text(shape: tuple[int | None, ...]) -> str:
-    """Sizes for people; ``?`` is one that is not fixed."""
+    """Sizes as text, with ``?`` for one that is not fixed."""
     return " × ".join("?" if size is None else f"{size}" for size in shape) or "a number"
 
 
@@ -77,23 +77,24 @@ class OnnxModel:
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """What the exporter wrote into the file."""
+        """The metadata that the exporter wrote into the file."""
         found: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         return found
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height of its input; None if they are not fixed."""
+        """Width and height of the input in pixels; None if they are not fixed."""
         _, _, height, width = self.input.shape
         return None if width is None or height is None else (width, height)
 
     @property
     def batch(self) -> int | None:
-        """How many pictures it takes at once; None if that is not fixed."""
+        """The number of pictures that it takes at once; None if that is not fixed."""
         return self.input.shape[0]
 
     def output(self, *names: str) -> str:
-        """The first of ``names`` that it has, or the name of its only output. Raises ModelError."""
+        """The first of ``names`` that is an output, else the name of the only output. Raises
+        ModelError."""
         there = [each.name for each in self.outputs]
         for name in names:
             if name in there:
@@ -106,7 +107,7 @@ class OnnxModel:
         return there[0]
 
     def run(self, pictures: NDArray[np.float32], output: str) -> Array:
-        """What it answers. Raises ModelError."""
+        """The output for ``pictures``, shape (n, 3, height, width). Raises ModelError."""
         given = {self.input.name: pictures.astype(self._dtype, copy=False)}
         try:
             (answer,) = self._session.run([output], given)
@@ -139,7 +140,7 @@ def _tensor(described: Any) -> Tensor:
 
 
 def _onnxruntime() -> tuple[Any, tuple[type[Exception], ...]]:
-    """The module, and what it raises."""
+    """The module, and the exceptions that it raises. MisuseError if it is not installed."""
     try:
         import onnxruntime
         from onnxruntime.capi import onnxruntime_pybind11_state as state

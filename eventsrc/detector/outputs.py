@@ -21,8 +21,8 @@ _LAST_CHANCE_S: Final = 2.0
 
 @dataclass
 class Delivered:
-    """Counts of keyframes by outcome. ``waiting`` and ``refused`` are in the spool, ``no_room`` did
-    not fit into it."""
+    """Counts of keyframes by outcome: ``waiting`` and ``refused`` ones are in the spool, those with
+    ``no_room`` did not fit into it."""
 
     published: int = 0
     waiting: int = 0
@@ -30,26 +30,26 @@ class Delivered:
     no_room: int = 0
     crops: int = 0
     crops_lost: int = 0
-    """Crops without a subscriber."""
+    """Crops not sent because there was no subscriber."""
 
 
 class Output(Protocol):
-    """Takes keyframes."""
+    """A destination of keyframes."""
 
     @property
     def delivered(self) -> Delivered:
         """The counts so far."""
 
     def send(self, keyframe: Keyframe) -> None:
-        """Take one keyframe."""
+        """Write or send one keyframe."""
 
     def close(self, wait_s: float) -> None:
-        """Finish; wait at most so many seconds for acknowledgements."""
+        """Close the output, after waiting at most ``wait_s`` seconds for acknowledgements."""
 
 
 class FileOutput:
-    """Envelopes as JSON lines in a new file. Raises MisuseError when it is there already, or cannot
-    be written."""
+    """Envelopes as JSON lines in a new file. Raises MisuseError if it exists already or cannot be
+    written."""
 
     def __init__(self, path: Path) -> None:
         self.delivered = Delivered()
@@ -85,9 +85,11 @@ class FileOutput:
 
 
 class ZenohOutput:
-    """Envelopes through a spool, which keeps what no recorder has acknowledged; crops at once.
+    """Envelopes over Zenoh through a spool, which keeps them until a recorder acknowledges them;
+    crops directly.
 
-    A spool without room makes files wait (``patient``), and costs a camera the keyframe.
+    While the spool is full, `send` waits if ``patient`` (pictures from files), else it drops the
+    keyframe (a camera).
     """
 
     def __init__(
@@ -132,7 +134,7 @@ class ZenohOutput:
                 self._counts.crops_lost += not sent
 
     def close(self, wait_s: float) -> None:
-        """Wait for acknowledgements, less long when it was stopped, and close the spool."""
+        """Wait for acknowledgements, for a shorter time after ``stop``, and close the spool."""
         left_s = min(wait_s, _LAST_CHANCE_S) if self._stop.is_set() else wait_s
         stopped = self._stop.is_set()
         while left_s > 0 and self._publisher.unacknowledged:
@@ -149,24 +151,24 @@ class CropSender:
     def __init__(self, session: Session, prefix: str, note: Callable[[str], None]) -> None:
         self._session, self._prefix, self._note = session, prefix, note
         self._heard = session.publisher(f"{prefix}/*")
-        self._told = False
+        self._noted = False
 
     def send(self, crop: Crop) -> bool:
-        """Send it; False without a subscriber."""
+        """Publish a crop; return False if there is no subscriber."""
         if not self._heard.has_subscriber:
-            if not self._told:
+            if not self._noted:
                 self._note(
                     f"crops are lost: there is no subscriber to {self._prefix}/*;"
                     " a recorder keeps them, unless its --crops says otherwise"
                 )
-            self._told = True
+            self._noted = True
             return False
         try:
             self._session.put(f"{self._prefix}/{quote(crop.det_id, safe='')}", crop.jpeg)
         except TransportError as error:
-            if not self._told:
+            if not self._noted:
                 self._note(str(error))
-            self._told = True
+            self._noted = True
             return False
         return True
 

@@ -1,7 +1,7 @@
-"""Pictures as bytes: the size of a JPEG or PNG and where it ends, found without decoding it.
+"""Find the size and the end of a JPEG or PNG without decoding it.
 
-So a picture that is cut short, or whose head says that it is huge, is refused before any pixel is
-decoded, and a stream of pictures, as ``ffmpeg -f image2pipe`` writes it, is split into its parts.
+So a picture that is cut short, or huge by its header, is refused before any pixel is decoded, and a
+stream of pictures, as ``ffmpeg -f image2pipe`` writes it, is split into its parts.
 """
 
 import re
@@ -28,7 +28,7 @@ _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _END: Final = 0xD9
 _NEXT_MARKER: Final = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])")
 _ENDS: Final = (b"\xff\xd9", b"IEND\xaeB`\x82")
-"""Of a JPEG and of a PNG."""
+"""The first bytes of a JPEG and of a PNG."""
 _READ_BYTES: Final = 64 * 1024
 
 
@@ -38,9 +38,9 @@ class PictureError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture that a source gave: ``pixels`` decodes it and raises PictureError.
+    """A picture from a source. ``pixels`` decodes it and raises PictureError.
 
-    ``stamp_s`` is when it was taken, in seconds. ``pixels`` may be called until the source gives
+    ``stamp_s`` is when it was taken, in seconds. ``pixels`` may be called until the source yields
     the next picture.
     """
 
@@ -53,7 +53,7 @@ class _Extent(NamedTuple):
     width: int
     height: int
     end: int
-    """The index behind the last byte."""
+    """The index behind the picture's last byte."""
 
 
 class _CutShort(PictureError):
@@ -76,10 +76,10 @@ def check_picture(data: bytes) -> None:
 
 
 def split_stream(read: Callable[[int], bytes]) -> Iterator[bytes | PictureError]:
-    """The pictures of a stream of JPEG and PNG, one behind the other.
+    """Split a stream of consecutive JPEG and PNG pictures.
 
-    ``read`` returns up to so many bytes, none at the end. What is no picture is passed over and
-    given as one PictureError a stretch.
+    ``read`` returns up to so many bytes, none at the end. Each stretch of bytes that are no picture
+    is yielded as one PictureError.
     """
     buffer = bytearray()
     ended = skipping = False
@@ -109,7 +109,7 @@ def split_stream(read: Callable[[int], bytes]) -> Iterator[bytes | PictureError]
 
 
 def _skip_to_a_start(buffer: bytearray, read: Callable[[int], bytes], *, ended: bool) -> bool:
-    """Drop what stands before the next picture; False at the end of the stream."""
+    """Drop the bytes before the next picture; False at the end of the stream."""
     del buffer[:1]
     while True:
         found = [buffer.find(mark) for mark in (JPEG_START, PNG_START)]
@@ -131,8 +131,8 @@ def _grow(buffer: bytearray, read: Callable[[int], bytes]) -> int:
 
 
 def _read_to_an_end(buffer: bytearray, read: Callable[[int], bytes]) -> bool:
-    """Read until a picture may have ended, so that one is not searched again and again for its end;
-    False at the end of the stream."""
+    """Read until the buffer has an end mark, so that a large picture is not parsed again after each
+    read; False at the end of the stream."""
     while True:
         before = max(0, len(buffer) - max(map(len, _ENDS)))
         if not _grow(buffer, read):

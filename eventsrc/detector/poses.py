@@ -1,8 +1,8 @@
 """The robot's poses by time, from a file or as they arrive, and the pose at which a picture was
 taken.
 
-A picture has a pose when one is known within `NEAR_S` of its stamp. With such a pose on each side
-it is between them, in proportion to the time; otherwise it is the nearest one.
+A picture has a pose if one is known within `NEAR_S` of its stamp. With such a pose on each side it
+is interpolated linearly; otherwise it is the nearest one.
 """
 
 import math
@@ -21,22 +21,22 @@ from .messages import MessageError, pose_of
 
 NEAR_S: Final = 0.1
 _KEPT: Final = 20_000
-"""Most poses kept of those that arrive: 100 s of 200 a second."""
+"""Bound of the received poses kept: 100 s of 200 a second."""
 _KEPT_BYTES: Final = 16 * 1024 * 1024
-"""Most bytes of unread messages: 20,000 of Odometry with covariances take 14 MB."""
+"""Bound of the bytes of unread messages: 20,000 of Odometry with covariances take 14 MB."""
 _SLACK_S: Final = 1e-6
 """Tolerance for rounding: stamps 100 ms apart are still within 100 ms."""
 
 
 class Poses(Protocol):
-    """Where the robot was at a time."""
+    """The robot's poses by time."""
 
     def at(self, stamp_s: float) -> Pose | None:
         """The pose at a stamp; None if none is known near it."""
 
 
 class NoPoses:
-    """The robot has none."""
+    """No poses."""
 
     def at(self, stamp_s: float) -> Pose | None:  # noqa: ARG002  as `Poses` has it
         """None."""
@@ -72,7 +72,7 @@ class PoseTrack:
         return after < len(self._stamps) and self._stamps[after] <= stamp_s + NEAR_S + _SLACK_S
 
     def at(self, stamp_s: float) -> Pose | None:
-        """The pose at a stamp, as the module says."""
+        """The pose at a stamp, interpolated or the nearest; None if none is within `NEAR_S`."""
         after = bisect_left(self._stamps, stamp_s)
         near = [
             index
@@ -117,16 +117,16 @@ class LivePoses:
     def __init__(self) -> None:
         self._track = PoseTrack()
         self._last_two_s = (-math.inf, -math.inf)
-        """The stamps of the poses that came last."""
+        """The stamps of the last two poses received."""
         self._messages: deque[tuple[bytes, float]] = deque()
         self._bytes = 0
         self._came = threading.Condition()
         self.count = 0
-        """Poses that were read."""
+        """Number of poses read."""
         self.dropped = 0
-        """Unread messages that were dropped for newer ones."""
+        """Number of unread messages dropped for newer ones."""
         self.bad = 0
-        """Messages that are no pose."""
+        """Number of messages that are no pose."""
         self.bad_reason: str | None = None
         """The reason why the last of them is no pose."""
 
@@ -141,7 +141,7 @@ class LivePoses:
             self._came.notify()
 
     def refuse(self, reason: str) -> None:
-        """Count a message that cannot be taken."""
+        """Count a message that is no pose."""
         with self._came:
             self.bad += 1
             self.bad_reason = reason
@@ -163,8 +163,8 @@ class LivePoses:
                 return self._track.at(stamp_s)
 
     def _reaches(self, stamp_s: float) -> bool:
-        """Whether the poses of that time have come: one soon after it, or the last two are both of
-        later. A single pose far in the future, from a wrong clock, does not count."""
+        """Whether the poses of that time have been received: one is soon after it, or the last two
+        are both later. A single pose far in the future, from a wrong clock, does not count."""
         return self._track.has_soon_after(stamp_s) or min(self._last_two_s) >= stamp_s
 
     def _read(self, payload: bytes, received_s: float) -> None:

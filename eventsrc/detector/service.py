@@ -21,10 +21,10 @@ class Report:
     too_large: int = 0
     """Pictures too large to be taken."""
     poses: int | None = None
-    """Poses that came in; None where they do not."""
+    """Poses received over Zenoh; None if poses are not received."""
     bad_poses: int = 0
     stopped: bool = False
-    """Whether it ended before the last picture of a file, folder or stream."""
+    """Whether the run ended before the last picture of a file, folder or stream."""
 
     @property
     def clean(self) -> bool:
@@ -47,19 +47,19 @@ class Detection:
     def run(self, pictures: Iterable[Picture], watch: Callable[[Report], None]) -> None:
         """Process all pictures, or until ``stop`` is set; ``watch`` is called after each.
 
-        Pictures that come in over Zenoh have no last one: they end by themselves with ``stop``.
+        Pictures received over Zenoh have no last one; their iterator ends with ``stop``.
         """
         for picture in pictures:
             if self._stop.is_set() and pictures is not self._live:
                 self._stopped = True
                 return
-            keyframe = self._keyframes.look(picture)
+            keyframe = self._keyframes.process(picture)
             if keyframe is not None:
                 self._output.send(keyframe)
             watch(self.report())
 
     def close(self, wait_s: float) -> None:
-        """Finish the output."""
+        """Close the output, after waiting at most ``wait_s`` seconds for acknowledgements."""
         self._output.close(wait_s)
 
     def report(self) -> Report:

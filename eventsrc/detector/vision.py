@@ -1,4 +1,4 @@
-"""OpenCV: pictures decoded, resized, cut and encoded, and videos read. Only this module imports it.
+"""Decode, resize, cut and encode pictures and read videos by OpenCV. Only this module imports it.
 
 docs/decisions/opencv.md says why OpenCV. It is imported when the first picture is decoded.
 """
@@ -26,12 +26,12 @@ Floats = NDArray[np.float32]
 Fit: TypeAlias = Literal["crop", "stretch", "pad"]
 JPEG_QUALITY: Final = 90
 _PADDING: Final = 114
-"""The grey that detectors are trained with around a picture."""
+"""The grey around pictures in the training of detectors."""
 
 
 @functools.cache
 def _cv2() -> ModuleType:
-    # Read when it is imported: what it prints about files, as FFmpeg in it does, is said by us.
+    # Read at import. They silence OpenCV and its FFmpeg: faults are in our own messages.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     try:
@@ -67,15 +67,15 @@ _stderr = threading.Lock()
 _PADDED: Final = re.compile(
     r"Corrupt JPEG data: (\d|1[0-6]) extraneous bytes before marker 0xd9", re.ASCII
 )
-"""Many cameras that compress in hardware fill a picture up between its last pixel and its end."""
+"""Padding before the end mark, which many cameras that compress in hardware add; no damage."""
 
 
 @contextmanager
 def _decoder_messages() -> Iterator[list[str]]:
-    """A list that has, after the block, what the C libraries of the decoders printed.
+    """Collect the messages of the decoders' C libraries; the list is filled after the block.
 
-    They print to file descriptor 2 that a JPEG is damaged, and decode the rest of it to grey. So
-    stderr is a file in memory meanwhile; what others print there goes on to the real one.
+    They report a damaged JPEG on file descriptor 2 only, and decode the rest of it to grey. So
+    stderr is a file in memory within the block; other output there is passed on afterwards.
     """
     messages: list[str] = []
     with _stderr, _scratch() as scratch:
@@ -142,7 +142,7 @@ def shrunk(pixels: Pixels, side: int) -> Pixels:
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """How a picture lies in a model's input: scaled by ``scale`` along x and y, then moved."""
+    """The place of a picture in a model's input: scaled along x and y, then shifted."""
 
     width: int
     height: int
@@ -151,8 +151,8 @@ class Letterbox:
 
     @classmethod
     def of(cls, width: int, height: int, size: tuple[int, int], *, centred: bool) -> "Letterbox":
-        """The largest that fits into ``size``, width and height of the input, unstretched but for
-        the rounding to whole pixels."""
+        """The largest that fits into ``size``, width and height of the input. The aspect ratio is
+        kept, except for rounding to whole pixels."""
         ratio = min(size[0] / width, size[1] / height)
         inner = max(1, round(width * ratio)), max(1, round(height * ratio))
         free = size[0] - inner[0], size[1] - inner[1]
@@ -165,20 +165,20 @@ class Letterbox:
         return round(self.width * self.scale[0]), round(self.height * self.scale[1])
 
     def to_picture(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes (x0, y0, x1, y1) of the input in pixels of the picture, cut to it."""
+        """Boxes (x0, y0, x1, y1) in the input as pixels of the picture, clipped to it."""
         offset, scale = np.array(self.offset * 2), np.array(self.scale * 2)
         limit = np.array((self.width, self.height) * 2, np.float64)
         moved: NDArray[np.float64] = np.clip((boxes - offset) / scale, 0.0, limit)
         return moved
 
     def to_input(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes of the picture in pixels of the input."""
+        """Boxes in the picture as pixels of the input."""
         moved: NDArray[np.float64] = boxes * np.array(self.scale * 2) + np.array(self.offset * 2)
         return moved
 
 
 class Canvas:
-    """A model's input for one picture at a time; its memory is used again for each."""
+    """A buffer in the size of a model's input, reused for each picture."""
 
     def __init__(self, size: tuple[int, int], *, centred: bool) -> None:
         self._size, self._centred = size, centred
@@ -186,7 +186,7 @@ class Canvas:
         self._last: Letterbox | None = None
 
     def lay(self, pixels: Pixels) -> tuple[Pixels, Letterbox]:
-        """``pixels`` with grey around, in the input's size. Holds until the next call."""
+        """``pixels`` scaled to the input's size with grey around. Valid until the next call."""
         cv2 = _cv2()
         height, width = pixels.shape[:2]
         box = Letterbox.of(width, height, self._size, centred=self._centred)
@@ -203,8 +203,8 @@ class Canvas:
 
 
 class Scaling(NamedTuple):
-    """How values become a model's input: times ``gain`` plus ``shift``, for each channel of the
-    model, which takes red first if ``rgb``, else blue."""
+    """The normalisation of a model's input: value times ``gain`` plus ``shift`` for each channel,
+    red first if ``rgb``, else blue first."""
 
     rgb: bool
     gain: tuple[float, ...]
@@ -244,7 +244,7 @@ def fitted(pixels: Pixels, size: tuple[int, int], fit: Fit, *, cubic: bool) -> P
     ratios = size[0] / width, size[1] / height
     ratio = max(ratios) if fit == "crop" else min(ratios)
     if fit == "crop":
-        # What is cut away is cut before resizing, so that a wide crop does not become huge.
+        # Cut before resizing, so that a wide crop does not become huge.
         keep_w, keep_h = min(width, size[0] / ratio), min(height, size[1] / ratio)
         x, y = round((width - keep_w) / 2), round((height - keep_h) / 2)
         middle = pixels[y : y + max(1, round(keep_h)), x : x + max(1, round(keep_w))]

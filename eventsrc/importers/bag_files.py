@@ -137,12 +137,12 @@ class Bag:
         share = self._parts[self._at].share_read()
         return sum(self._sizes[: self._at]) + int(share * self._sizes[self._at])
 
-    def look(self, sampled: Sampled) -> BagContents:
+    def scan(self, sampled: Sampled) -> BagContents:
         """Read the whole bag: its topics, with the messages for which ``sampled`` returns True."""
         contents = BagContents()
         for part in self._parts:
             try:
-                part.look(contents, sampled)
+                part.scan(contents, sampled)
             except _DAMAGE as error:
                 contents.damage = contents.damage or f"{part.path.name}: {error}"
         return contents
@@ -182,7 +182,7 @@ class _Part(Protocol):
     advice: str
     """The end of messages about damage: how more of the file may be saved."""
 
-    def look(self, contents: BagContents, sampled: Sampled) -> None: ...
+    def scan(self, contents: BagContents, sampled: Sampled) -> None: ...
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]: ...
 
@@ -203,7 +203,7 @@ class _McapPart:
     def share_read(self) -> float:
         return 0.0 if self._file is None or self._file.closed else self._file.tell() / self._size
 
-    def look(self, contents: BagContents, sampled: Sampled) -> None:
+    def scan(self, contents: BagContents, sampled: Sampled) -> None:
         for message in self._all():
             topic = contents.topics.get(message.key)
             if topic is None:
@@ -246,7 +246,7 @@ class _SqlitePart:
     def share_read(self) -> float:
         return min(self._read / self._count, 1.0)
 
-    def look(self, contents: BagContents, sampled: Sampled) -> None:
+    def scan(self, contents: BagContents, sampled: Sampled) -> None:
         bag = self._opened()
         for each in bag.topics():
             about = each.topic, each.type_name, each.encoding, each.definition

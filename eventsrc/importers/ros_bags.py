@@ -75,7 +75,7 @@ class RosBag:
 
     def messages(self) -> Iterator[ImportedMessage]:
         """Envelopes and maps, in the order in which detections and grids were received."""
-        contents = self._bag.look(sampled)
+        contents = self._bag.scan(sampled)
         notes = self._define(contents)
         choice = choose(bag_name(self._path), contents, self._types, self._options)
         report = self.report = _report(self.name, contents, choice)

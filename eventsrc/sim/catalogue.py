@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One product; objects of the same model look nearly the same."""
+    """A model of furniture; objects of the same model look nearly the same."""
 
     name: str
     class_name: str
@@ -86,7 +86,7 @@ FURNITURE: dict[str, tuple[str, ...]] = {
     ),
     "hall": ("rack-coats", "bench-hall", "plant-cactus", "mirror-plain", "picture-print"),
 }
-"""Model names by room, in the order of placing: large ones first."""
+"""Model names by room, in the order in which they are placed: large ones first."""
 
 DINING_SET = ("table-dining", "chair-dining", "chair-dining", "chair-dining", "chair-dining")
 """Placed together in the dining room: the table and four chairs around it."""

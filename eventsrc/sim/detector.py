@@ -2,7 +2,7 @@
 
 Camera: a pinhole looking straight ahead, 640 × 400 pixels, 69.4° wide. An object is visible when it
 is in range, most of its box is in the picture, the box is not tiny, and no wall stands between the
-camera and its middle or one of its sides. Furniture hides phantom.
+camera and its middle or one of its sides. Furniture hides nothing.
 
 Detector: it misses some objects, gets boxes wrong by a few pixels, is less confident of distant
 objects, gives 4 % a wrong class (of about the same size), and detects something that is not there
@@ -48,7 +48,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class VisibleObject:
-    """A thing in view: its exact box in pixels, its distance, and which side of it shows.
+    """A thing in view: its exact box in pixels, its distance, and the side that the camera sees.
 
     ``side_rad`` is the direction from the thing to the camera, relative to the thing's front.
     """
@@ -174,7 +174,8 @@ CLASSES = tuple(sorted({model.class_name for model in MODELS.values()}))
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """The fields of a detection in the envelope, without its id; the true instance or None."""
+    """The fields of a detection in the envelope, without its id, and the true instance, None for a
+    phantom."""
 
     fields: dict[str, Any]
     instance: str | None

@@ -44,7 +44,7 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """A gap in the wall between two rooms, without a leaf. ``flat`` when the wall runs along x."""
+    """A gap in the wall between two rooms. ``flat`` if the wall runs along x."""
 
     rooms: tuple[str, str]
     centre: Point
@@ -167,7 +167,7 @@ def _walls(
 
 
 def _cut(start: float, end: float, gaps: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The line from ``start`` to ``end`` without its ``gaps`` of (centre, width)."""
+    """The pieces of the line from ``start`` to ``end`` between its ``gaps`` (centre, width)."""
     pieces: list[tuple[float, float]] = []
     for centre, width in sorted(gaps):
         pieces.append((start, centre - width / 2))

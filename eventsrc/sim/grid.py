@@ -2,8 +2,8 @@
 
 Cells are 0.1 m. A cell is free when its centre is at least ``CLEARANCE_M`` from walls and
 furniture; that is more than the robot's radius, because the driven path cuts corners a little.
-Costs are integers (10 straight, 14 diagonal, more near obstacles), so ties break the same way
-everywhere.
+Costs are integers (10 straight, 14 diagonal, more near obstacles), so ties are broken in the same
+way on every machine.
 """
 
 import heapq
@@ -54,9 +54,10 @@ class DriveGrid:
         return self.clearance_at(x, y) >= CLEARANCE_M
 
     def clearest(self, around: Point, within: Rect, radius_m: float) -> Point:
-        """The free spot in ``within`` with most clearance, at most ``radius_m`` from ``around``.
+        """The free spot in ``within`` with most clearance, at most ``radius_m`` from ``around``; of
+        equal ones the nearest.
 
-        Nearer spots win ties. Raises MapfoldError when no spot there is free.
+        Raises MapfoldError when no spot there is free.
         """
         best: tuple[float, float, Cell] | None = None
         for cell in self._cells_of(within):

@@ -1,4 +1,4 @@
-"""A furnished house: the floor plan and the objects in it, all from one seed.
+"""A furnished house: a floor plan and the objects in it, from one seed.
 
 Furniture stands with its back to a wall, clear of doors and of each other; the dining set stands
 free. A furnishing is accepted only if the robot can drive from every room to every other; otherwise
@@ -85,10 +85,8 @@ def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
 
 
 def _with_instances(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
-    """Name instances of one model house7-model-1, house7-model-2 … in the order they were placed.
-
-    Two houses may have the same model of chair, never the same chair.
-    """
+    """Name the instances of a model house7-model-1, house7-model-2 … in the order of placing. No
+    two houses share an instance."""
     counts: dict[str, int] = {}
     named: list[Thing] = []
     for thing in things:
@@ -176,10 +174,8 @@ def _door_area(door: Door) -> Rect:
 
 
 def occupancy_map(house: House) -> OccupancyMap:
-    """The walls as an occupancy map, as a map server would publish them.
-
-    No furniture, nothing unknown. A wall takes the cells that its line is in.
-    """
+    """The walls as an occupancy map, without furniture and without unknown cells. A wall occupies
+    the cells that its line is in."""
     lines = [(w.x0, w.y0, w.x1, w.y1) for w in house.plan.walls]
     left = _cell(min(min(x0, x1) for x0, _, x1, _ in lines)) - _MAP_MARGIN
     below = _cell(min(min(y0, y1) for _, y0, _, y1 in lines)) - _MAP_MARGIN
@@ -195,5 +191,5 @@ def occupancy_map(house: House) -> OccupancyMap:
 
 
 def _cell(metres: float) -> int:
-    """The number of a cell; walls lie on tenths of a millimetre, so the division is safe."""
+    """The index of a cell. Walls lie on tenths of a millimetre, so the division is exact enough."""
     return round(metres * 10_000) // round(_MAP_RESOLUTION_M * 10_000)

@@ -1,16 +1,16 @@
-"""Pictures of the simulated robot's camera along a drive, with poses and truth: into a folder, or
-over Zenoh.
+"""Draw the pictures of the simulated robot's camera along a drive, with poses and truth, and write
+them to a folder or publish them over Zenoh.
 
 For each column of a picture a ray is cast over the floor plan; walls and things are upright, so a
-hit is a stretch of that column. What is nearer hides what is behind it, pixel by pixel. Everything
-is flat: floor, ceiling and walls in greys, each thing in a colour of its own, so that a detector
+hit is a stretch of that column. Nearer surfaces hide farther ones, pixel by pixel. Colours are
+uniform: floor, ceiling and walls are grey, each thing has a colour of its own, so that a detector
 with known weights can find the things and an encoder that only averages colours can tell those of
 one class apart. Things of one class have hues as different as possible.
 
 A folder gets a JPEG for each picture, named by the time it was taken, ``poses.csv`` with a pose of
-the localisation for each, and ``truth.jsonl`` with what each shows; `mapfold detect` reads the
-first two. Over Zenoh a picture is sensor_msgs/CompressedImage in CDR, as a bridge of ROS 2 sends
-it, and its pose, just before it, JSON.
+the localisation for each, and ``truth.jsonl`` with the things that each shows; `mapfold detect`
+reads the first two. Over Zenoh a picture is sensor_msgs/CompressedImage in CDR, as a bridge of
+ROS 2 sends it, preceded by its pose in JSON.
 """
 
 import itertools
@@ -56,7 +56,7 @@ _LEAST_CHROMA: Final = 128
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A thing in a picture: the box around the pixels that show it, and how many these are."""
+    """A thing in a picture: the box around the pixels that show it, and their number."""
 
     instance: str
     class_name: str
@@ -93,7 +93,7 @@ def thing_colours(house: House) -> dict[str, Colour]:
 
 
 def _nearest_hue(colour: Colour, others: list[Colour]) -> int:
-    """The greatest cosine to others' hues, in thousandths."""
+    """The greatest cosine between the hue of ``colour`` and those of ``others``, in thousandths."""
     return max((round(1000 * _hue_cosine(colour, other)) for other in others), default=-1000)
 
 
@@ -128,7 +128,7 @@ class Camera:
         ahead = self._depths(self._walls, pose)
         nearest = ahead.argmin(axis=0)
         wall = ahead[nearest, np.arange(WIDTH_PX)]
-        # What each pixel shows, as an index into the palette.
+        # For each pixel an index into the palette.
         shows = np.where(
             self._between(wall, 0.0, _WALL_HEIGHT_M, slice(None)),
             self._wall_kinds[nearest],
@@ -155,7 +155,7 @@ class Camera:
         shows: NDArray[np.uint8],
         depth: NDArray[np.float32],
     ) -> tuple[slice, slice]:
-        """Draw one thing; returns the rows and columns that may show it."""
+        """Draw one thing; return the rows and columns that may show it."""
         hit = np.flatnonzero(np.isfinite(front))
         columns = slice(int(hit[0]), int(hit[-1]) + 1)
         front, back = front[columns], np.minimum(back[columns], _FAR_M)
@@ -190,8 +190,8 @@ class Camera:
         return between
 
     def _depths(self, segments: NDArray[np.float64], pose: TruePose) -> NDArray[np.float64]:
-        """How far ahead each column's ray meets each segment, shape (segments, columns); infinite
-        where it does not."""
+        """The depth in metres at which each column's ray meets each segment, shape (segments,
+        columns); infinite where it does not."""
         cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
         moved = segments - np.array((pose.x, pose.y) * 2)
         ahead = moved[:, 0::2] * cos + moved[:, 1::2] * sin
@@ -232,11 +232,11 @@ _SLACK_S: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class CameraPicture:
-    """A picture: when it was taken, where the localisation was then, and what it truly shows."""
+    """A picture with its time, the pose of the localisation, and the true things in it."""
 
     stamp_s: float
     time_s: float
-    """Since the drive began."""
+    """Seconds since the drive began."""
     pose: dict[str, float]
     jpeg: bytes
     truth: dict[str, Any]
@@ -283,7 +283,7 @@ def _at_rate(poses: Iterator[TruePose], per_s: float) -> Iterator[TruePose]:
 
 
 def write_pictures(pictures: Iterator[CameraPicture], folder: Path, stop: threading.Event) -> int:
-    """Write pictures, poses and truth until ``stop`` is set; returns how many pictures.
+    """Write pictures, poses and truth until ``stop`` is set; return the number of pictures.
 
     Raises MisuseError if the folder is not empty or cannot be written.
     """
@@ -322,8 +322,9 @@ def publish_pictures(
     wait_s: float,
     stop: threading.Event,
 ) -> int:
-    """Publish pictures and poses, ``speed`` times as fast as the robot drove, until ``stop`` is
-    set; 0 is unpaced. Returns how many pictures. TransportError without a subscriber in time."""
+    """Publish pictures and poses, ``speed`` times as fast as the robot drove (0: unpaced), until
+    ``stop`` is set; return the number of pictures. Raises TransportError if there is no subscriber
+    within ``wait_s`` seconds."""
     images, poses = session.publisher(image_key), session.publisher(pose_key)
     if not images.wait_for_subscriber(wait_s):
         raise TransportError(

@@ -1,4 +1,4 @@
-"""Named random streams: every decision draws from its own, so that none shifts another.
+"""Named random streams: each decision has its own, so that its draws do not shift those of others.
 
 A stream is PCG64 seeded with the SHA-256 of its name's words. Directions and noise are sums of
 integers (Irwin-Hall, close enough to normal): unlike numpy's normal variates they use no

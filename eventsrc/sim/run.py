@@ -1,7 +1,7 @@
 """Simulate a run through a house, and publish it over Zenoh or write it to a file.
 
 The poses in the envelopes are those of a localisation, a centimetre or two off the true ones. The
-truth has the room of each keyframe and the instance of each detection; it goes to a file of its
+truth, the room of each keyframe and the instance of each detection, is written to a file of its
 own, never into an envelope or a log.
 """
 
@@ -30,7 +30,7 @@ from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
 
 DEFAULT_SEED = 7
 FIRST_START_S = 1_777_885_200.0
-"""2026-05-04 09:00 UTC: when run a starts. Each further run starts a day later."""
+"""The start of run a, 2026-05-04 09:00 UTC. Each further run starts a day later."""
 _DAY_S = 86_400.0
 _POSITION_NOISE_M = 0.012
 _YAW_NOISE_RAD = 0.008
@@ -53,7 +53,7 @@ class SimulatedRun:
 
 
 def encode(document: dict[str, Any]) -> bytes:
-    """One compact line of UTF-8 JSON, without the line's end."""
+    """One compact line of UTF-8 JSON, without a line end."""
     return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
 
 
@@ -73,7 +73,7 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
 
 
 def start_of(run: str) -> float:
-    """When ``run`` starts, in seconds since 1970."""
+    """The start of ``run`` in seconds since the Unix epoch."""
     return FIRST_START_S + _DAY_S * _day(run)
 
 
@@ -128,8 +128,8 @@ def publish_run(
 ) -> int:
     """Publish ``run`` under ``key``, ``speed`` times as fast as the robot drove; 0 is unpaced.
 
-    Waits up to ``wait_s`` seconds for a subscriber, without which messages are lost; TransportError
-    if there is none. Returns how many keyframes were sent: not all when ``stop`` was set.
+    Waits up to ``wait_s`` seconds for a subscriber, because messages without one are lost; raises
+    TransportError if there is none. Returns the number of keyframes sent before ``stop`` was set.
     """
     publisher = session.publisher(key)
     if not publisher.wait_for_subscriber(wait_s):

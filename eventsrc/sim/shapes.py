@@ -12,7 +12,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Rect:
-    """An upright rectangle; x0 <= x1 and y0 <= y1."""
+    """A rectangle with sides along x and y; x0 <= x1 and y0 <= y1."""
 
     x0: float
     y0: float

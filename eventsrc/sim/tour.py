@@ -99,8 +99,8 @@ def _opening(house: House) -> Point:
 def nearest_by_route(grid: DriveGrid, start: Point, goals: Sequence[Point]) -> Point:
     """The goal with the shortest route; of several the least.
 
-    No route is shorter than the straight line, so goals that are farther away than the shortest
-    route found so far need none.
+    No route is shorter than the straight line, so no route is searched to goals that are farther
+    away than the shortest route found so far is long.
     """
     best = (math.inf, start)
     for goal in sorted(goals, key=lambda goal: math.dist(start, goal)):

@@ -83,7 +83,7 @@ def measure(seconds: float) -> dict[str, Any]:
         started = time.process_time()
         try:
             for picture in open_images(str(drawn), lambda _size: b"", Timing()):
-                keyframe = looking.look(picture)
+                keyframe = looking.process(picture)
                 assert keyframe is not None
                 output.send(keyframe)
         finally:

@@ -127,7 +127,7 @@ def test_the_gate_is_the_naive_one(
     chosen = []
     for index, (stamp, pose) in enumerate(pictures):
         if gate.is_due(stamp, pose):
-            gate.take(stamp, pose)
+            gate.set_last(stamp, pose)
             chosen.append(index)
     assert chosen == _naive_keyframes(pictures, limits)
 
@@ -138,7 +138,7 @@ def test_half_a_metre_in_steps_is_half_a_metre() -> None:
     x = 0.0
     for step in range(101):
         if gate.is_due(float(step), Pose(x, 0.0, 3.1)):
-            gate.take(float(step), Pose(x, 0.0, 3.1))
+            gate.set_last(float(step), Pose(x, 0.0, 3.1))
             taken += 1
         x += 0.05
     assert taken == 11
