@@ -1,12 +1,12 @@
-"""A recorder's side of a zenoh-bridge-ros2dds: its messages, kept verbatim, and what they make.
+"""Record messages of a zenoh-bridge-ros2dds verbatim, and the envelopes that they complete.
 
 Zenoh's threads put messages into the queue and note tokens of types. The writer thread gives the
 messages to `Bridge.take`, which finds the type of each and returns what is to be appended: the
 message with its schema, and right behind it the envelopes that it completes (`eventsrc.ros`).
 
-A message whose type no token has told yet is held back, for at most `HOLD_NS` and within
-`HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema and makes nothing. Messages of
-one topic keep their order. Nothing is lost here but messages under keys of no topic, which are
+A message whose type no token has given yet is held back, for at most `HOLD_NS` and within
+`HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema, and no envelope is made of it.
+Messages of one topic keep their order. Only messages under keys of no topic are left out; they are
 counted.
 """
 
@@ -45,8 +45,11 @@ class _Held(NamedTuple):
 
 
 class Bridge:
-    """Belongs to the writer thread, but for `note_token`. ``topics`` are all that are recorded,
-    also those that ``recording`` makes nothing of."""
+    """The topics of a bridge that are recorded, with the types and held messages of each.
+
+    Only the writer thread changes it, except by `note_token`. ``topics`` are all that are recorded,
+    also those from which ``recording`` makes no envelope.
+    """
 
     def __init__(self, recording: RosRecording, topics: Iterable[str], types: MessageTypes) -> None:
         self.recording = recording
@@ -56,18 +59,18 @@ class Bridge:
         self._derivation = Derivation(recording, types)
         self._types = types
         self._lock = threading.Lock()
-        self._told: dict[str, str] = {}
+        self._new_types: dict[str, str] = {}
         self._formats: dict[str, MessageFormat] = {}
         self._held: deque[_Held] = deque()
         self._held_bytes = 0
         self.untyped = 0
         """Messages kept without a schema, since their type is not known."""
         self.unknown_keys = 0
-        """Messages left out, since their keys are those of no topic of ours."""
+        """Messages left out, since their keys belong to no recorded topic."""
 
     @property
     def refused(self) -> dict[str, int]:
-        """Messages that are kept and cannot be read, by topic."""
+        """How many messages are kept but cannot be read, by topic."""
         return self._derivation.refused
 
     @property
@@ -77,7 +80,7 @@ class Bridge:
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """What the envelopes have and what they lack, by topic of detections."""
+        """What the envelopes contain and what they lack, by topic of detections."""
         return self._derivation.counts
 
     @property
@@ -95,15 +98,15 @@ class Bridge:
         )
 
     @property
-    def types_told(self) -> frozenset[str]:
+    def types_known(self) -> frozenset[str]:
         """The keys whose types are known; may be called from any thread."""
         with self._lock:
-            return frozenset(self._formats) | frozenset(self._told)
+            return frozenset(self._formats) | frozenset(self._new_types)
 
     @property
     def latched_keys(self) -> tuple[str, ...]:
-        """Keys whose last messages a bridge may keep for who comes late. Detections and their
-        embeddings are not asked for: what is kept of them is of before."""
+        """Keys whose last messages a bridge may cache for late subscribers. Without detections and
+        their embeddings: cached ones are older than this recording."""
         live = {t for s in self.recording.streams for t in (s.detections, s.embeddings)}
         return tuple(key for key, topic in self._topics.items() if topic not in live)
 
@@ -117,14 +120,14 @@ class Bridge:
         found = type_of_token(token)
         if found is not None and found[0] in self._topics:
             with self._lock:
-                self._told[found[0]] = found[1]
+                self._new_types[found[0]] = found[1]
 
     def take(
         self, messages: Sequence[BridgedMessage], logged_ns: int, check: CheckEnvelope
     ) -> list[CheckedMessage]:
-        """What is to be appended at ``logged_ns`` for these messages, and for those held back whose
-        type came or whose time is over."""
-        self._learn()
+        """The messages to append at ``logged_ns``: these, and those held back whose type is known
+        by now or whose time is over, each with what it completes."""
+        self._store_new_types()
         taken = [*self._release(logged_ns, check)] if self._held else []
         waiting = {held.key for held in self._held}
         for message in messages:
@@ -142,7 +145,7 @@ class Bridge:
         return taken
 
     def finish(self, logged_ns: int, check: CheckEnvelope) -> list[CheckedMessage]:
-        """What is left to be appended at the end."""
+        """The messages still to be appended when the recording ends."""
         taken = self.take((), logged_ns, check)
         while self._held:
             taken += self._give_up(self._next_held(), logged_ns, check)
@@ -150,15 +153,15 @@ class Bridge:
             taken += _checked(derived, check)
         return taken
 
-    def _learn(self) -> None:
-        """Take over the types that tokens have told."""
+    def _store_new_types(self) -> None:
+        """Make a format of each type that tokens gave since the last call."""
         with self._lock:
-            told, self._told = self._told, {}
-            for key, type_name in told.items():
+            new_types, self._new_types = self._new_types, {}
+            for key, type_name in new_types.items():
                 self._formats[key] = self._format(type_name)
 
     def _format(self, type_name: str) -> MessageFormat:
-        """With the definition of the type, if there is one."""
+        """The format of messages of a type, with its definition if that is known."""
         try:
             text = self._types.definition(type_name).encode()
         except Undecodable:
@@ -195,7 +198,7 @@ class Bridge:
     ) -> Iterator[CheckedMessage]:
         topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
         yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
-        if form.schema:  # of a type without a known definition nothing is made, which is counted
+        if form.schema:  # without a known definition no envelope is made, which is counted
             definition = form.schema_text.decode()
             made = self._derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:

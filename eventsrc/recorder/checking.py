@@ -42,8 +42,8 @@ _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
 
 
 class CheckedMessage(msgspec.Struct, frozen=True, gc=False):
-    """A message, and what the writer thread needs of the envelope in it. A map is already the
-    event that it becomes, under its key; from the network nothing else can come under that.
+    """A checked message, and what the writer thread needs of the envelope in it. The payload of a
+    map is already that of its event; its key is `MAP_KEY`, which no other accepted message has.
 
     ``run_id``, ``keyframe_id`` and ``stamp_ns`` are None for a rejected payload and for a form
     older than the envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of
@@ -118,7 +118,7 @@ class Checker:
 
     def next_batch(self, timeout_s: float) -> Batch | None:
         """The next batch; an empty one if nothing came in time, None after the last one."""
-        closed = self._queue.closed  # read first: what was put before closing is still recorded
+        closed = self._queue.closed  # read first: messages put before closing are recorded
         self._add(_BATCH, timeout_s if self._ahead.empty else 0.0)
         batch, self._ahead = self._ahead, Batch()
         return None if batch.empty and (closed or self._left == 0) else batch
@@ -152,14 +152,14 @@ class Checker:
             else:
                 payloads.append(message)
                 batch.size += len(message.payload)
-        for part in _parts(payloads):
+        for part in _split(payloads):
             batch.messages.extend(self.check(part))
         if self._left is not None:
             self._left -= batch.count - before
         return bool(received)
 
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
-        """Check messages together."""
+        """Validate messages together; the result of each, in order."""
         checked = check_payloads(
             [(message.key, message.payload) for message in messages],
             first=self._writer.next_offset,
@@ -194,8 +194,8 @@ def _checked_crop(message: CropMessage, now_ns: int) -> CheckedMessage:
     return CheckedMessage(topic, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
 
 
-def _parts(messages: Sequence[Received]) -> Iterator[list[Received]]:
-    """``messages`` in parts to be checked together."""
+def _split(messages: Sequence[Received]) -> Iterator[list[Received]]:
+    """Split ``messages`` into parts that are checked together."""
     part: list[Received] = []
     size = 0
     for message in messages:

@@ -1,4 +1,4 @@
-"""A recorder's side of commands over Zenoh: `EditRequest` in the queue, `Edits` behind it.
+"""Record commands that come over Zenoh: `EditRequest` in the queue, `Edits` in the writer thread.
 
 Zenoh's thread makes an `EditRequest` and puts it into the queue, or refuses it when it is too large
 or too many wait. The writer thread gives it to `Edits`, which checks and appends the command, and
@@ -43,11 +43,11 @@ class EditRequest:
         self.known_at = Offset(int(known_at)) if known_at.isdecimal() else None
 
     def reply(self, recorded: Recorded) -> None:
-        """Say that the command is durable."""
+        """Reply that the command is durable."""
         self._query.reply(self._query.key, recorded.encode())
 
     def refuse(self, error: str, newer: Offset | None = None) -> None:
-        """Say that the command is not recorded, and why."""
+        """Reply that the command is not recorded, and why."""
         refuse_query(self._query, error, newer)
 
 
@@ -57,7 +57,7 @@ def refuse_query(query: Query, error: str, newer: Offset | None = None) -> None:
 
 
 def fault_of(query: Query) -> str | None:
-    """Why a query is not even read; None if it may be."""
+    """Why the payload of a query is not read; None if its size is allowed."""
     if query.size > MAX_COMMAND_BYTES or query.selector_size > MAX_SELECTOR:
         return (
             f"a command of {query.size:,} bytes behind a selector of {query.selector_size:,}; "
@@ -83,7 +83,7 @@ class KnownCommands:
 
     @classmethod
     def of(cls, reader: LogReader) -> "KnownCommands":
-        """Those of a log. Raises LogDamaged, also where an event is no command."""
+        """The commands of a log. Raises LogDamaged, also for an event that is no valid command."""
         known = cls()
         for event in reader.read(keys={COMMAND_KEY}):
             try:
@@ -101,8 +101,8 @@ class KnownCommands:
         self.end = Offset(offset + 1)
 
     def find(self, command: Command) -> Offset | None:
-        """The offset of this very command; None if the id is new. Raises InvalidCommand if the id
-        is that of another command."""
+        """The offset at which this command is recorded; None if its id is new. Raises
+        InvalidCommand if the id is that of another command."""
         known = self._by_id.get(command.command_id)
         if known is None:
             return None

@@ -1,4 +1,4 @@
-"""Commands for a log that a recorder holds, over Zenoh: the query, its replies, and asking.
+"""Send commands over Zenoh to the recorder that holds a log: the query and its replies.
 
 A recorder started with ``--accept-edits`` answers queries to ``mapfold/edit/<log id>``. The payload
 is a command's JSON (`eventsrc.commands`). The parameter ``known_at=N`` says that the sender made
@@ -72,7 +72,7 @@ class NoAnswer(TransportError):
 def send_command(
     session: Session, log_id: str, command: Command, known_at: Offset, *, timeout_s: float
 ) -> Recorded:
-    """Have the recorder of a log append ``command``; returns when it is durable.
+    """Send ``command`` to the recorder of a log; return its reply when the event is durable.
 
     Raises CommandRefused, NewerCommand, or NoAnswer, after which the command may still be recorded.
     """

@@ -31,8 +31,8 @@ from .writer_thread import RecorderReport, WriterThread
 DEFAULT_KEYS: Final = ("tb/detections",)
 DEFAULT_CROPS: Final = ("tb/crops/*",)
 _CACHE_TIMEOUT_S: Final = 2.0
-_MOST_KEPT: Final = 1_000
-"""Messages taken from what a bridge keeps of one topic."""
+_MAX_CACHED: Final = 1_000
+"""Limit for the messages that a bridge has cached of one topic."""
 _MAX_REJECTED: Final = 2
 """A message of up to this many times the size limit (or the default limit, if larger) is rejected,
 kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it
@@ -45,9 +45,9 @@ class Recorder:
     It is subscribed when the constructor returns. ``ledger`` is the log's gap history
     (`eventsrc.gap_history`); without it, a gap between an earlier recorder's last keyframe and this
     one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots that do
-    not count their keyframes by one. With ``edits`` it takes commands too (`edits`), with
-    ``bridge`` the messages of a bridge from ROS (`bridged`), under ``crops``, each
-    ``PREFIX/*``, the JPEGs of detections (`eventsrc.crops`), which then are nothing under ``keys``.
+    not count their keyframes by one. With ``edits`` it records commands too (`edits`), with
+    ``bridge`` the messages of a bridge from ROS (`bridged`). Under ``crops``, each ``PREFIX/*``, it
+    records the JPEGs of detections (`eventsrc.crops`), and ignores them under ``keys``.
     """
 
     def __init__(
@@ -108,8 +108,8 @@ class Recorder:
         session.confirm()
 
     def _subscribe_bridge(self, session: Session, bridge: Bridge, limit: SizeLimit) -> None:
-        """Subscribe to a bridge's tokens, then to its messages, and get those that it keeps for
-        who comes late."""
+        """Subscribe to a bridge's tokens, then to its messages, and get those that it has cached
+        for late subscribers."""
         for key in bridge.keys:
             for selector in token_selectors(key):
                 self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
@@ -122,7 +122,7 @@ class Recorder:
         for key in bridge.latched_keys:
             for selector in cache_selectors(key):
                 for message in session.kept(
-                    selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MOST_KEPT
+                    selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MAX_CACHED
                 ):
                     self._receive_bridged(message)
 
@@ -169,8 +169,8 @@ class Recorder:
         writing.result()
 
     def _receive(self, messages: Sequence[Received]) -> None:
-        # A recorder of `**` receives acks and refusals too, also its own. They are not data. Crops
-        # it receives twice.
+        # A recorder of `**` also receives acks and refusals, which are not data, and each crop a
+        # second time.
         ignored = (ACK_PREFIX, *self._crop_prefixes)
         self._queue.put_all([m for m in messages if not m.key.startswith(ignored)])
 
@@ -195,5 +195,5 @@ class Recorder:
         try:
             self._session.send(key, payload)
         except TransportError:
-            # The robot will send again, and this recorder reply again.
+            # The robot sends the message again, and is then replied to again.
             return

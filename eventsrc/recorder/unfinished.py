@@ -1,8 +1,8 @@
-"""What a recorder of ROS messages that was killed left out: messages without their envelopes.
+"""Append the envelopes that a killed recorder of ROS messages did not write.
 
 A killed recorder may have written a message and not yet what it completes; and detections that
 waited for a pose were not made into an envelope at all. Both follow from the messages in the log
-(`eventsrc.ros.derivation`), so the next recorder makes up for it before it records. It must read
+(`eventsrc.ros.derivation`), so the next recorder appends them before it records. It must read
 the last recording's messages once; after a regular end there is nothing to do. A recording that has
 lost events to damage is left as it is.
 """
@@ -28,8 +28,8 @@ from eventsrc.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
 
 
 def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:
-    """Append what the messages of the log's last recording of ROS make and the log lacks, and end
-    that recording; returns how many events. Raises LogDamaged."""
+    """Append the events that follow from the messages of the log's last recording of ROS and are
+    not in it, and end that recording; returns how many. Raises LogDamaged."""
     last = None
     for event in reader.read(keys={ROS_KEY}):
         last = event
@@ -65,7 +65,7 @@ def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Deri
     has_losses = False
 
     def watched() -> Iterator[Event]:
-        """The events; what is found among them is taken out of what was made."""
+        """Yield the events, and remove those that the log has from ``made`` and ``maps``."""
         nonlocal has_losses
         for event in reader.read(start):
             has_losses = has_losses or _is_rot(event)
@@ -84,8 +84,8 @@ def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Deri
 
 
 def _is_rot(event: Event) -> bool:
-    """Whether it stands for a lost event; if that was a message, keyframes behind it would be
-    numbered anew."""
+    """Whether an event replaces a lost one. If that was a message of ROS, the keyframes after it
+    would get other numbers."""
     if event.key != LOSS_KEY:
         return False
     try:

@@ -1,4 +1,4 @@
-"""The recorder's writer thread: from the queue into the log, then acknowledge what is synced.
+"""The recorder's writer thread: append messages of the queue, acknowledge them once synced.
 
 * This thread alone appends to the log and commits. It gets checked batches from the queue
   (`checking`), and has the next messages checked while it waits for the disk.
@@ -180,7 +180,7 @@ class WriterThread:
         self._writer = writer
         self._edits = edits
         self._ledger: GapLedger[RunId] = GapLedger() if ledger is None else ledger
-        self._saves_ledger = ledger is not None  # else it does not cover the whole log
+        self._saves_ledger = ledger is not None  # a new ledger does not cover the whole log
         self._send_reply = send_reply
         self._report_gaps = report_gaps
         self._losses_due_ns = time.monotonic_ns() + _LOSSES_EVERY_NS
@@ -279,7 +279,7 @@ class WriterThread:
         return True
 
     def append(self, batch: Batch) -> None:
-        """Append a batch; it commits in between."""
+        """Append a batch. May commit, also in the middle of it."""
         self._in_progress = batch.count
         logged_ns = self._writer.now_ns()
         messages = batch.messages

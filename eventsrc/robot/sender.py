@@ -76,7 +76,7 @@ class Sender:
         self._failure: TransportError | None = None
 
     def wake(self) -> None:
-        """Say that something was spooled."""
+        """Make the sending thread look for new envelopes in the spool."""
         with self._changed:
             self._woken = True
             self._changed.notify_all()

@@ -160,7 +160,8 @@ class _Quarantine:
 
 
 class Spool:
-    """Thread-safe. Raises SpoolError when the file cannot be used."""
+    """The envelopes in one spool file. Thread-safe; every method raises SpoolError when the file
+    cannot be used."""
 
     def __init__(self, path: Path, max_bytes: int = DEFAULT_SPOOL_BYTES) -> None:
         self.path = path
@@ -248,7 +249,7 @@ class Spool:
             return int(count)
 
     def acknowledge(self, ack: Ack) -> int:
-        """Remove what ``ack`` names; returns how many waiting envelopes were removed."""
+        """Remove the payloads that ``ack`` names; returns how many waiting envelopes those were."""
         removed = 0
         with _spool_errors(self.path), self._lock, self._transaction():
             for sha256 in ack.sha256:

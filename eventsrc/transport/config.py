@@ -80,9 +80,9 @@ _LISTEN: Final = "listen/endpoints"
 _MAX_MESSAGE: Final = "transport/link/rx/max_message_size"
 _RECEIVED: Final = "transport/link/rx/buffer_size"
 _RECEIVED_BYTES: Final = 4 * 1024 * 1024
-"""Of the buffers that Zenoh uses again. By default it has one of 64 KiB, and while the messages in
-that wait for their reader it makes another, filled with zeros, for each few messages of 9 kB, which
-takes 2 µs a message. Memory that is not used is not taken."""
+"""Size of the receive buffers that Zenoh reuses. Its default is one of 64 KiB; while messages in it
+are unread, Zenoh allocates and zeroes another for every few messages of 9 kB, which takes 2 µs a
+message. Pages that are never written take no memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class ZenohOptions:
 
 
 class Config(Protocol):
-    """The methods of zenoh.Config used here; keys are paths, values JSON5."""
+    """The methods of zenoh.Config that are used here; keys are paths, values JSON5."""
 
     def get_json(self, key: str) -> Any: ...
     def insert_json5(self, key: str, value: Any) -> None: ...

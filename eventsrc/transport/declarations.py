@@ -1,6 +1,6 @@
-"""What a Zenoh session declares: publishers, subscriptions, queryables; and what it receives.
+"""Publishers, subscriptions and queryables of a Zenoh session, and the messages it receives.
 
-Other packages use it through `eventsrc.transport.session`, where the rules stand.
+Other packages use them through `eventsrc.transport.session`, which states the rules.
 """
 
 import sys
@@ -18,12 +18,12 @@ from .errors import ignore_transport_errors, transport_errors
 _MAX_KEY_BYTES: Final = 16 * 1024
 """Zenoh panics when a key does not fit into one batch of 64 KiB with the rest of its content."""
 CHANNEL_SIZE: Final = 256
-"""Messages that have come and are in no batch yet: those of 12 ms at 20,000 a second."""
+"""Messages received and in no batch yet: those of 12 ms at 20,000 a second."""
 _MAX_BATCH_BYTES: Final = 4 * 1024 * 1024
 """Payload bytes that end a batch."""
-_MANY: Final = 8
+_PAUSE_FROM: Final = 8
 _PAUSE_S: Final = 0.002
-"""After a batch of at least so many messages; at 20,000 a second 40 come meanwhile."""
+"""Pause after a batch of at least `_PAUSE_FROM` messages; at 20,000 a second 40 come meanwhile."""
 _HEARTBEATS: Final = "@adv/pub/"
 """In a heartbeat's key: between the publisher's key and its session and entity id."""
 _HEARTBEAT_BYTES: Final = 4
@@ -163,7 +163,7 @@ class Subscription:
 
 
 class BatchSubscription(Subscription):
-    """A subscription with a thread that takes what has come from Zenoh's channel.
+    """A subscription with a thread that reads messages from Zenoh's channel in batches.
 
     Zenoh calls a handler with the interpreter lock taken, so each message would make the thread
     that records wait. The thread needs the lock once a batch. While many messages come it pauses
@@ -186,7 +186,7 @@ class BatchSubscription(Subscription):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop receiving, when all that has come is handled."""
+        """Stop receiving; returns when every message received so far is handled."""
         super().close()
         self._thread.join()
 
@@ -207,22 +207,22 @@ def _receive_batches(
             return
         batch: list[Received] = []
         try:
-            _take_batch(first, channel, batch, limit)
+            _fill_batch(first, channel, batch, limit)
             handler(batch)
         except Exception:  # noqa: BLE001 - reported
             raised, thread = sys.exc_info(), threading.current_thread()
             threading.excepthook(threading.ExceptHookArgs((*raised, thread)))
-        if len(batch) >= _MANY:
+        if len(batch) >= _PAUSE_FROM:
             pause.wait(_PAUSE_S)
 
 
-def _take_batch(
+def _fill_batch(
     first: zenoh.Sample,
     channel: "zenoh.handlers.Handler[zenoh.Sample]",
     batch: list[Received],
     limit: SizeLimit,
 ) -> None:
-    """Append ``first`` and what else is in the channel, up to the bounds of a batch."""
+    """Append ``first`` and the messages in ``channel`` to ``batch``, up to its bounds."""
     sample: zenoh.Sample | None = first
     size = 0
     while sample is not None:
@@ -242,7 +242,7 @@ def _take_batch(
 
 
 def _parameters(text: str) -> dict[str, str]:
-    """Zenoh writes them ``name=value;name=value``."""
+    """Parse the parameters of a selector, ``name=value;name=value``."""
     pairs = (part.partition("=") for part in text.split(";") if part)
     return {name: value for name, _, value in pairs}
 
@@ -273,5 +273,6 @@ def check_key_length(key: str) -> None:
     size = len(key.encode())
     if size > _MAX_KEY_BYTES:
         raise TransportError(
-            f"key {key[:80]!r}…: {size:,} bytes are more than {_MAX_KEY_BYTES:,}; choose a shorter"
+            f"key {key[:80]!r}…: {size:,} bytes are more than {_MAX_KEY_BYTES:,}; "
+            "choose a shorter key"
         )

@@ -1,4 +1,4 @@
-"""Zenoh's failures as a TransportError with a message of one line."""
+"""Convert exceptions of Zenoh to TransportError with a message of one line."""
 
 import contextlib
 import re
@@ -50,10 +50,10 @@ def _joined(endpoints: object) -> str:
 
 
 class transport_errors:  # noqa: N801 (used as a function is)
-    """Turn what Zenoh raises into a TransportError that begins with ``place``.
+    """Context manager: convert exceptions of Zenoh to a TransportError that begins with ``place``.
 
-    The message names a panic as such: the session may be unusable afterwards. May be entered again
-    and again; a generator would take 1 µs more for each message sent.
+    The message names a panic as such: the session may be unusable afterwards. Reusable; a generator
+    function would take 1 µs more for each message sent.
     """
 
     def __init__(self, place: str) -> None:

@@ -103,8 +103,8 @@ class Session:
     def subscribe_batches(
         self, key_expr: str, handler: Callable[[list[Received]], None], limit: SizeLimit
     ) -> Subscription:
-        """Like `subscribe`, with all messages that have come since the call before, in order. For
-        many messages a second, of which each would else interrupt the program's other threads."""
+        """Like `subscribe`, but call ``handler`` with all messages received since its last call, in
+        order. For high rates, at which a call for each message would slow down other threads."""
         check_key_length(key_expr)
         with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
             channel: zenoh.handlers.FifoChannel[zenoh.Sample]
@@ -145,8 +145,8 @@ class Session:
     def kept(
         self, selector: str, *, timeout_s: float, limit: SizeLimit, most: int
     ) -> list[Received]:
-        """The messages that caches answer to ``selector`` with, under keys of their own; at most
-        ``most``, and those over ``limit`` are not copied out of Zenoh."""
+        """The messages that caches reply to ``selector``, each under its own key; at most ``most``.
+        Those over ``limit`` are not copied out of Zenoh."""
         check_key_length(selector)
         found: list[Received] = []
         with transport_errors(f"selector {selector!r} cannot be asked"):

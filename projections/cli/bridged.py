@@ -260,7 +260,7 @@ def warn_of_silence(
     def watching(report: RecorderReport) -> None:
         nonlocal calls
         calls += 1
-        if calls == round(_QUIET_S / every_s) and not (bridge.types_told or report.messages):
+        if calls == round(_QUIET_S / every_s) and not (bridge.types_known or report.messages):
             say(
                 f"no bridge has announced any of {', '.join(bridge.topics)} yet: check that "
                 "zenoh-bridge-ros2dds runs, is connected to the same router, and has the namespace "

@@ -63,7 +63,7 @@ def test_messages_are_verbatim_and_make_the_envelopes_of_a_bag(
         recording(connected(), log_path, own := new_bridge(namespace)) as running,
     ):
         announce_all(bridge)
-        running.wait_until(lambda _: len(own.types_told) == len(KINDS))
+        running.wait_until(lambda _: len(own.types_known) == len(KINDS))
         payloads = send_all(bridge, sent)
         running.wait_until(lambda r: r.messages >= len(sent))
     report = running.finish()
