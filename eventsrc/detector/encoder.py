@@ -63,7 +63,7 @@ def read_preparation(model: Path) -> Preparation:
         text = path.read_bytes()
     except OSError as error:
         raise MisuseError(
-            f"{path}: {error.strerror}; this file says how {model.name} wants its pictures,"
+            f"{path}: {error.strerror}; this file describes the input of {model.name},"
             ' such as {"model": "NAME", "size": 224, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5,'
             " 0.5]}; see docs/detector.md"
         ) from None

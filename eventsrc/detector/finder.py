@@ -155,7 +155,7 @@ def _labels_in(model: OnnxModel) -> tuple[str, ...]:
         names = None
     if isinstance(names, dict) and set(names) == set(range(len(names))):
         names = [names[index] for index in range(len(names))]
-    return _checked(names, f"{model.path}: the classes that it names")
+    return _checked(names, f"{model.path}: the classes in its metadata")
 
 
 def _checked(names: object, place: str) -> tuple[str, ...]:

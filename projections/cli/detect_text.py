@@ -30,7 +30,7 @@ pictures, --encoder turns each crop into an embedding. To have both in a few min
      Ultralytics and its weights are AGPL-3.0; what that asks of you: docs/detector.md.
 
   2. an encoder: the image tower of CLIP or SigLIP, exported once with PyTorch (docs/detector.md has
-     the ten lines), and beside clip.onnx a file clip.json that says how it wants its pictures:
+     the ten lines), and beside clip.onnx a file clip.json that describes its input:
        {"model": "ViT-B-32/laion2b_s34b_b79k", "size": 224, "resize": "crop",
         "mean": [0.48145466, 0.4578275, 0.40821073], "std": [0.26862954, 0.26130258, 0.27577711]}
 

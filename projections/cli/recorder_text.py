@@ -195,7 +195,7 @@ def unused_text(report: RecorderReport) -> list[str]:
     if report.untyped:
         lines.append(
             f"{counted(report.untyped, 'message')} kept without a schema, and nothing made of "
-            "them: no bridge told their type"
+            "them: no bridge declared their type"
         )
     if report.unknown_keys:
         lines.append(
