@@ -1,4 +1,4 @@
-"""Reading an active segment, growing or left over from a crash.
+"""Read an active segment, growing or left over from a crash.
 
 It has no index: its chunk heads and commit marks (80 bytes a commit) are read once, and later only
 those that have been added.
@@ -31,12 +31,12 @@ class ActiveFile(SegmentFile):
             raise
 
     def refresh(self) -> Offset:
-        """Read the commit marks added since the last call; the next offset."""
+        """Read the commit marks added since the last call; return the next offset."""
         try:
             while self._read_commit():
                 pass
         except BadRecord:
-            # A chunk that is being written, a torn end, or damage: `damaged_end` tells which.
+            # A chunk that is being written, a torn end, or damage, which `damaged_end` finds.
             pass
         return self.next_offset
 
@@ -92,11 +92,11 @@ class ActiveFile(SegmentFile):
         return recorded_end
 
     def channels_of(self, body: bytes) -> dict[int, Channel]:
-        """By id, from the records before the first message."""
+        """The channels of a chunk by id, from the records before its first message."""
         _, channels = _mcap.definitions(body, leading=True)
         return {channel.id: channel for channel in channels}
 
     def schemas_of(self, body: bytes) -> dict[int, Schema]:
-        """By id, from the records before the first message."""
+        """The schemas of a chunk by id, from the records before its first message."""
         schemas, _ = _mcap.definitions(body, leading=True)
         return {schema.id: schema for schema in schemas}

@@ -144,7 +144,7 @@ class ActiveSegment:
             raise self._fail(error) from error
         except LogError:
             raise
-        except BaseException:  # Ctrl-C: what is half written must have nothing behind it
+        except BaseException:  # Ctrl-C: nothing may be written behind a group that is half written
             self._fail(InterruptedError(errno.EINTR, "interrupted"))
             raise
         if problem is not None:

@@ -15,22 +15,22 @@ _OTHERS: Final = 0o077
 
 
 def cache_folder(log: Path, kind: CacheKind) -> Path:
-    """The folder of a cache, which need not be there. A log named by ``.`` or ``..`` has it beside
-    the folder that is meant."""
+    """The path of a cache folder, which may not exist. For a log given as ``.`` or ``..`` it is
+    beside the folder that these name."""
     named = log.resolve() if log.name in ("", "..") else log
     return named.parent / f"{named.name}.{kind}"
 
 
 def make_cache_folder(log: Path, kind: CacheKind) -> Path:
-    """`cache_folder`, made if it is not there: others may do in it at most what they may in the
-    log. Raises OSError."""
+    """Create `cache_folder` if it does not exist, with no more permissions for group and others
+    than the log has; return its path. Raises OSError."""
     folder = cache_folder(log, kind)
     folder.mkdir(mode=_OWNER | (log.stat().st_mode & _OTHERS), exist_ok=True)
     return folder
 
 
 def cache_sizes(log: Path) -> list[tuple[Path, int]]:
-    """The folders of caches that there are and may be read, and how many bytes are in each."""
+    """Each cache folder that exists and can be read, with the total size of its files in bytes."""
     sizes = []
     for kind in _KINDS:
         folder = cache_folder(log, kind)

@@ -53,9 +53,8 @@ def sync_file(fd: int) -> None:
 
 
 def drop_cached(fd: int, start: int, end: int) -> None:
-    """Let the system forget the bytes from ``start`` to ``end`` of a file that is synced, so that
-    their memory is used again. They stay on the disk. Nothing happens where a system has no such
-    call (macOS)."""
+    """Drop bytes ``start`` to ``end`` of a synced file from the page cache. They stay on the disk.
+    Does nothing where the system lacks posix_fadvise (macOS)."""
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(fd, start, end - start, os.POSIX_FADV_DONTNEED)
 

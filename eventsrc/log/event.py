@@ -40,8 +40,8 @@ class Event:
 
 
 def event_hash(event: Event | None) -> str:
-    """SHA-256 of an event's offset, key, times and payload, in hex; "" for none. The same message
-    recorded again has another: it is logged at another time."""
+    """SHA-256 of an event's offset, key, times and payload, in hex; "" for None. The same message
+    recorded again has another hash, since it is logged at another time."""
     if event is None:
         return ""
     head = json.dumps([event.offset, event.key, event.logged_ns, event.stamp_ns]).encode()
@@ -49,7 +49,7 @@ def event_hash(event: Event | None) -> str:
 
 
 class MessageFormat(NamedTuple):
-    """What a verbatim message is: the fields of its MCAP channel and schema.
+    """The format of a verbatim message: the fields of its MCAP channel and schema.
 
     ``encoding`` is the message encoding (``cdr``, ``jpeg``). ``schema`` is empty if there is none;
     else its name, such as ``nav_msgs/msg/Odometry``, with the encoding of the schema (``ros2msg``)
@@ -70,7 +70,7 @@ class VerbatimEvent(Event):
 
     @property
     def is_envelope(self) -> bool:
-        """False."""
+        """False: a verbatim message is no envelope."""
         return False
 
 
@@ -83,4 +83,4 @@ class NewEvent(msgspec.Struct, frozen=True, gc=False):
     stamp_ns: int
     version: int = ENVELOPE_VERSION
     format: MessageFormat | None = None
-    """Of a verbatim message; None for JSON."""
+    """The format of a verbatim message; None for JSON."""

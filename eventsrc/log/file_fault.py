@@ -65,8 +65,8 @@ def identity_of(path: Path) -> Identity:
 
 
 def find_problem(fd: int, path: Path, size: int) -> Problem | None:
-    """What is wrong with the open file ``fd``, which should be at ``path`` and ``size`` bytes long.
-    Raises OSError."""
+    """The problem of the open file ``fd``, which should be at ``path`` and ``size`` bytes long;
+    None if there is none. Raises OSError."""
     ours = os.fstat(fd)
     try:
         named = identity_of(path)

@@ -1,4 +1,4 @@
-"""Reading MCAP files that other programs wrote: their messages or records, in file order.
+"""Read MCAP files that other programs wrote: their messages or records, in file order.
 
 The mcap package allocates as much memory as a file declares, and a file of 98 kB can declare, and
 hold, gigabytes. So records are read here, and every declared size (of a record, a chunk, its
@@ -30,7 +30,7 @@ _U64 = struct.Struct("<Q")
 
 
 def check_size(what: str, size: int, max_bytes: int) -> None:
-    """BadRecord when a ``what`` declares a ``size`` that is over the limit."""
+    """Raise BadRecord if the ``size`` that a record or chunk (``what``) declares is too large."""
     if size > max_bytes:
         raise BadRecord(
             f"a {what} declares {size:,} bytes, more than {max_bytes:,} are read; if that "
@@ -61,7 +61,7 @@ def decode_foreign_chunk(content: bytes, max_bytes: int) -> bytes:
 
 
 def _decompress(name: bytes, data: bytes, size: int) -> bytes:
-    """At max_bytes one byte more than ``size``."""
+    """The decompressed ``data``, cut off after ``size`` + 1 bytes."""
     try:
         match name:
             case b"":

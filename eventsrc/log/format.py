@@ -113,8 +113,9 @@ def head_of(path: Path, base: Offset) -> dict[str, str]:
         return read_head(path, file.read(HEAD_BYTES), base)[0]
 
 
-def claims_of(path: Path) -> dict[str, str]:
-    """Metadata at the head of the segment at ``path``, whatever its base."""
+def head_at_any_base(path: Path) -> dict[str, str]:
+    """Metadata at the head of the segment at ``path``, with any base; errors as `read_head`, but no
+    WrongPlace."""
     with path.open("rb") as file:
         return _read_head(path, file.read(HEAD_BYTES))[0]
 
@@ -185,7 +186,7 @@ ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
 UNREADABLE_VERSION = 0
 """Of a channel whose version is not a number: forged, or another program's. Its events are read and
 not folded."""
-_A_VERSION = re.compile(r"[0-9]{1,9}")
+_VERSION = re.compile(r"[0-9]{1,9}")
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {
     REJECTED_KEY: RejectedPayload,
@@ -225,10 +226,10 @@ def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Chan
 
 def envelope_version(channel: Channel) -> int:
     """The version of the envelopes on a channel; the current one if it has none."""
-    said = channel.metadata.get(ENVELOPE_VERSION_KEY)
-    if said is None:
+    version = channel.metadata.get(ENVELOPE_VERSION_KEY)
+    if version is None:
         return ENVELOPE_VERSION
-    return int(said) if _A_VERSION.fullmatch(said) else UNREADABLE_VERSION
+    return int(version) if _VERSION.fullmatch(version) else UNREADABLE_VERSION
 
 
 VERBATIM_KEY = "mapfold.verbatim"
@@ -333,7 +334,7 @@ def list_growing(log: Path) -> list[SegmentPath]:
 
 
 def leftovers(log: Path) -> list[Path]:
-    """Half-made files that a crash left behind; what they hold is elsewhere, too."""
+    """Half-made files that a crash left behind; everything in them is also in other files."""
     return sorted(p for p in log.iterdir() if p.name.endswith((NEW, SEALING)))
 
 

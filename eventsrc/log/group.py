@@ -19,8 +19,8 @@ from .format import NO_SCHEMA, key_channel, schema_of, verbatim_channel
 from .mcap_records import MESSAGE_HEAD, Channel, Schema, encode_message_head
 
 MAX_LEADING_BYTES: Final = 2 * 1024 * 1024
-"""Of the schemas and channels of one group; from this size on it takes no further event. A chunk
-may have eight times as much."""
+"""Size of a group's schemas and channels from which on it takes no further event. A chunk may have
+eight times as much."""
 
 _ChannelKey = tuple[str, int, MessageFormat | None]
 
@@ -74,7 +74,7 @@ class GroupBuilder:
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._schema_records: dict[int, bytes] = {}
         self.definition_bytes = 0
-        """Of all schemas and channels of the segment so far."""
+        """Bytes of all schemas and channels of the segment so far."""
         self._begin()
 
     def _begin(self) -> None:

@@ -23,7 +23,7 @@ from eventsrc.errors import LogBusy
 from .format import LOCK
 
 _TRIES: Final = 5
-_LOOK_S: Final = 0.01
+_RETRY_S: Final = 0.01
 """`is_held` itself holds the lock for some microseconds."""
 
 
@@ -77,7 +77,7 @@ def _lock(fd: int) -> None:
         try:
             return fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            time.sleep(_LOOK_S)
+            time.sleep(_RETRY_S)
     return fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
@@ -116,5 +116,5 @@ def _holder(fd: int) -> str:
     try:
         text = json.loads(os.pread(fd, 4096, 0))
         return f"process {text['pid']} on {text['host']} since {text['since']}"
-    except (ValueError, KeyError, TypeError):  # caught between its open and its first line
+    except (ValueError, KeyError, TypeError):  # it has not written its text yet
         return "another process"

@@ -9,8 +9,8 @@ byte, a u64 length and its content, all little-endian.
 
 The *commit mark* has opcode 0x80, from the range that the specification leaves to applications, so
 other readers skip it. Content: u64 first offset and u64 next offset of the chunk before it, and the
-CRC-32 of the record up to there, XORed with the random *mark seed* of its segment. A robot does not
-know the seed, so it cannot publish bytes that are read as a mark. The mark is written after its
+CRC-32 of the record up to there, XORed with the random *mark seed* of its segment. Publishers do
+not have the seed, so they cannot forge bytes that are read as a mark. The mark is written after its
 chunk is synced.
 """
 
@@ -47,17 +47,17 @@ MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"
 LIBRARY = "mapfold"
 MAX_EVENT_BYTES = 96 * 1024 * 1024
-"""Of one payload. A rejected payload of 64 MiB takes 85 MiB as base64."""
+"""Limit for one payload. A rejected payload of 64 MiB takes 85 MiB as base64."""
 MAX_GROUP_BYTES = 64 * 1024 * 1024
 """From this size on a group takes no further event."""
 MAX_CHUNK_BYTES = 176 * 1024 * 1024
-"""Of a chunk, compressed or not: a full group and one more event."""
+"""Limit for a chunk, compressed or not: a full group and one more event."""
 MAX_SUMMARY_BYTES = 32 * 1024 * 1024
-"""Of the index at the end of a sealed segment."""
+"""Limit for the index at the end of a sealed segment."""
 MAX_MESSAGES = 1 << 20
-"""In one chunk."""
+"""Limit for the messages in one chunk."""
 MAX_DEFINITIONS_BYTES = 16 * 1024 * 1024
-"""Of all schemas and channels in a chunk or a summary, or of one metadata record."""
+"""Limit for all schemas and channels in a chunk or a summary, and for one metadata record."""
 
 FRAME = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<BQHIQQ")
@@ -77,7 +77,7 @@ ZSTD_PATTERN_AT = _CHUNK.size - 4
 FOOTER_BYTES = FRAME.size + 20
 TAIL_BYTES = FOOTER_BYTES + len(MAGIC)
 
-_COPIED = 1024 * 1024
+_COPY_BELOW_BYTES = 1024 * 1024
 """Chunks below this size are read whole and their body is copied, which is faster."""
 _COMPRESSION = zstandard.ZstdCompressionParameters.from_level(1, hash_log=12)
 """Base64 of floats has six bits a byte and little else to compress: home-1 shrinks to 0.699 of its
@@ -204,7 +204,7 @@ def decode_chunk(record: bytes) -> bytes:
 def read_chunk(read: Callable[[int, int], bytes], length: int, position: int) -> bytes:
     """The body of the chunk record of ``length`` bytes at ``position`` of a file, its CRC checked.
     ``read(length, position)`` reads from the file."""
-    if length < _COPIED:
+    if length < _COPY_BELOW_BYTES:
         return decode_chunk(read(length, position))
     head = decode_chunk_head(read(ZSTD_CHUNK_HEAD, position))
     if head.length != length:
@@ -222,7 +222,7 @@ def _checked_body(head: ChunkHead, body: bytes) -> bytes:
 
 def _decompress(data: bytes, size: int) -> bytes:
     try:
-        # The frame names its own size. It must be right, and it is checked before memory is taken.
+        # The zstd frame declares its size, which is checked before memory is allocated.
         if zstandard.frame_content_size(data) != size:
             raise BadRecord("a chunk's compressed size is damaged")
         return zstandard.ZstdDecompressor().decompress(data)

@@ -1,4 +1,4 @@
-"""Reading the events of a log by offset, in order, one chunk at a time.
+"""Read the events of a log by offset, in order, one chunk at a time.
 
 A reader yields durable events only: of the growing segment, the chunks with a commit mark. It takes
 no lock and can read while a writer writes, rotates and seals. At damage it yields every event
@@ -54,7 +54,7 @@ class LogReader:
         return tuple(self._segments)
 
     def refresh(self) -> Offset:
-        """Find what was committed since; the new `next_offset`."""
+        """Find the commits since the last call; return the new `next_offset`."""
         while True:
             if isinstance(self._last, ActiveFile):
                 self._last.refresh()

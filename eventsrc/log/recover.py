@@ -25,10 +25,11 @@ from .format import (
     DAMAGED,
     DUPLICATE,
     LEDGER,
+    PREVIOUS,
     SEALED,
     SegmentPath,
-    claims_of,
     half_renamed,
+    head_at_any_base,
     head_of,
     leftovers,
     list_segments,
@@ -47,10 +48,10 @@ from .sealed_segment import check_sealed
 from .segment import Scan
 
 DEFAULT_MAX_LOSSES: Final = 100_000
-"""Loss events that recovery adds unasked, besides those that the damaged bytes can have held."""
-_MOST_IN_A_SEGMENT: Final = 1 << 31
+"""Loss events added without ``--yes``, besides those that the damaged bytes can have held."""
+_MAX_SEGMENT_EVENTS: Final = 1 << 31
 _BLOCK_BYTES: Final = 512
-"""What `st_blocks` counts, on every file system."""
+"""Size of a block in `st_blocks`, on every file system."""
 
 
 class TooManyLosses(LogError):
@@ -175,7 +176,7 @@ class _Recovery:
         self._overlapping.append(replace(segment, path=self._log / moved.now))
 
     def _fill_from_overlapping(self, following: SegmentPath | None) -> None:
-        """Take missing events from the segments that were set aside."""
+        """Add missing events from the segments that were set aside."""
         for overlapping in self._overlapping:
             scan = _scan(overlapping, None)
             if scan.next_offset > self._next_offset:
@@ -187,27 +188,27 @@ class _Recovery:
     def _check_losses(
         self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
     ) -> None:
-        """Raise TooManyLosses if too many losses would be added: one damaged number can claim
-        any."""
+        """Raise TooManyLosses if too many losses would be added: a single damaged number can
+        declare any count."""
         losses = sum(last - first + 1 for first, last in scan.gaps)
         self._losses_left -= max(0, losses - _damaged_bytes(segment, scan) // MESSAGE_HEAD)
-        if self._losses_left >= 0 and losses <= _MOST_IN_A_SEGMENT:
+        if self._losses_left >= 0 and losses <= _MAX_SEGMENT_EVENTS:
             return
         evidence = (
             f"{following.path.name} begins there"
             if following
             else "according to the offsets in the file"
         )
-        way_out = (
+        next_step = (
             f"If that is right, run `{advised('log', 'recover', self._log, '--yes')}`; else move "
             "the file that is wrong out of the log"
-            if losses <= _MOST_IN_A_SEGMENT
+            if losses <= _MAX_SEGMENT_EVENTS
             else "No log is that long: move the file that is wrong out of the log"
         )
         raise TooManyLosses(
             f"{self._log}: {losses:,} events from offset {scan.gaps[0][0]} to {scan.gaps[-1][1]} "
             f"seem to be lost ({evidence}), more than the damaged bytes can have held, and each "
-            f"would get a loss event. {way_out}{self._moved_so_far()}"
+            f"would get a loss event. {next_step}{self._moved_so_far()}"
         )
 
     def _moved_so_far(self) -> str:
@@ -290,7 +291,7 @@ def _origin(segment: SegmentPath | None) -> dict[str, str]:
     if segment is None:
         return {}
     try:
-        return origin_notes(claims_of(segment.path))
+        return origin_notes(head_at_any_base(segment.path))
     except (LogDamaged, NotALog):
         return {}
 
@@ -300,10 +301,10 @@ def _replaced_hash(following: SegmentPath | None) -> dict[str, str]:
     if following is None:
         return {}
     try:
-        claim = head_of(following.path, following.base).get("previous_sha256")
+        previous = head_of(following.path, following.base).get(PREVIOUS)
     except (LogDamaged, NotALog):
         return {}
-    return {} if claim is None else {REPLACES: claim}
+    return {} if previous is None else {REPLACES: previous}
 
 
 def _segment_report(segment: SegmentPath | None, scan: Scan, copy: str | None) -> SegmentRecovery:

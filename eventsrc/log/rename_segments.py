@@ -36,9 +36,9 @@ from .format import (
     PREVIOUS,
     SEALED,
     SegmentPath,
-    claims_of,
     free_name,
     half_renamed,
+    head_at_any_base,
     segment_files,
     segment_path,
 )
@@ -142,7 +142,7 @@ def _target_of(path: Path) -> SegmentPath:
 
 def _inspect(path: Path, named: SegmentPath) -> _SegmentFile:
     try:
-        claims = claims_of(path)
+        claims = head_at_any_base(path)
     except LogDamaged:
         return _SegmentFile(path, named, None)
     except NotALog:

@@ -1,4 +1,4 @@
-"""Reading segments that another program has rewritten, as `mcap sort` does.
+"""Read segments that another program has rewritten, as `mcap sort` does.
 
 Such a file has other chunks in another order. But its metadata still names the log and the base,
 and each message has its sequence number, so every event in it has its right offset. It is read by
@@ -28,11 +28,11 @@ unless single events are larger."""
 _OVERHEAD_BYTES: Final = 256
 """Memory of a message besides its bytes."""
 _RUN_BYTES: Final = 1 << 24
-"""Size of the chunks that messages are put together in."""
+"""Size of the chunks that are made of the messages."""
 _OPCODES: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA)
 _SEQUENCES: Final = 1 << 32
 _HEAD: Final = struct.Struct("<HIQQ")
-"""Of a message: channel, sequence number, log and publish time."""
+"""The head of a message: channel, sequence number, log and publish time."""
 
 
 def is_rewritten(data: bytes) -> bool:
@@ -76,7 +76,7 @@ class _Messages:
         self._definition_bytes = self._message_bytes = 0
 
     def add(self, record: ForeignRecord) -> bool:
-        """Whether the record could be read and is within the limits."""
+        """Add a record; False if it cannot be read or is over a limit."""
         opcode, content, _ = record
         if opcode == Opcode.MESSAGE:
             return self._add_message(content)

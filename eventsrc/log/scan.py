@@ -1,4 +1,4 @@
-"""Scan an active segment for its good chunks, whatever happened to its bytes; read a scan's events.
+"""Scan an active segment, damaged or not, for its good chunks; read the events of a scan.
 
 The file is a row of chunks and commit marks. A chunk is good if its CRC holds and its sequence
 numbers continue. Where no good chunk is, `resync` says where reading can go on. Then:

@@ -38,6 +38,7 @@ from .durable_files import (
 )
 from .format import (
     ACTIVE,
+    PREVIOUS,
     SEALED,
     SEALING,
     file_head,
@@ -66,8 +67,8 @@ from .sealed_segment import SEAL_METADATA
 
 CHUNK_BYTES = 1024 * 1024
 _SYNC_BYTES = 4 * 1024 * 1024
-"""Synced at a time. Syncing a whole segment at once keeps the disk from the commits of the segment
-that grows, for up to 40 ms; so they wait 10 ms at most."""
+"""Bytes synced at a time. Syncing a whole segment at once delays the commits of the growing segment
+by up to 40 ms, this by 10 ms at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +248,7 @@ class _Builder:
         self._edges = [0]
         self._log_ns: list[int] = []
         self._stamp_ns: list[int] = []
-        head = head_metadata(
-            plan.log_id, plan.base, {"previous_sha256": plan.previous_sha256, **plan.notes}
-        )
+        head = head_metadata(plan.log_id, plan.base, {PREVIOUS: plan.previous_sha256, **plan.notes})
         start = file_head(head)
         length = len(_mcap.encode(head))
         self._metadata.append(MetadataIndex(len(start) - length, length, head.name))

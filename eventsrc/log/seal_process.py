@@ -2,14 +2,14 @@
 
 Sealing takes half a processor at 20,000 events a second, and the thread that records would wait for
 the interpreter lock of a thread that seals. So the process reads a finished segment and writes the
-sealed one beside it, under a name with its own process id. Nothing else: the writer, which holds
-the lock of the log, gives the file its name. When the writer dies, the process finishes its
-segment, cannot send its answer, deletes its file and ends. So no process of a dead writer changes a
+sealed one beside it, under a name with its own process id. The writer, which holds the lock
+of the log, renames it. When the writer dies, the process finishes its
+segment, cannot send its reply, deletes its file and ends. So no process of a dead writer changes a
 log that the next writer holds.
 
-What is synced of a sealed segment leaves the page cache. A long recording would otherwise fill the
-memory with segments that are not read soon, and new memory is slower to write to than memory just
-used: in a virtual machine each event took 3 to 7 µs more.
+Synced bytes of a sealed segment are dropped from the page cache. A long recording would otherwise
+fill the memory with segments that are not read soon, and new memory is slower to write to than
+memory just used: in a virtual machine each event took 3 to 7 µs more.
 
 One JSON document a line: a plan goes in, ``{"sha256": …, "temporary": …}`` or an error comes out.
 
@@ -51,7 +51,7 @@ class SealingProcess:
                 python_command(_PROGRAM),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,  # the writer fails at the same, and reports it
+                stderr=subprocess.DEVNULL,  # the writer then seals, and reports the same error
                 process_group=0,
             )
         except OSError as error:
@@ -65,7 +65,7 @@ class SealingProcess:
         Raises OSError or LogDamaged as `eventsrc.log.seal.seal` does, and ProcessGone if the
         process has died; the segment is then not sealed.
         """
-        answer = self._ask(
+        reply = self._request(
             {
                 "log": str(plan.log.absolute()),
                 "log_id": plan.log_id,
@@ -75,27 +75,27 @@ class SealingProcess:
                 "notes": plan.notes,
             }
         )
-        if "errno" in answer:
-            raise OSError(answer["errno"], answer["message"])
-        if "damaged" in answer:
-            raise LogDamaged(answer["damaged"])
-        replace_durably(Path(answer["temporary"]), segment_path(plan.log, plan.base, SEALED))
-        return str(answer["sha256"])
+        if "errno" in reply:
+            raise OSError(reply["errno"], reply["message"])
+        if "damaged" in reply:
+            raise LogDamaged(reply["damaged"])
+        replace_durably(Path(reply["temporary"]), segment_path(plan.log, plan.base, SEALED))
+        return str(reply["sha256"])
 
-    def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+    def _request(self, request: dict[str, Any]) -> dict[str, Any]:
         try:
-            self._input.write(json.dumps(question).encode() + b"\n")
+            self._input.write(json.dumps(request).encode() + b"\n")
             self._input.flush()
-            answer: dict[str, Any] = json.loads(self._output.readline())
+            reply: dict[str, Any] = json.loads(self._output.readline())
         except (OSError, ValueError) as error:
             self.close()
-            unlink_quietly(_temporary(question, self._process.pid))
+            unlink_quietly(_temporary(request, self._process.pid))
             raise ProcessGone(str(error)) from error
-        return answer
+        return reply
 
     def close(self) -> None:
         """End the process and wait for it."""
-        with contextlib.suppress(OSError):  # what it has not read
+        with contextlib.suppress(OSError):  # it has not read everything
             self._input.close()
         self._output.close()
         self._process.wait()
@@ -105,22 +105,22 @@ def main() -> None:
     """Run in the process: seal plan after plan, until the writer closes the standard input."""
     os.nice(_NICE)
     for line in sys.stdin:
-        question = json.loads(line)
-        temporary = _temporary(question, os.getpid())
+        request = json.loads(line)
+        temporary = _temporary(request, os.getpid())
         try:
-            print(json.dumps(_answer(question, temporary)), flush=True)
+            print(json.dumps(_reply_to(request, temporary)), flush=True)
         except OSError:  # the writer is gone
             unlink_quietly(temporary)
             os._exit(1)
 
 
-def _temporary(question: dict[str, Any], pid: int) -> Path:
-    return segment_path(Path(question["log"]), question["base"], f".{pid}{SEALING}")
+def _temporary(request: dict[str, Any], pid: int) -> Path:
+    return segment_path(Path(request["log"]), request["base"], f".{pid}{SEALING}")
 
 
-def _answer(question: dict[str, Any], temporary: Path) -> dict[str, Any]:
-    """Write the sealed segment to ``temporary``; the answer to the writer."""
-    plan = SegmentPlan(**{**question, "log": Path(question["log"])})
+def _reply_to(request: dict[str, Any], temporary: Path) -> dict[str, Any]:
+    """Write the sealed segment to ``temporary``; the reply to the writer."""
+    plan = SegmentPlan(**{**request, "log": Path(request["log"])})
     try:
         file = ActiveFile(segment_path(plan.log, plan.base, ACTIVE), plan.base)
         bodies = (file.read_chunk(chunk) for chunk in file.chunks)

@@ -114,7 +114,9 @@ class Sealer:
     def _seal(self, segment: Finished) -> None:
         base, following = segment
         active = segment_path(self._log, base, ACTIVE)
-        if active.exists():  # otherwise only the sync of the folder failed, the time before
+        if (
+            active.exists()
+        ):  # else an earlier call sealed it, and only the sync of the folder failed
             notes = origin_notes(head_of(active, base))
             previous = self._previous_sha256
             plan = SegmentPlan(self._log, self._log_id, base, previous, following, notes)
@@ -142,6 +144,6 @@ class Sealer:
 
 
 def _lower_priority() -> None:
-    """Of this thread, where the system gives threads priorities of their own (Linux)."""
+    """Lower the priority of this thread, where threads have their own (Linux)."""
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

@@ -35,7 +35,8 @@ from .segment import ChunkRef, SegmentFile
 SEAL_METADATA = "mapfold.seal"
 """First part of the name of a segment's seal: see `metadata_name`."""
 _MAX_CHUNKS = 1 << 16
-"""In one segment: a chunk is 1 MiB or a single event, and a segment is full at 64 MiB."""
+"""Limit for the chunks of one segment: a chunk is 1 MiB or a single event, and a segment is full at
+64 MiB."""
 _BLOCK = 1024 * 1024
 _DATA_END_BYTES = _mcap.FRAME.size + 4
 
@@ -47,7 +48,7 @@ class SealedFile(SegmentFile):
         super().__init__(path, base)
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
-        """Those of verbatim messages."""
+        """The schemas of verbatim messages, by id."""
         try:
             self._read_summary()
         except (ValueError, KeyError) as error:
@@ -65,7 +66,7 @@ class SealedFile(SegmentFile):
         return self.channels
 
     def schemas_of(self, body: bytes) -> dict[int, Schema]:  # noqa: ARG002
-        """All of them, from the summary."""
+        """All schemas of verbatim messages, from the summary."""
         return self.schemas
 
     def _read_summary(self) -> None:

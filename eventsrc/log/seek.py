@@ -1,7 +1,7 @@
 """Find a point in a log from text: how many events come before it.
 
     17                      the first 17 events, offsets 0 to 16
-    end                     all of them
+    end                     all events
     2026-03-24T13:05:00Z    up to and including the last event stamped at or before this time
                             (UTC unless it says otherwise; a date alone is its midnight)
     robot-1:42              up to and including the first event with keyframe 42 of run robot-1

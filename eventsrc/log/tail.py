@@ -1,4 +1,4 @@
-"""Following a log as it grows: every event once, across rotations, milliseconds after its commit.
+"""Follow a log as it grows: every event once, across rotations, milliseconds after its commit.
 
 Polls the commit marks of the file: while nothing comes, one `pread` of some 80 bytes and five
 `stat` for the next segment every 5 ms. That costs one to two percent of a core (58 to 86 µs a poll,

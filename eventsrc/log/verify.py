@@ -14,7 +14,16 @@ from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.progress import report_progress
 from eventsrc.text import counted
 
-from .format import IMPORTED, SEALED, SegmentPath, WrongPlace, claims_of, head_of, segment_path
+from .format import (
+    IMPORTED,
+    PREVIOUS,
+    SEALED,
+    SegmentPath,
+    WrongPlace,
+    head_at_any_base,
+    head_of,
+    segment_path,
+)
 from .lock import is_held
 from .log_identity import majority_log_id
 from .reader import segments_of
@@ -28,7 +37,7 @@ from .verify_events import EventFindings, Finding, Kind
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was read and what was found."""
+    """The result of `verify_log`: how much was read, and the findings."""
 
     path: Path
     log_id: str | None
@@ -133,7 +142,7 @@ class _Verifier:
         self._expected_hashes = set()
 
     def _check_head(self, segment: SegmentPath) -> dict[str, str] | None:
-        """None for a segment of another log or of another base; empty for a damaged head."""
+        """The head of a segment; None for one of another log or base, empty for a damaged one."""
         try:
             head = head_of(segment.path, segment.base)
         except WrongPlace as error:
@@ -161,7 +170,7 @@ class _Verifier:
             repair = advised("log", "recover", self._log)
             text = f"another program has rewritten it; `{repair}` repairs it"
             self._add("crc", text, name)
-        previous = head.get("previous_sha256", NO_PREVIOUS)
+        previous = head.get(PREVIOUS, NO_PREVIOUS)
         if head and self._expected_hashes and previous not in self._expected_hashes:
             self._add("chain", "was not written after the segment before it", name)
         self._expected_hashes = {check.sha256, head.get(REPLACES, check.sha256)}
@@ -205,11 +214,12 @@ def _size_of(segment: SegmentPath) -> int:
 
 
 def _majority_log_id(segments: list[SegmentPath]) -> str | None:
-    """The log id that most segments carry; None without a majority, then the first one counts."""
+    """The log id that most segments carry; None without a majority: then that of
+    the first segment is used."""
     carried = []
     for segment in segments:
         try:
-            carried.append((segment.path, claims_of(segment.path)["log_id"]))
+            carried.append((segment.path, head_at_any_base(segment.path)["log_id"]))
         except (LogDamaged, NotALog):
             continue
     try:

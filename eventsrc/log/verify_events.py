@@ -12,8 +12,8 @@ time.
 Stamps: a robot numbers its keyframes in the order it took them, so its stamps should grow with
 their numbers, in whatever order they reached the log. A finding is a keyframe stamped before its
 predecessor by number (the robot's clock was set back), or more than a day after it (the clock was
-set while the robot drove). Stamps far from the log time are none: runs are imported long after, and
-robots have clocks of their own.
+set while the robot drove). Stamps far from the log time are no finding: runs are imported long
+after, and robots have clocks of their own.
 """
 
 import hashlib
@@ -77,7 +77,7 @@ class ReportedGaps:
         self._ledger.add_reported(gap, 0)
 
     def still_open(self) -> Iterator[OpenGaps]:
-        """What is still missing, by run."""
+        """The keyframes that are still missing, by run."""
         missing: defaultdict[RunId, list[Gap[RunId]]] = defaultdict(list)
         for gap in self._ledger.reported_gaps():
             missing[gap.run_id].append(gap)
@@ -110,8 +110,8 @@ class _Run:
 
 
 class RunStamps:
-    """Checks the stamps of runs. Each keyframe is added once, in offset order; it takes three
-    numbers of memory."""
+    """Checks the stamps of runs. Each keyframe is added once, in offset order; three
+    numbers of each are kept."""
 
     def __init__(self) -> None:
         self._runs: dict[RunId, _Run] = {}

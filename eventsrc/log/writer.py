@@ -45,7 +45,7 @@ ROTATE_DEFINITION_BYTES = 4 * 1024 * 1024
 much."""
 MAX_SCHEMA_BYTES = 256 * 1024
 MAX_NAME_BYTES = 16 * 1024
-"""Of the topic, encoding and schema names of a verbatim message, each in UTF-8."""
+"""Limit for the topic, encoding and schema names of a verbatim message, each in UTF-8."""
 _MAX_NS = 2**63
 
 
@@ -165,7 +165,7 @@ class LogWriter:
 
     @property
     def durable_offset(self) -> Offset:
-        """Every event below it is synced, and visible to readers."""
+        """Every event before this offset is synced, and visible to readers."""
         return self._active.committed
 
     @property
@@ -241,8 +241,8 @@ class LogWriter:
         return self.durable_offset
 
     def begin_segment(self) -> None:
-        """Commit, and begin the next segment unless this one is empty. Of an import: what comes is
-        older than what is before, so that no clock is taken to have been set back."""
+        """Commit, and begin the next segment unless this one is empty. For an import of
+        events older than the ones before: verification then reports no clock that was set back."""
         self.sync()
         if self._active.committed > self._active.base:
             self._rotate()
@@ -332,7 +332,7 @@ class LogWriter:
 
 
 def _check_format(log: Path, topic: str, form: MessageFormat) -> None:
-    """Raise LogError for a verbatim message that no log takes."""
+    """Raise LogError for a verbatim message whose names or schema cannot be kept."""
     if is_system_key(topic):
         raise LogError(f"{log}: a message on {visible(topic[:80])}: that key is mapfold's own")
     for text in (topic, form.encoding, form.schema, form.schema_encoding):
