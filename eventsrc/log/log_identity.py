@@ -1,4 +1,4 @@
-"""Check that the segments of a log belong together, and that they are the ones they were before.
+"""Check that the segments of a log belong together, and whether they are still the same.
 
 Log id: a segment copied from another log has a valid name and valid checksums. A reader stops at it
 and a writer does not start. Recovery goes by the majority of segments, and does nothing without
@@ -51,7 +51,7 @@ def common_log_id(segments: Iterable[SegmentPath]) -> str | None:
 
 def majority_log_id(log_ids: Iterable[tuple[Path, str]]) -> str | None:
     """The log id that most of these segments carry. Raises LogDamaged when two are equally common:
-    only a person can say then which files are wrong."""
+    which files are wrong must then be decided by a person."""
     by_path = dict(log_ids)
     ranked = Counter(by_path.values()).most_common(2)
     if len(ranked) == 2 and ranked[0][1] == ranked[1][1]:

@@ -2,7 +2,7 @@
 
 Every offset is kept, because checkpoints, maps and people refer to offsets: a lost event is
 replaced by a ``mapfold/loss`` event with cause ``rot``. Timestamps of lost events are estimated
-from their neighbours: those of the event before, or else of the one behind.
+from their neighbours: those of the event before, or else of the one after.
 """
 
 import os
@@ -44,10 +44,10 @@ def first_and_last_times(body: bytes) -> tuple[EventTimes, EventTimes]:
     return times[0], times[-1]
 
 
-def adjacent_times(before: SegmentPath | None, behind: SegmentPath | None) -> EventTimes:
-    """The times of the event before a lost segment, or else of the one behind it; zeros if neither
+def adjacent_times(before: SegmentPath | None, after: SegmentPath | None) -> EventTimes:
+    """The times of the event before a lost segment, or else of the one after it; zeros if neither
     can be read."""
-    for segment, chunk, which in ((before, -1, 1), (behind, 0, 0)):
+    for segment, chunk, which in ((before, -1, 1), (after, 0, 0)):
         if segment is None:
             continue
         try:
@@ -60,6 +60,7 @@ def adjacent_times(before: SegmentPath | None, behind: SegmentPath | None) -> Ev
 
 
 _BATCH = 4096
+"""Losses encoded at a time."""
 LOST_SCHEMA = "lost"
 """The name of a schema that no readable chunk has."""
 

@@ -131,7 +131,7 @@ def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> l
             found.append(left)
         else:
             if left.scan.log_id is not None:
-                # The writer had come to this offset, even if files before it are gone by now.
+                # The writer had reached this offset, even if files before it are missing.
                 state.next_offset = max(state.next_offset, segment.base)
             segment.path.unlink()
             sync_directory(log)
@@ -139,7 +139,7 @@ def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> l
 
 
 def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
-    """``reach`` is the base of the next segment, or None for the last one."""
+    """Scan a left-over segment; ``reach`` is the base of the next one, None for the last."""
     finished = None if reach is None else _finished(segment, reach)
     if finished is not None:
         return finished

@@ -2,10 +2,9 @@
 
 Sealing takes half a processor at 20,000 events a second, and the thread that records would wait for
 the interpreter lock of a thread that seals. So the process reads a finished segment and writes the
-sealed one beside it, under a name with its own process id. The writer, which holds the lock
-of the log, renames it. When the writer dies, the process finishes its
-segment, cannot send its reply, deletes its file and ends. So no process of a dead writer changes a
-log that the next writer holds.
+sealed one beside it, under a name with its own process id. The writer, which holds the lock of the
+log, renames it. When the writer dies, the process finishes its segment, cannot send its reply,
+deletes its file and ends. So no process of a dead writer changes a log that the next writer holds.
 
 Synced bytes of a sealed segment are dropped from the page cache. A long recording would otherwise
 fill the memory with segments that are not read soon, and new memory is slower to write to than

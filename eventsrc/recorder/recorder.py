@@ -121,7 +121,7 @@ class Recorder:
         session.confirm()
         for key in bridge.latched_keys:
             for selector in cache_selectors(key):
-                for message in session.kept(
+                for message in session.cached(
                     selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MAX_CACHED
                 ):
                     self._receive_bridged(message)

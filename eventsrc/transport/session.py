@@ -142,14 +142,14 @@ class Session:
                 self.raw.liveliness().declare_subscriber(key_expr, receive, history=True)
             )
 
-    def kept(
+    def cached(
         self, selector: str, *, timeout_s: float, limit: SizeLimit, most: int
     ) -> list[Received]:
         """The messages that caches reply to ``selector``, each under its own key; at most ``most``.
         Those over ``limit`` are not copied out of Zenoh."""
         check_key_length(selector)
         found: list[Received] = []
-        with transport_errors(f"selector {selector!r} cannot be asked"):
+        with transport_errors(f"selector {selector!r} cannot be queried"):
             for reply in self.raw.get(selector, timeout=timeout_s):
                 sample = reply.ok
                 if sample is None or len(found) >= most:
@@ -202,7 +202,7 @@ class Session:
     ) -> list[tuple[bool, bytes]]:
         """Like `get`, with the errors: (True, payload) or (False, error) for each reply."""
         check_key_length(selector)
-        with transport_errors(f"selector {selector!r} cannot be asked"):
+        with transport_errors(f"selector {selector!r} cannot be queried"):
             return [
                 (True, reply.ok.payload.to_bytes())
                 if reply.ok is not None
