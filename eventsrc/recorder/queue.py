@@ -113,7 +113,7 @@ class CropMessage(Received, frozen=True, gc=False):
 
 
 class MessageQueue:
-    """Many threads `put`, one thread calls `get`.
+    """The bounded queue of messages: many threads call `put`, one thread calls `get`.
 
     Holds at most ``size`` messages and ``max_bytes`` of payload, or a single larger message.
     """

@@ -10,9 +10,10 @@
   the ack prefix, so it is no run's ack key, and recorders of ``**`` ignore everything behind that
   prefix. A robot that missed it sends again and gets the next.
 * `Sent` is a robot's progress: the last keyframe of a run that it has sent. Without it, a recorder
-  could not miss the last keyframes of a run: a gap shows only when a later keyframe is recorded. It
-  goes out on ``<key>/@mapfold/sent``, which no ``*`` or ``**`` matches, so only those who ask for
-  it receive it. The gap that follows from it is an event (`eventsrc.gaps`).
+  could not find that the last keyframes of a run are missing: a gap shows only when a later
+  keyframe is recorded. It goes out on ``<key>/@mapfold/sent``. No ``*`` or ``**`` matches that, so
+  only subscribers that name ``@mapfold`` receive it. A gap found by it is an event
+  (`eventsrc.gaps`).
 """
 
 import hashlib

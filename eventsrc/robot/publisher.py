@@ -4,7 +4,7 @@
   the network. One thread sends (`eventsrc.robot.sender`), in the order of publishing.
 * An envelope leaves the spool when a recorder's ack names its bytes; an ack names what is synced in
   a log. Until then it is sent again, so it may arrive more than once; the fold counts the first.
-* What no recorder would accept is refused here, by the recorder's own validation
+* `publish` raises for an envelope that no recorder would accept: it validates as recorders do
   (`eventsrc.ingest`). A recorder may have narrower rules (`--max-payload`) or older ones. An
   envelope that it refuses, with the bytes and the reason in its log, is quarantined in the spool
   and no longer sent: see `EnvelopePublisher.refused`.

@@ -139,7 +139,7 @@ def configure(config: Config, defaults: Config, options: ZenohOptions, mode: Mod
         _set(config, "connect/exit_on_failure", True)
         _set(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
     if mode == "router":
-        _set(config, "adminspace/enabled", True)  # `Session.locators` asks it
+        _set(config, "adminspace/enabled", True)  # `Session.locators` queries it
 
 
 def _configure_scouting(config: Config) -> None:
