@@ -150,7 +150,8 @@ def test_robots_do_not_hear_one_another_and_strangers_hear_nothing(
 
     listeners = {name: session(name) for name in heard}
     for name, listener in listeners.items():
-        listener.subscribe(key, functools.partial(note, name))
+        # called by the thread that receives, so before the reply of a later `confirm` is read
+        listener.subscribe(key, functools.partial(note, name), in_order=True)
         listener.confirm()
     robot = session("robot-1")
     robot.send(key, b"seen")
