@@ -17,7 +17,7 @@ from tests.commands import Commands
 from tests.integration.test_evaluate_command import save
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
-from tests.thorough import THOROUGH, mostly_slow, rounds
+from tests.thorough import THOROUGH, rounds
 
 EVIDENCE = Settings(fusion="evidence", places="rooms")
 
@@ -111,7 +111,8 @@ def _cut(keyframe: Keyframe, dimension: int) -> Keyframe:
 
 
 @pytest.mark.seconds
-@pytest.mark.parametrize(("self_", "many"), mostly_slow([(False, 1), (True, 2)]))
+@pytest.mark.slow
+@pytest.mark.parametrize(("self_", "many"), [(False, 1), (True, 2)])
 def test_scores_of_several_maps_are_those_of_one_process(
     folder: Path, used: list[int], capsys: pytest.CaptureFixture[str], self_: bool, many: int
 ) -> None:

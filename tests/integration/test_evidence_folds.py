@@ -78,9 +78,8 @@ def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> 
         assert rows == list(expected_rows(view, label))
 
 
-@pytest.mark.parametrize(
-    ("size", "loader"), [(23, "insert"), (1, "copy"), (256, "copy")][: rounds(3, 1)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "loader"), [(23, "insert"), (1, "copy"), (256, "copy")])
 def test_a_tail_that_goes_on_has_the_rows_of_a_rebuild(
     tmp_path: Path,
     documents: list[dict[str, Any]],
