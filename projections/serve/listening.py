@@ -1,4 +1,4 @@
-"""The HTTP server: a bound address, TLS, and uvicorn behind an accept loop of our own.
+"""The HTTP server: a bound address, TLS, and uvicorn with limits on accepted connections.
 
 asyncio accepts without a limit, and TLS handshakes in progress are not counted. Here each
 connection is counted from the moment it is accepted (`connections`), and a few are accepted in each
@@ -79,6 +79,7 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._connections = connections
         self._opening: set[asyncio.Task[None]] = set()
+        self._resumptions: dict[socket.socket, asyncio.TimerHandle] = {}
         # Without TLS asyncio does not take these options.
         self._tls: dict[str, Any] = (
             {}
@@ -88,31 +89,33 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         self.servers = []
-        self._accepting = [
-            asyncio.create_task(self._accept(listener)) for listener in sockets or ()
-        ]
+        self._loop = asyncio.get_running_loop()
+        for listener in sockets or ():
+            self._loop.add_reader(listener, self._accept, listener)
         self.started = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        for task in self._accepting:
-            task.cancel()
-        await asyncio.wait(self._accepting)
+        for listener in sockets or ():
+            self._loop.remove_reader(listener)
+        for resumption in self._resumptions.values():
+            resumption.cancel()
         self._connections.close_handshakes()
         await super().shutdown(sockets)
 
-    async def _accept(self, listener: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                accepted, _ = await loop.sock_accept(listener)
-            except OSError as error:  # such as no free file descriptor
-                self._connections.report(error.strerror or str(error))
-                await asyncio.sleep(_PAUSE_S)
-                continue
-            self._begin(accepted)
-            for more in accept_pending(listener, _AT_ONCE - 1):
-                self._begin(more)
-            await asyncio.sleep(0)
+    def _accept(self, listener: socket.socket) -> None:
+        """Accept connections; called by the event loop while any are in the backlog.
+
+        `loop.sock_accept` raises InvalidStateError if cancelled in the turn in which one arrives.
+        """
+        try:
+            for accepted in accept_pending(listener, _AT_ONCE):
+                self._begin(accepted)
+        except OSError as error:  # such as no free file descriptor
+            self._connections.report(error.strerror or str(error))
+            self._loop.remove_reader(listener)
+            self._resumptions[listener] = self._loop.call_later(
+                _PAUSE_S, self._loop.add_reader, listener, self._accept, listener
+            )
 
     def _begin(self, accepted: socket.socket) -> None:
         try:
@@ -136,8 +139,9 @@ class _Server(uvicorn.Server):
 
 
 def accept_pending(listener: socket.socket, most: int) -> Iterator[socket.socket]:
-    """Accept at most ``most`` connections that are in the backlog."""
-    with contextlib.suppress(OSError):  # none waits, or no file descriptor is free
+    """Accept at most ``most`` connections that are in the backlog. Raises OSError when a connection
+    there cannot be accepted."""
+    with contextlib.suppress(BlockingIOError, InterruptedError):
         for _ in range(most):
             yield listener.accept()[0]
 

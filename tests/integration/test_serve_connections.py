@@ -1,8 +1,10 @@
 """Incomplete and malformed HTTP requests, unread answers: real sockets, a small application."""
 
+import asyncio
 import json
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
@@ -10,6 +12,7 @@ from http.client import HTTPConnection
 from typing import Any
 
 import pytest
+import uvicorn
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
@@ -216,6 +219,25 @@ def test_the_end_does_not_wait_for_an_incomplete_request(start: START) -> None:
         for sent in (b"", b"P", request("POST", "/", b"12345")[:-1]):
             held.enter_context(connect(port)).sendall(sent)
         assert status(ask(port, request("GET", "/"))) == 200
+
+
+def test_the_end_while_a_client_connects_logs_no_error(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The server ends in the turn of its event loop that sees the connection in the backlog."""
+    connected = threading.Event()
+    with bind("127.0.0.1", 0) as listener, ExitStack() as clients:
+
+        async def connect_and_end(server: uvicorn.Server) -> None:
+            await asyncio.sleep(0.01)  # the server accepts from now on
+            clients.enter_context(connect(listener.getsockname()[1]))
+            connected.set()
+            await asyncio.sleep(0)
+
+        monkeypatch.setattr(uvicorn.Server, "main_loop", connect_and_end)
+        with serving(application, listener):
+            assert connected.wait(DEADLINE_S)
+    assert not caplog.records
 
 
 @pytest.mark.parametrize(
