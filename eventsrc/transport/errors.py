@@ -11,6 +11,8 @@ import zenoh
 from eventsrc.advised import advised
 from eventsrc.errors import TransportError
 
+from .config import DEFAULT_ENDPOINT
+
 _SOURCE_PLACE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PANIC: Final = ("pyo3_runtime", "PanicException")
 _SYSTEM_ERROR: Final = re.compile(r"\[[^\]]*: (.+ \(os error \d+\))\]?")
@@ -40,9 +42,16 @@ def open_error(error: BaseException, connect: object, listen: object) -> Transpo
     if "Unable to connect" in message:
         return TransportError(
             f"no Zenoh router or peer answers at {_joined(connect)}; "
-            f"start one with `{advised('router')}` or say where it is with --connect"
+            f"start one with `{_router_at(connect)}` or say where it is with --connect"
         )
     return TransportError(f"no Zenoh session: {one_line(error)}; check --zenoh-config")
+
+
+def _router_at(endpoints: object) -> str:
+    """The command line of a router that listens on the first endpoint of a session."""
+    first = endpoints[0] if isinstance(endpoints, list) and endpoints else None
+    listen = () if first in (None, DEFAULT_ENDPOINT) else ("--listen", first)
+    return advised("router", *listen, without=("--connect", "--zenoh-config"))
 
 
 def _joined(endpoints: object) -> str:

@@ -131,9 +131,7 @@ class Loaders(StrEnum):
     insert = "insert"
 
 
-OnlyOption = Annotated[
-    Sinks | None, typer.Option("--only", help="Write only the graph or only the vectors.")
-]
+OnlyOption = Annotated[Sinks | None, typer.Option("--only", help="Only the graph or the vectors.")]
 LoaderOption = Annotated[
     Loaders,
     typer.Option("--loader", help="How rows are sent; insert where COPY is not allowed."),

@@ -247,24 +247,27 @@ def worst_text(found: _Scored) -> str:
 
 
 def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
-    """Warn if none of a map's keyframes and observations has truth; None stands for no scores.
+    """Warn if none of a map's keyframes and observations has truth; None stands for no scores."""
+    if scores is not None and not _has_truth(scores):
+        say(
+            f"no truth for any keyframe of {log}: its places and objects are not scored; see"
+            " --truth"
+        )
 
-    Without the warning, scores over no things would look perfect.
-    """
-    if scores is None or scores["places"]["rooms"] or scores["objects"]["instances"]:
-        return
-    say(f"no truth for any keyframe of {log}: its places and objects are not scored; see --truth")
+
+def _has_truth(scores: Mapping[str, Any]) -> bool:
+    return bool(scores["places"]["rooms"] or scores["objects"]["instances"])
 
 
 def scores_text(scores: Mapping[str, Any]) -> str:
     """The scores as a table: places, objects, then re-localisation by number of crops and views."""
-    lines = [_score_line("places", scores["places"]), _score_line("objects", scores["objects"]), ""]
+    lines = [_score_line(name, scores[name], _has_truth(scores)) for name in ("places", "objects")]
     columns = {
         counted(int(n), word): column
         for word, group in (("crop", "relocalization"), ("view", "views"))
         for n, column in scores[group].items()
     }
-    lines.append(f"re-localisation ({scores['method']})".ljust(_LABEL) + _cells(list(columns)))
+    lines += ["", f"re-localisation ({scores['method']})".ljust(_LABEL) + _cells(list(columns))]
     lines += _rows(_ROWS, columns)
     return "\n".join(lines) + "\n"
 
@@ -284,7 +287,9 @@ def _rows(rows: Sequence[tuple[str, str]], columns: Mapping[str, Any]) -> Iterat
         yield "  " + label.ljust(_LABEL - 2) + _cells(values)
 
 
-def _score_line(title: str, scores: Mapping[str, Any]) -> str:
+def _score_line(title: str, scores: Mapping[str, Any], has_truth: bool) -> str:
+    if not has_truth:  # of no things all scores are perfect
+        return f"{title}: number {scores['number']}, not scored"
     return f"{title}: " + ", ".join(f"{k} {_cell(v)}" for k, v in scores.items())
 
 

@@ -20,6 +20,7 @@ from .databases import LoaderOption, Loaders, loader_of
 from .fleet_options import (
     EngineOption,
     JobsOption,
+    QuestionJobsOption,
     SitesArgument,
     TemplateOption,
     VectorTemplateOption,
@@ -254,7 +255,7 @@ def relocalize(
     top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places of each site.")] = 3,
     hfov: HfovOption = None,
     image: ImageOption = None,
-    jobs: JobsOption = None,
+    jobs: QuestionJobsOption = None,
     db: TemplateOption = None,
     vector_db: VectorTemplateOption = None,
     as_json: JsonOption = False,

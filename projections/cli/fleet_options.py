@@ -27,7 +27,7 @@ def open_engine(engine: str, jobs: int | None, tasks: int) -> Engine:
     if scheme != "dask" or not address:
         raise MisuseError(f"--engine {engine}: there are local and dask://HOST:PORT")
     if jobs is not None:
-        raise MisuseError("--jobs is of --engine local; a cluster runs as many as it has workers")
+        raise MisuseError("--jobs is for --engine local; a cluster runs as many as it has workers")
     from projections.fleet.cluster import DaskCluster  # its package is an extra
 
     return DaskCluster(address)
@@ -54,7 +54,7 @@ VectorTemplateOption = Annotated[
     typer.Option(
         "--vector-db",
         metavar="TEMPLATE",
-        help="Another one for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
+        help="A database of each site's embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
     ),
 ]
 EngineOption = Annotated[
@@ -65,10 +65,16 @@ EngineOption = Annotated[
         help="local: processes on this machine; dask://HOST:PORT: the workers of that scheduler.",
     ),
 ]
-JobsOption = Annotated[
-    int | None,
-    typer.Option("--jobs", min=1, max=1024, help="Sites at once [default: the number of cores]."),
-]
+
+
+def _jobs_option(default: str) -> Any:
+    help_ = f"Sites at once [default: {default}]."
+    return typer.Option("--jobs", metavar="N", min=1, max=1024, help=help_)
+
+
+JobsOption = Annotated[int | None, _jobs_option("the number of cores")]
+QuestionJobsOption = Annotated[int | None, _jobs_option("twice the number of cores")]
+"""For `relocalize`, which waits for databases."""
 
 
 def sites_of(place: Path) -> list[Site]:

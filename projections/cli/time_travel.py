@@ -194,7 +194,7 @@ def why(
     Commands that named, joined, kept apart or moved something of it are named too.
     """
     if (thing is None) == (same is None):
-        raise MisuseError("give one of PLACE_ID, OBJECT_ID and --same RUN:KEYFRAME RUN:KEYFRAME")
+        raise MisuseError("give a place, an object, or two keyframes as RUN:KEYFRAME RUN:KEYFRAME")
     pair = (thing, other) if thing is not None and other is not None else same
     with _timeline(log, settings_file, set_, no_cache) as timeline:
         end = point(timeline.reader, at)

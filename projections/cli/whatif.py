@@ -67,7 +67,8 @@ def whatif(
     base: Annotated[
         str,
         typer.Option(
-            metavar="'NAME=VALUE …'", help="Compare with these settings instead of the defaults."
+            metavar="'NAME=VALUE …'",
+            help="Settings of the base map, on top of --settings or the log's.",
         ),
     ] = "",
     without: Annotated[

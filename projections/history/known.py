@@ -11,6 +11,7 @@ from functools import partial
 from typing import TypeVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.corrections import Corrections
@@ -32,7 +33,14 @@ from .conditions import Expression
 from .explanation import Explanation, explain_object, explain_place, with_entries
 from .history_recorder import HistoryRecorder, map_at
 from .history_recorder import Progress as Progress
-from .names import NoSuchThing, find_keyframe, find_object, find_place
+from .names import (
+    NoSuchThing,
+    find_keyframe,
+    find_object,
+    find_place,
+    id_of_place,
+    keyframe_ordinal,
+)
 from .records import Merge, ObjectMerge, Refusal
 from .same_place import explain_same_place
 from .stored_history import StoredHistory
@@ -183,9 +191,24 @@ class KnownHistory:
             return with_entries(explained, told)
         if thing not in history.place_ordinals and thing.startswith("obj-"):
             raise NoSuchThing("object", thing, history.object_ordinals)
-        place = find_place(history, thing, last)
+        try:
+            place = find_place(history, thing, last)
+        except NoSuchThing:
+            self._refuse_keyframe(thing, last)
+            raise
         told = place_commands(self._entries, history, place, last)
         return with_entries(explain_place(history, place, last), told)
+
+    def _refuse_keyframe(self, text: str, end: Offset) -> None:
+        """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
+        keyframe = keyframe_ordinal(self.history, text)
+        if keyframe is None:
+            return
+        place = id_of_place(self.history, self.history.place_at(keyframe, end))
+        raise MisuseError(
+            f"{text} is a keyframe, in {place or 'no place'}; give a place, an object or two"
+            " keyframes"
+        )
 
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which

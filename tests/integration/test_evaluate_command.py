@@ -3,6 +3,7 @@
 import copy
 import gzip
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,14 @@ def test_the_table_and_the_plain_method(mapfold: Commands, runs: list[str]) -> N
     said = mapfold("evaluate", *runs, "--method", "plain")
     assert "re-localisation (plain)" in said.out
     assert "pose error p50" in said.out
+
+
+def test_without_truth_no_perfect_scores_are_printed(mapfold: Commands, runs: list[str]) -> None:
+    said = mapfold("evaluate", *runs[:2])
+    assert said.err.startswith("no truth for any keyframe of ")
+    places, objects, *_ = said.out.splitlines()
+    assert re.fullmatch(r"places: number \d+, not scored", places)
+    assert re.fullmatch(r"objects: number \d+, not scored", objects)
 
 
 def test_the_map_is_asked_about_itself_without_truth(mapfold: Commands, runs: list[str]) -> None:

@@ -115,7 +115,10 @@ def test_without_a_router_it_is_one_line_and_no_log(start: Start, tmp_path: Path
     recorder = start("record", str(tmp_path / "log"), "--connect", away)
     assert recorder.wait() == 1
     (line,) = recorder.lines
-    assert line.startswith(f"mapfold: no Zenoh router or peer answers at {away}; start one with")
+    assert line == (
+        f"mapfold: no Zenoh router or peer answers at {away}; start one with `mapfold router"
+        f" --listen {away}` or say where it is with --connect"
+    )
     assert not (tmp_path / "log").exists()
 
 

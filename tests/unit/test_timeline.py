@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.errors import MisuseError
 from eventsrc.log import LogWriter
 from projections.errors import LogPointError
 from projections.history import ExpressionError, NoSuchThing, Timeline
@@ -157,6 +158,13 @@ def test_an_absent_id_lists_the_near_ones(corridor: Timeline, thing: str, says: 
     with pytest.raises(NoSuchThing) as caught:
         corridor.why(thing)
     assert str(caught.value).startswith(says)
+
+
+def test_a_keyframe_alone_is_refused_with_its_place(corridor: Timeline) -> None:
+    with pytest.raises(MisuseError, match="run-a:1 is a keyframe, in run-a_p0; give a place"):
+        corridor.why("run-a:1")
+    with pytest.raises(MisuseError, match="run-a:7 is a keyframe, in no place;"):
+        corridor.why("run-a:7")
 
 
 def test_an_absent_keyframe_lists_the_near_ones(corridor: Timeline) -> None:
