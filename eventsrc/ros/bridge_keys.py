@@ -40,13 +40,13 @@ def topic_of(namespace: str, topic: str, option: str) -> str:
     name = topic.removeprefix("/")
     if not _is_name(name):
         raise MisuseError(
-            f"{option} {visible(topic[:80])!r} is no topic of ROS 2; such as /detections or "
+            f"{option} {visible(topic[:80])!r} is not a topic of ROS 2, such as /detections or "
             "/camera/detections"
         )
     bare = namespace.strip("/")
     if bare and not _is_name(bare):
         raise MisuseError(
-            f"--namespace {visible(namespace[:80])!r} is no namespace of ROS 2; such as /bot1"
+            f"--namespace {visible(namespace[:80])!r} is not a namespace of ROS 2, such as /bot1"
         )
     return f"/{bare}/{name}" if bare else f"/{name}"
 

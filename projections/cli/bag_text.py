@@ -45,14 +45,16 @@ def model_option(panel: str) -> typer.models.OptionInfo:
 def heights_option(panel: str) -> typer.models.OptionInfo:
     """``--heights``."""
     option: typer.models.OptionInfo = typer.Option(
-        "--heights", help="State the robot's height, which tells floors.", rich_help_panel=panel
+        "--heights",
+        help="State the robot's height in envelopes; it separates floors.",
+        rich_help_panel=panel,
     )
     return option
 
 
 def max_gap_option(panel: str) -> typer.models.OptionInfo:
     """``--max-gap``."""
-    text = "Poses farther apart in time are not interpolated between."
+    text = "Longest time between two poses to interpolate between them."
     return ros_option(panel, "--max-gap", "SECONDS", text)
 
 
@@ -73,25 +75,31 @@ PoseOption = Annotated[
         "--pose",
         "tf|TOPIC|none",
         "Where poses come from: transforms, or a topic of nav_msgs/Odometry or "
-        "geometry_msgs/PoseWithCovarianceStamped.",
+        "geometry_msgs/PoseWithCovarianceStamped. Default: transforms, else such a topic.",
     ),
 ]
 CovarianceOption = Annotated[
     str | None,
     _topic(
         "--covariance",
-        "Topic whose latest covariance is the error of poses by transforms; or none.",
+        "Topic whose latest covariance is the error of poses by transforms; or none. Default: one "
+        "in the map's frame.",
     ),
 ]
 EmbeddingsOption = Annotated[
     str | None,
     _topic(
         "--embeddings",
-        "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none.",
+        "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none. "
+        "Default: one with embedding in its name.",
     ),
 ]
 CameraOption = Annotated[
-    str | None, _topic("--camera", "Topic of sensor_msgs/CameraInfo; or none.")
+    str | None,
+    _topic(
+        "--camera",
+        "Topic of sensor_msgs/CameraInfo; or none. Default: that of the detections' frame.",
+    ),
 ]
 GridOption = Annotated[
     str | None,
@@ -137,7 +145,7 @@ def labels_by_number(path: Path | None) -> dict[str, str]:
         return {}
     names = read_label_file(path)
     if not all(isinstance(name, str) for name in names):
-        raise MisuseError(f"--labels {path}: no list of names; write one a line")
+        raise MisuseError(f"--labels {path}: not a list of names; write one a line")
     labels = {str(number): name for number, name in enumerate(names) if name}
     if not labels:
         raise MisuseError(f"--labels {path}: names no class; write one a line")
@@ -172,7 +180,7 @@ def bag_lines(report: BagReport) -> Iterator[str]:
 
 
 def stream_lines(streams: Mapping[str, Counts]) -> Iterator[str]:
-    """What was made of each topic of detections, what that lacks, and what could not be used."""
+    """For each topic of detections: its keyframes, what they lack, and unused messages."""
     for name, counts in streams.items():
         yield f"{visible(name)}: {_keyframes(counts)}"
         for topic_name, count in counts.unused.items():

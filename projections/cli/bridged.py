@@ -164,12 +164,12 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
         with LogReader(writer.path) as reader:
             made = append_missing(reader, writer, types)
     except LogDamaged as error:
-        say(f"what the last recording of ROS lacks is not looked for: {error}")
+        say(f"not checked which envelopes the last recording of ROS lacks: {error}")
     else:
         if made:
             say(
                 f"{writer.path}: the last recording of ROS did not finish; made "
-                f"{counted(made, 'event')} that its messages make"
+                f"{counted(made, 'event')} from its messages"
             )
     return Bridge(recording, topics, types)
 

@@ -86,7 +86,7 @@ def calibrate_command(
     connect: ConnectOption = None,
     zenoh_config: ConfigOption = None,
 ) -> None:
-    """Read the constants of fusion by evidence off the map's own revisits.
+    """Estimate the constants of fusion by evidence from the map's own revisits.
 
     Things seen from several spots give usual distances, errors of boxes and poses, sizes of things,
     and the likeness of their pictures from other sides and on other days; pairs in one picture give

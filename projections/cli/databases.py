@@ -78,7 +78,7 @@ def _left_out_parts(
     if counts["det_ids_reused"]:
         yield (
             f"{counted(counts['det_ids_reused'], 'observation')} with the det_id of an earlier"
-            " keyframe (leave det_id away, or make it unique)"
+            " keyframe (omit det_id, or make it unique)"
         )
     if report.foreign is not None:
         yield _foreign_text(log, settings, report, report.foreign, logged)
@@ -131,10 +131,17 @@ class Loaders(StrEnum):
     insert = "insert"
 
 
-OnlyOption = Annotated[Sinks | None, typer.Option("--only", help="Only the graph or the vectors.")]
+OnlyOption = Annotated[
+    Sinks | None,
+    typer.Option("--only", metavar="graph|vectors", help="Only the graph or the vectors."),
+]
 LoaderOption = Annotated[
     Loaders,
-    typer.Option("--loader", help="How rows are sent; insert where COPY is not allowed."),
+    typer.Option(
+        "--loader",
+        metavar="copy|insert",
+        help="How rows are sent; insert where COPY is not allowed.",
+    ),
 ]
 
 

@@ -31,7 +31,7 @@ from .options import (
 from .terminal import display, emit, finish, say
 
 group = typer.Typer(
-    help="The embedded PostgreSQL server, and a check of any database against a log.",
+    help="Run the embedded PostgreSQL server; check and repair any database.",
     no_args_is_help=True,
 )
 
@@ -89,7 +89,7 @@ def check(
     settings_file: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Prove the databases equal to LOG at their checkpoints, row by row; exit 3 if they are not."""
+    """Compare the databases with LOG at their checkpoints, row by row; exit 3 if they differ."""
     settings = settings_of(settings_file, assignments)
     with databases(db, vector_db) as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
@@ -184,7 +184,10 @@ def status(
     settings_file: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Offsets, lag, checkpoints, dead letters, rejected, losses, versions; exit 3 on findings."""
+    """Show offsets, lag, checkpoints, dead letters, rejected, losses, versions.
+
+    Exit 3 on findings.
+    """
     settings = settings_of(settings_file, assignments)
     info = log_info(log)
     with databases(db, vector_db) as targets:

@@ -14,11 +14,13 @@ from .terminal import emit, finish, say
 
 def demo(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where to leave log, databases and map.png.")
+        Path, typer.Option(metavar="DIR", help="Folder for the log, the databases and map.png.")
     ] = Path("logs/demo"),
-    seed: Annotated[int, typer.Option(help="Which simulated house.", min=0)] = DEFAULT_SEED,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Which simulated house.", min=0)
+    ] = DEFAULT_SEED,
     speed: Annotated[
-        float, typer.Option(help="Times as fast as the robot drives.", min=1.0, max=1000.0)
+        float, typer.Option(metavar="X", help="Times real time.", min=1.0, max=1000.0)
     ] = 30.0,
     db: DbOption = None,
     vector_db: VectorDbOption = None,

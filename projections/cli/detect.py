@@ -100,8 +100,7 @@ def detect(
         float | None,
         typer.Option(
             metavar="N",
-            help="Pictures a second, where their names or the video do not say when they were"
-            " taken.",
+            help="Pictures a second, if neither file names nor the video give times.",
             rich_help_panel=_PICTURES,
         ),
     ] = None,
@@ -109,16 +108,18 @@ def detect(
         str,
         typer.Option(
             metavar="TIME",
-            help="When the first was taken, with --fps or of a video: seconds since 1970, or ISO.",
+            help="When the first picture was taken, with --fps or for a video: seconds since 1970,"
+            " or ISO.",
             rich_help_panel=_PICTURES,
         ),
     ] = "0",
     queue: Annotated[
         int,
         typer.Option(
+            metavar="N",
             min=1,
             max=1000,
-            help="How many pictures from Zenoh may wait; newer ones take the place of the oldest.",
+            help="How many pictures from Zenoh may wait; newer ones replace the oldest.",
             rich_help_panel=_PICTURES,
         ),
     ] = QUEUE,
@@ -130,7 +131,7 @@ def detect(
         Path | None,
         typer.Option(
             metavar="MODEL.onnx",
-            help="Encoder of crops; MODEL.json beside it says how it wants them.",
+            help="Encoder of crops; MODEL.json beside it describes its input.",
             rich_help_panel=_MODELS,
         ),
     ] = None,
@@ -138,8 +139,8 @@ def detect(
         str,
         typer.Option(
             metavar="NAME",
-            help=f"What the detector answers: {', '.join(HEADS)}; yolov8 is for v9, v11 and v12"
-            " too.",
+            help=f"Format of the detector's output: {', '.join(HEADS)}; yolov8 is for v9, v11 and"
+            " v12 too.",
             rich_help_panel=_MODELS,
         ),
     ] = "yolov8",
@@ -147,23 +148,28 @@ def detect(
         str | None,
         typer.Option(
             metavar="FILE",
-            help="The detector's classes, a line each, or coco [default: those that it names].",
+            help="The detector's classes, one a line, or coco [default: those in the model].",
             rich_help_panel=_MODELS,
         ),
     ] = None,
     size: Annotated[
         int,
         typer.Option(
+            metavar="PIXELS",
             min=32,
             max=4096,
-            help="Side of the detector's input where the model leaves it open.",
+            help="Side of the detector's input, if the model does not fix it.",
             rich_help_panel=_MODELS,
         ),
     ] = SIZE,
-    device: Annotated[str, typer.Option(help="cpu or cuda.", rich_help_panel=_MODELS)] = "cpu",
+    device: Annotated[
+        str,
+        typer.Option(metavar="cpu|cuda", help="What the models run on.", rich_help_panel=_MODELS),
+    ] = "cpu",
     threads: Annotated[
         int | None,
         typer.Option(
+            metavar="N",
             min=1,
             max=1024,
             help="Threads of each model [default: one a core].",
@@ -173,12 +179,17 @@ def detect(
     confidence: Annotated[
         float,
         typer.Option(
-            min=0.0, max=1.0, help="Least confidence of a detection.", rich_help_panel=_MODELS
+            metavar="P",
+            min=0.0,
+            max=1.0,
+            help="Least confidence of a detection.",
+            rich_help_panel=_MODELS,
         ),
     ] = CONFIDENCE,
     overlap: Annotated[
         float,
         typer.Option(
+            metavar="P",
             min=0.0,
             max=1.0,
             help="Two boxes of a class that overlap by more (intersection over union) are one.",
@@ -188,7 +199,11 @@ def detect(
     max_detections: Annotated[
         int,
         typer.Option(
-            min=1, max=1000, help="Most detections in a picture.", rich_help_panel=_MODELS
+            metavar="N",
+            min=1,
+            max=1000,
+            help="Most detections in a picture.",
+            rich_help_panel=_MODELS,
         ),
     ] = MOST,
     moved: Annotated[
@@ -196,7 +211,7 @@ def detect(
         typer.Option(
             metavar="METRES",
             min=0.0,
-            help="Distance from the last keyframe at which a picture is the next one.",
+            help="Distance from the last keyframe from which a picture is a new keyframe.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = MOVED_M,
@@ -205,7 +220,7 @@ def detect(
         typer.Option(
             metavar="DEGREES",
             min=0.0,
-            help="Turn since the last keyframe at which it is one.",
+            help="Turn since the last keyframe from which a picture is a new keyframe.",
             rich_help_panel=_KEYFRAMES,
         ),
     ] = TURNED_DEG,
@@ -214,8 +229,8 @@ def detect(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Time since the last keyframe after which it is one; 0: at once."
-            f" [default: {AFTER_S:g}; without poses 0]",
+            help="Time since the last keyframe from which a picture is a new keyframe; 0: every"
+            f" picture is one. [default: {AFTER_S:g}; without poses 0]",
             rich_help_panel=_KEYFRAMES,
             show_default=False,
         ),
@@ -255,8 +270,8 @@ def detect(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Keeps what no recorder has acknowledged, also for the next start [default:"
-            " detect-spool.sqlite in $MAPFOLD_HOME, else in .mapfold].",
+            help="File of envelopes that no recorder has acknowledged; the next start sends them"
+            " again [default: detect-spool.sqlite in $MAPFOLD_HOME, else in .mapfold].",
         ),
     ] = None,
     wait: Annotated[
@@ -278,10 +293,10 @@ def detect(
 
     Pictures come from a folder, a video, stdin or Zenoh; poses from a file or Zenoh. A picture
     becomes a keyframe when the robot has moved or turned far enough, or after a time. Its objects
-    are found and their crops encoded by ONNX models of your own; without any, it says where to get
-    some. Ctrl-C ends it.
+    are found and their crops encoded by ONNX models of your own; without them, this command prints
+    where to get some. Ctrl-C ends it.
 
-    Exit 3 when anything was left out, lost or still waits in the spool.
+    Exit 3 when anything was left out or lost, or waits in the spool.
     """
     if detector is None or encoder is None:
         say(WITHOUT_MODELS)

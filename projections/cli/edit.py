@@ -120,24 +120,24 @@ def _different_objects(first: ObjectArgument, second: OtherObjectArgument) -> Ma
 def _drop_object(
     thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
 ) -> MakeCommand:
-    """Leave out an object that does not exist in the building.
+    """Drop an object from the map, with the observations that it has now.
 
-    Every observation that it has now is left out; the log keeps them.
+    The log keeps them.
     """
     return lambda current, stamp: make.drop_object(current, stamp, thing)
 
 
 @_kind("drop-detection")
 def _drop_detection(
-    det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID…", help="Their det_ids.")],
+    det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID", help="The det_id of each.")],
 ) -> MakeCommand:
-    """Leave out detections; the log keeps them."""
+    """Drop detections from the map; the log keeps them."""
     return lambda current, stamp: make.drop_detection(current, stamp, det_ids)
 
 
 @_kind("forget-run")
 def _forget_run(run: RunArgument) -> MakeCommand:
-    """Leave out all keyframes of a run; the log keeps them."""
+    """Drop all keyframes of a run from the map; the log keeps them."""
     return lambda current, stamp: make.forget_run(current, stamp, run)
 
 
@@ -148,7 +148,7 @@ def _forget_keyframes(
         str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
     ],
 ) -> MakeCommand:
-    """Leave out some keyframes of a run; the log keeps them."""
+    """Drop some keyframes of a run from the map; the log keeps them."""
     return lambda current, stamp: make.forget_keyframes(current, stamp, run, span)
 
 
@@ -167,10 +167,10 @@ def _correct_poses(
         Path | None,
         typer.Argument(metavar="FILE", help="A trajectory: TUM, CSV with a header, JSON lines."),
     ] = None,
-    dx: Annotated[float | None, typer.Option("--dx", help="Shift in x, metres.")] = None,
-    dy: Annotated[float | None, typer.Option("--dy", help="Shift in y, metres.")] = None,
+    dx: Annotated[float | None, typer.Option("--dx", metavar="METRES", help="Shift in x.")] = None,
+    dy: Annotated[float | None, typer.Option("--dy", metavar="METRES", help="Shift in y.")] = None,
     dyaw: Annotated[
-        float | None, typer.Option("--dyaw", help="Turn about the map's origin, radians.")
+        float | None, typer.Option("--dyaw", metavar="RADIANS", help="Turn about the map's origin.")
     ] = None,
     first: _FromOption = None,
     last: _ToOption = None,
@@ -178,9 +178,9 @@ def _correct_poses(
         float,
         typer.Option(
             "--slack",
-            metavar="S",
+            metavar="SECONDS",
             min=0.0,
-            help="Seconds that a keyframe may lie outside the stamps of FILE.",
+            help="How far a keyframe may lie outside the stamps of FILE.",
         ),
     ] = DEFAULT_SLACK_S,
     ignore_missing: Annotated[
@@ -248,17 +248,17 @@ def edits(
     effects: Annotated[
         bool,
         typer.Option(
-            "--effects", help="Work out the effects that are not known yet: two folds for each."
+            "--effects", help="Compute the effects that are not known yet: two folds for each."
         ),
     ] = False,
     json_: JsonOption = False,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """The commands in a log: who gave which when and why, what it changed, and what is undone.
+    """List the commands in a log: who gave which when and why, what it changed, what is undone.
 
     An effect counts the places, objects and keyframes that were changed in the map of the events
-    before the command. `mapfold edit` keeps that of its command beside the log.
+    before the command. `mapfold edit` keeps the effect of its command beside the log.
     """
     settings_of = functools.partial(settings_from, settings_file, set_)
     with LogReader(log) as reader:

@@ -88,7 +88,12 @@ _COMMON: dict[str, tuple[Any, Any]] = {
         False,
     ),
     "all_": (
-        Annotated[bool, typer.Option("--all", help="With --dry-run: name every thing.")],
+        Annotated[
+            bool,
+            typer.Option(
+                "--all", help=f"With --dry-run: list all changes, not only {_MOST_LINES} of a kind."
+            ),
+        ],
         False,
     ),
     "json": (JsonOption, False),
@@ -180,13 +185,11 @@ def _show(made: Made, common: _Common) -> None:
             }
         )
         return
-    head, _, rest = difference_text(
-        difference, most=None if common.all_ else _MOST_LINES
-    ).partition("\n")
+    text = difference_text(difference, most=None if common.all_ else _MOST_LINES)
     before, after = (digest[:16] for digest in difference.digests)
-    if not difference.same:
-        head = f"digest {before} → {after}"
-    display(f"{made.command.kind} would change {effect}; nothing is recorded\n{head}\n{rest}")
+    digests = f"the same map, digest {before}" if difference.same else f"digest {before} → {after}"
+    details = text.partition("\n")[2]
+    display(f"{made.command.kind} would change {effect}; nothing is recorded\n{digests}\n{details}")
 
 
 def _report(made: Made, common: _Common) -> None:

@@ -86,17 +86,25 @@ def evaluate(
     ],
     query_logs: Annotated[
         list[Path] | None,
-        typer.Option("--query", metavar="LOG", help="Log to ask from; may be repeated."),
+        typer.Option(
+            "--query", metavar="LOG", help="Log whose keyframes are the questions; may be repeated."
+        ),
     ] = None,
     truth_files: Annotated[
         list[Path] | None,
-        typer.Option("--truth", metavar="FILE", help="Truth of the runs; may be repeated."),
+        typer.Option("--truth", metavar="FILE", help="Ground truth of runs; may be repeated."),
     ] = None,
     until: Annotated[
         str, typer.Option("--at", metavar="W", help=f"Fold the map's log only to here: {W}.")
     ] = "end",
-    method: Annotated[str, typer.Option("--method", help="joint or plain.")] = "joint",
-    seed: Annotated[int, typer.Option("--seed", help="Draws the crops asked with.")] = DEFAULT_SEED,
+    method: Annotated[
+        str,
+        typer.Option("--method", metavar="joint|plain", help="As for `mapfold relocalize`."),
+    ] = "joint",
+    seed: Annotated[
+        int,
+        typer.Option("--seed", metavar="N", help="Seed of the choice of crops."),
+    ] = DEFAULT_SEED,
     hfov: HfovOption = None,
     image: ImageOption = None,
     self_: Annotated[
@@ -105,7 +113,11 @@ def evaluate(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", metavar="FILE", help="Draw where three crops fail."),
+        typer.Option(
+            "--picture",
+            metavar="FILE",
+            help="Draw the questions of three crops, and the error of each.",
+        ),
     ] = None,
     set_: SetOption = None,
     settings_file: SettingsOption = None,
@@ -122,14 +134,15 @@ def evaluate(
     ] = None,
     json_: JsonOption = False,
 ) -> None:
-    """How good places, objects and re-localisation are.
+    """Score places, objects and re-localisation against ground truth.
 
-    Scores against the truth, of re-localisation with one to five crops a question, and with one to
-    five pictures (views) of up to three crops. Beside them the scores of the plain recipe (the
-    median position of the ten most similar observations) and of the best cosine alone. With several
-    maps each is asked every question, and the worst one is named.
+    Re-localisation is scored with one to five crops a question, and with one to five pictures
+    (views) of up to three crops. Beside them are the scores of the plain recipe (the median
+    position of the ten most similar observations) and of the best cosine alone. With several maps
+    each is asked every question, and the worst one is named.
 
-    With --self the map is asked about its own keyframes, as if it had not been there then.
+    With --self the map is asked about its own keyframes, each without the observations of its
+    visit in the map.
     """
     check_picture(picture)
     if picture is not None and len(map_logs) > 1:

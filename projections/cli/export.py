@@ -77,8 +77,8 @@ def export(
         typer.Option(
             metavar="N",
             min=1,
-            help="A scene every N events, for --foxglove and --rerun [default: such that there are"
-            " 500].",
+            help="A scene every N events, for --foxglove and --rerun [default: as many as make at"
+            " most 500 scenes].",
         ),
     ] = None,
     origin: Annotated[
@@ -91,7 +91,9 @@ def export(
     ] = None,
     floor: Annotated[
         str | None,
-        typer.Option("--floor", metavar="NAME", help="This floor only; - is that without a name."),
+        typer.Option(
+            "--floor", metavar="NAME", help="This floor only; - is the floor without a name."
+        ),
     ] = None,
     known_at: KnownAtOption = None,
     set_: SetOption = None,
@@ -106,7 +108,7 @@ def export(
     recordings = {"foxglove": foxglove, "rerun": rerun}
     if not any((files | recordings).values()):
         names = ", ".join(f"--{name}" for name in files | recordings)
-        raise MisuseError(f"nothing to write: give {names}")
+        raise MisuseError(f"nothing to write; give at least one of {names}")
     if origin is not None and geojson is None:
         raise MisuseError("--origin is for --geojson")
     if every is not None and not any(recordings.values()):
@@ -186,9 +188,11 @@ def _degrees(text: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
-        raise MisuseError(f"--origin {text}: wants LAT,LON or LAT,LON,YAW in degrees")
+        raise MisuseError(f"--origin {text}: write it as LAT,LON or LAT,LON,YAW, in degrees")
     if not (-89 <= values[0] <= 89 and -180 <= values[1] <= 180):
-        raise MisuseError(f"--origin {text}: latitude is -89 to 89, longitude -180 to 180")
+        raise MisuseError(
+            f"--origin {text}: give a latitude of -89 to 89 and a longitude of -180 to 180"
+        )
     return values
 
 
@@ -233,14 +237,14 @@ def foxglove(
             maps = PastMaps(reader, settings, corrections, end, bar.show_fold)
         if maps.moments.backwards:
             say(
-                f"{counted(maps.moments.backwards, 'event')} with a stamp before that of an earlier"
-                " one; the timeline shows them at the time of that one"
+                f"{counted(maps.moments.backwards, 'event')} with an earlier stamp than an event"
+                " before; the timeline shows them at that event's time"
             )
         try:
             playback = Playback(maps, log.resolve().name, host, port)
         except OSError as error:
             raise MisuseError(
-                f"cannot listen on {host}:{port}: {error}; give another --port"
+                f"cannot listen on {host}:{port}: {error}; give another --host or --port"
             ) from None
         with stop_on_signals() as stop:
             if not is_loopback(host):

@@ -43,7 +43,8 @@ from .signals import sigterm_unwinds
 from .terminal import display, emit, finish, say
 
 fleet_app = typer.Typer(
-    help="Many sites at once, each with a log and a database of its own.", no_args_is_help=True
+    help="Rebuild, check and ask many sites, each with a log and a database of its own.",
+    no_args_is_help=True,
 )
 
 _NAMED: Final = 10
@@ -175,7 +176,7 @@ def status(
     settings_file: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """A table of all sites: log, last keyframe, losses, and how far the databases are.
+    """Show a table of all sites: log, last keyframe, losses, and how far the databases are.
 
     Exit 3 when a site is not up to date, has lost something or cannot be read.
     """
@@ -252,7 +253,9 @@ def verify(
 def relocalize(
     place: SitesArgument,
     query: QuestionArgument,
-    top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places of each site.")] = 3,
+    top: Annotated[
+        int, typer.Option("--top", metavar="N", min=1, max=100, help="Places of each site.")
+    ] = 3,
     hfov: HfovOption = None,
     image: ImageOption = None,
     jobs: QuestionJobsOption = None,
@@ -260,10 +263,10 @@ def relocalize(
     vector_db: VectorTemplateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Which site a robot is at, from a few object crops: the probability of each, and of none.
+    """Find the site a robot is at, from a few object crops: the probability of each, and of none.
 
-    Each site's map is asked as by `relocalize`; its answer is in the output. Exit 3 when a site
-    could not be asked.
+    Each site's map is asked as by `mapfold relocalize`; its answer is in the output. Exit 3 when a
+    site could not be asked.
     """
     from projections.fleet.asking import ask_sites
 

@@ -65,24 +65,27 @@ def import_(
     files: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[FILE]...",
+            metavar="FILE",
             help="JSON lines (plain or gzip), logger records, MCAP files, bags of ROS 2, other "
             "logs; - is stdin.",
         ),
     ] = None,
-    key: Annotated[str, typer.Option(help="Key for messages without one.")] = DEFAULT_KEY,
+    key: Annotated[
+        str, typer.Option(metavar="KEY", help="Key for messages without one.")
+    ] = DEFAULT_KEY,
     map_: Annotated[
         Path | None,
         typer.Option(
             "--map",
             metavar="FILE",
-            help="The map.yaml of a map server; its walls hold from here on, for the files too.",
+            help="The map.yaml of a map server, appended before the files; its walls apply from"
+            " there on.",
         ),
     ] = None,
     floor: Annotated[
         str | None,
         typer.Option(
-            metavar="F", help="The floor that the map is of, as `floor` in envelopes names it."
+            metavar="NAME", help="The floor of the map of --map, as in the envelopes' `floor`."
         ),
     ] = None,
     topic: Annotated[
@@ -107,16 +110,16 @@ def import_(
     max_gap: MaxGapOption = DEFAULT_MAX_GAP_NS / 1e9,
     json_: JsonOption = False,
 ) -> None:
-    """Append recorded envelopes to a log, in the order of the files, after an occupancy map.
+    """Append recorded envelopes and occupancy maps to a log, in the order of the files.
 
-    Of a bag of ROS 2 (a folder, or its .db3 or .mcap file) the detections become envelopes with
-    their poses, and an occupancy grid a map; needs the extra mapfold[ros]. What to use follows from
-    the topics' types and names where no option says it.
+    From a bag of ROS 2 (a folder, or its .db3 or .mcap file) detections become envelopes with their
+    poses, and occupancy grids become maps; needs the extra mapfold[ros]. Which topics are used
+    follows from their types and names, unless an option names them.
 
     A message that is neither a valid envelope nor an occupancy grid is kept with its bytes and the
     reason under mapfold/rejected, and the command exits with 3. Messages of an MCAP file that were
     meant for something else are passed over and counted; if nothing is left, it exits with 3, too.
-    Ctrl-C keeps what is in the log and says how far it got.
+    Ctrl-C keeps the events appended so far and prints how far the import got.
     """
     names = files or []
     if not names and map_ is None:

@@ -1,4 +1,4 @@
-"""The commands `mapfold log info`, `cat`, `verify` and `recover`."""
+"""The commands of `mapfold log`, except for `spaces`."""
 
 import base64
 import contextlib
@@ -184,7 +184,7 @@ class RangeNotes:
 
 
 log_app = typer.Typer(
-    help="Inspect and repair a log: info, cat, verify, recover.", no_args_is_help=True
+    help="Inspect and repair a log: info, cat, verify, recover, spaces.", no_args_is_help=True
 )
 
 
@@ -253,7 +253,7 @@ def _span(first_ns: int, last_ns: int) -> str:
 @log_app.command()
 def cat(
     log: LogArgument,
-    from_: Annotated[str, typer.Option("--from", metavar="W", help="First event.")] = "0",
+    from_: Annotated[str, typer.Option("--from", metavar="W", help="Start of the range.")] = "0",
     to: Annotated[str, typer.Option("--to", metavar="W", help="End of the range.")] = "end",
     key: Annotated[
         list[str] | None, typer.Option(metavar="K", help="Only this key; may be repeated.")
@@ -265,8 +265,8 @@ def cat(
 ) -> None:
     """Print the events of a log in order, one per line.
 
-    W is an offset, an ISO time, RUN:KEYFRAME or end. Offsets go from --from to before --to; a
-    keyframe or a time is included at either end.
+    W is an offset, an ISO time, RUN:KEYFRAME or end. An offset of --to is not included; a keyframe
+    or a time is, at either end.
     """
     gaps: list[Unreadable] = []
 
@@ -282,7 +282,7 @@ def cat(
         end = _end(reader, to, start, on_gap)
         last = reader.next_offset if end is None else end
         if start > last:
-            raise MisuseError(f"--from {from_} is offset {start}, after --to {to}, which is {last}")
+            raise MisuseError(f"--from {from_} (offset {start}) is after --to {to} (offset {last})")
         notes = RangeNotes(from_, to, key or ())
         events = notes.watch(reader.read(start, end, keys=key or None, on_gap=on_gap))
         if json_:
@@ -355,9 +355,10 @@ def recover(
     """Repair a log that is damaged or was left by a crash, keeping everything that can be read.
 
     Originals in which something recorded is damaged are kept as *.damaged; segments of other logs
-    are renamed to *.foreign, those whose events others hold to *.duplicate; wrong names are
-    corrected. Lost offsets become mapfold/loss events; without --yes at most 100,000 more than the
-    damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something was.
+    are renamed to *.foreign, those whose events are in other segments too to *.duplicate; wrong
+    names are corrected. Lost offsets become mapfold/loss events; without --yes at most 100,000 more
+    than the damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something
+    was.
     """
     report = recover_log(log, max_losses=sys.maxsize if yes else DEFAULT_MAX_LOSSES)
     if json_:

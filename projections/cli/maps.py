@@ -52,7 +52,7 @@ def state(
     settings_file: SettingsOption = None,
     no_cache: NoCacheOption = False,
 ) -> None:
-    """The map folded to a point in the log.
+    """Show the map folded to a point in the log.
 
     Counts, settings, digest, and each place with its size and neighbours; --json prints all.
     """
@@ -91,11 +91,13 @@ def draw(
         typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
     ] = "end",
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="The picture; its suffix says how: png, svg, pdf.")
+        Path, typer.Option(metavar="FILE", help="The picture: .png, .svg or .pdf.")
     ] = Path("map.png"),
     house: Annotated[
         int | None,
-        typer.Option(metavar="SEED", help="Draw the plan of this simulated house under it.", min=0),
+        typer.Option(
+            metavar="SEED", help="Draw the plan of this simulated house under the map.", min=0
+        ),
     ] = None,
     min_observations: Annotated[
         int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
@@ -103,7 +105,7 @@ def draw(
     floor: Annotated[
         str | None,
         typer.Option(
-            "--floor", metavar="NAME", help="Draw this floor only; - is that without a name."
+            "--floor", metavar="NAME", help="Draw this floor only; - is the floor without a name."
         ),
     ] = None,
     merges: Annotated[
@@ -113,7 +115,7 @@ def draw(
     set_: SetOption = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """A picture of the map folded to a point in the log.
+    """Draw the map folded to a point in the log.
 
     The robot's path, places in colours, objects, and edges between adjacent places.
     """

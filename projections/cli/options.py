@@ -201,7 +201,9 @@ ConfigOption = Annotated[
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
-PublishKeyOption = Annotated[str, typer.Option("--key", help="Zenoh key to publish under.")]
+PublishKeyOption = Annotated[
+    str, typer.Option("--key", metavar="KEY", help="Zenoh key to publish under.")
+]
 
 
 def zenoh_options(
@@ -234,7 +236,8 @@ HfovOption = Annotated[
     float | None,
     typer.Option(
         "--hfov",
-        help="Horizontal field of view of the robot's camera, degrees [default: that of the map's"
+        metavar="DEGREES",
+        help="Horizontal field of view of the robot's camera [default: that of the map's"
         " settings].",
         show_default=False,
     ),

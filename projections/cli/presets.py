@@ -22,9 +22,9 @@ PresetOption = Annotated[
     Preset | None,
     typer.Option(
         "--preset",
-        help="Settings with a name: page, for DBSCAN by distance, or rooms, for places that are"
-        " rooms; --set goes on top.",
-        show_choices=True,
+        metavar="|".join(PRESETS),
+        help="Named settings: page, for places by DBSCAN, or rooms, for places that are rooms;"
+        " --set goes on top.",
     ),
 ]
 

@@ -53,12 +53,14 @@ PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's i
 
 def similar(
     query: QuestionArgument,
-    top: Annotated[int, typer.Option("--top", min=1, max=64, help="Objects to list.")] = 10,
+    top: Annotated[
+        int, typer.Option("--top", metavar="N", min=1, max=64, help="Objects to list.")
+    ] = 10,
     db: DbOption = None,
     vector_db: VectorDbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Objects that look most like the crops of QUERY."""
+    """List the objects that look most like the crops of QUERY."""
     crops = question_from(query).crops
     with databases(db, vector_db) as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
@@ -69,7 +71,8 @@ def where(
     wanted: Annotated[
         str,
         typer.Argument(
-            metavar="WHAT", help="An object's id, a kind of room such as kitchen, a place's name."
+            metavar="WHAT",
+            help="An object's id, a kind of room such as kitchen, or a place's name.",
         ),
     ],
     at: AtOption = None,
@@ -79,10 +82,9 @@ def where(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where an object is, or which places are kitchens.
+    """Find an object, or the places that are rooms of a kind, such as kitchens.
 
-    What kind of room a place is follows from the objects in it, or from its name. With --at as it
-    was at a point of the log.
+    What kind of room a place is follows from the objects in it, or from its name.
     """
     with _map_source(db, log, at, settings_file, set_) as source:
         _print(where_is(source, wanted), json_)
@@ -97,15 +99,17 @@ def contents(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """The objects located in a place."""
+    """List the objects located in a place."""
     with _map_source(db, log, at, settings_file, set_) as source:
         _print(objects_of(source, place_id), json_)
 
 
 def holding(
     class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
-    start: Annotated[str, typer.Option("--from", metavar="PLACE", help="Where to start.")],
-    hops: Annotated[int, typer.Option("--hops", min=0, help="Steps from place to place.")] = 2,
+    start: Annotated[
+        str, typer.Option("--from", metavar="PLACE", help="The id of the place to start from.")
+    ],
+    hops: Annotated[int, typer.Option("--hops", metavar="N", min=0, help="Most steps.")] = 2,
     at: AtOption = None,
     log: LogOption = None,
     set_: SetOption = None,
@@ -113,9 +117,9 @@ def holding(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Places near a place that hold an object of a class.
+    """List the places near a place that hold an object of a class.
 
-    Near is at most --hops steps away, each from a place to one next to it.
+    Near is at most --hops steps away; a step is from a place to an adjacent one.
     """
     with _map_source(db, log, at, settings_file, set_) as source:
         _print(places_holding(source, class_name, start, hops), json_)
@@ -131,7 +135,7 @@ def path(
     db: DbOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """The places on the way from one place to another."""
+    """List the places on the way from one place to another."""
     with _map_source(db, log, at, settings_file, set_) as source:
         _print(path_between(source, start, goal), json_)
 
@@ -170,7 +174,7 @@ def _print(found: Any, as_json: bool) -> None:
         emit(found)
         return
     rows = found if isinstance(found, list) else [found]
-    display("".join(f"{_format(row)}\n" for row in rows) or "nothing")
+    display("".join(f"{_format(row)}\n" for row in rows) or "nothing found")
 
 
 def _format(row: dict[str, Any]) -> str:

@@ -21,7 +21,7 @@ from .terminal import emit, finish, people, say
 
 EVERY_S = 1.0
 _FEW_UNSEALED = 3
-"""The number of unsealed segments up to which none are shown, as it is normal."""
+"""So many unsealed segments are normal; only more are shown."""
 
 
 class RecorderStatus:
@@ -199,8 +199,8 @@ def unused_text(report: RecorderReport) -> list[str]:
         )
     if report.unknown_keys:
         lines.append(
-            f"{counted(report.unknown_keys, 'message')} left out: a publisher sent them under keys"
-            " that match topics of ROS recorded here and are none"
+            f"{counted(report.unknown_keys, 'message')} left out: their keys match recorded topics"
+            " of ROS, but are not the key of one"
         )
     return lines
 

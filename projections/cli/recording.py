@@ -61,7 +61,9 @@ large should reach the recorder and be counted."""
 
 
 def record(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log; made if it is not there.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
+    ],
     connect: ConnectOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
@@ -89,7 +91,7 @@ def record(
         typer.Option(metavar="POLICY", help="always, <N>ms or never: when events reach the disk."),
     ] = "50ms",
     queue: Annotated[
-        int, typer.Option(min=1, help="How many messages may wait for the disk.")
+        int, typer.Option(metavar="N", min=1, help="How many messages may wait for the disk.")
     ] = DEFAULT_QUEUE_SIZE,
     max_payload: Annotated[
         int,
@@ -98,7 +100,7 @@ def record(
         ),
     ] = DEFAULT_MAX_PAYLOAD_BYTES,
     max_events: Annotated[
-        int | None, typer.Option(min=1, help="Stop after so many messages.")
+        int | None, typer.Option(metavar="N", min=1, help="Stop after so many messages.")
     ] = None,
     gaps: Annotated[
         bool,
@@ -115,7 +117,7 @@ def record(
         bool,
         typer.Option(
             "--accept-edits",
-            help="Take the commands of `mapfold edit`, from everybody who may query "
+            help="Record the commands of `mapfold edit` from everybody who may query "
             f"{EDIT_PREFIX}/ on this Zenoh network.",
         ),
     ] = False,
@@ -141,7 +143,7 @@ def record(
 
     With --ros2dds also the messages of a zenoh-bridge-ros2dds, and without --key only those.
 
-    Exit 3 when anything was rejected, lost or is missing, or could not be read.
+    Exit 3 when anything was rejected or lost, is missing, or could not be read.
     """
     choice = BridgeChoice(
         namespace, detections, pose, covariance, embeddings, camera, grid, map_frame, base_frame,

@@ -82,13 +82,13 @@ def reembed_log(
         Path,
         typer.Option(
             metavar="MODEL.onnx",
-            help="Encoder of crops; MODEL.json beside it names its space and says how it wants"
-            " them, as for `mapfold detect`.",
+            help="Encoder of crops; MODEL.json beside it names its space and describes its input,"
+            " as for `mapfold detect`.",
         ),
     ],
     batch: Annotated[
         int,
-        typer.Option(metavar="N", min=1, max=MAX_REEMBEDDED, help="Crops in a group: an event."),
+        typer.Option(metavar="N", min=1, max=MAX_REEMBEDDED, help="Vectors in one event."),
     ] = DEFAULT_BATCH,
     crops: Annotated[
         list[str] | None,

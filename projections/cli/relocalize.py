@@ -71,10 +71,12 @@ def relocalize(
         typer.Option(
             "--class",
             metavar="CLASS",
-            help="Where is a thing of this class near? May be repeated; takes the place of QUERY.",
+            help="Ask where a thing of this class is near, instead of QUERY; may be repeated.",
         ),
     ] = None,
-    top: Annotated[int, typer.Option("--top", min=1, max=100, help="Places to list.")] = 3,
+    top: Annotated[
+        int, typer.Option("--top", metavar="N", min=1, max=100, help="Places to list.")
+    ] = 3,
     as_of: Annotated[
         str | None,
         typer.Option("--as-of", metavar="W", help=f"Ask the map as it was: {W} of --log."),
@@ -84,7 +86,12 @@ def relocalize(
         typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
     ] = None,
     method: Annotated[
-        str, typer.Option("--method", help="joint, or plain: similarities summed per Place.")
+        str,
+        typer.Option(
+            "--method",
+            metavar="joint|plain",
+            help="joint: by poses, from all crops together; plain: similarities summed per Place.",
+        ),
     ] = "joint",
     hfov: HfovOption = None,
     image: ImageOption = None,
@@ -94,7 +101,7 @@ def relocalize(
     settings_file: SettingsOption = None,
     json_: JsonOption = False,
 ) -> None:
-    """Where a robot is, from a few object crops or classes.
+    """Find where a robot is, from a few object crops or classes.
 
     Ranked Places with evidence, a pose hypothesis, how likely it is right (confidence) and how
     likely the map has the things shown (known).
@@ -150,7 +157,7 @@ def method_from(text: str) -> Method:
     """The method an option names."""
     if text in get_args(Method):
         return cast("Method", text)
-    raise MisuseError(f"--method {text}: there are joint and plain")
+    raise MisuseError(f"--method {text}: choose joint or plain")
 
 
 def _print_answer(answer: Answer, as_json: bool) -> None:
@@ -250,7 +257,7 @@ def _lines(read: Callable[[int], bytes], name: str) -> Iterator[bytes]:
 def print_tracked(
     lines: Iterator[bytes], search: Search, *, top: int, camera: Camera | None
 ) -> None:
-    """Answer each line as soon as it comes. Raises QuestionError at the end if any was wrong."""
+    """Answer each line as soon as it comes. Raises QuestionError at the end if any was invalid."""
     track, asked, wrong = Track("relocalize --track"), 0, 0
     for line in lines:
         asked += 1

@@ -136,7 +136,11 @@ _LARGEST_BYTES: Final = 16 * 1024 * 1024
 def serve(
     http: Annotated[
         str | None,
-        typer.Option("--http", metavar="HOST:PORT", help="Serve HTTP there too (extra [serve])."),
+        typer.Option(
+            "--http",
+            metavar="HOST:PORT",
+            help="Answer over HTTP, too, at this address (extra [serve]).",
+        ),
     ] = None,
     token_file: Annotated[
         Path | None,
@@ -172,18 +176,25 @@ def serve(
             " repeated.",
         ),
     ] = None,
-    zenoh: Annotated[bool, typer.Option(help="Serve mapfold/relocalize over Zenoh.")] = True,
+    zenoh: Annotated[bool, typer.Option(help="Answer over Zenoh.")] = True,
     connect: ConnectOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, max=64, help="Questions answered at a time.")
+        int,
+        typer.Option("--workers", metavar="N", min=1, max=64, help="Questions answered at a time."),
     ] = 4,
     rate: Annotated[
-        float, typer.Option("--rate", min=0.1, help="Questions a second, in the long run.")
+        float,
+        typer.Option(
+            "--rate", metavar="N", min=0.1, help="Questions a second on average; more are refused."
+        ),
     ] = 500.0,
     max_bytes: Annotated[
-        int, typer.Option("--max-bytes", min=1000, help="Longer questions are refused.")
+        int,
+        typer.Option(
+            "--max-bytes", metavar="BYTES", min=1000, help="Longer questions are refused."
+        ),
     ] = DEFAULT_MAX_BYTES,
     hfov: HfovOption = None,
     image: ImageOption = None,
@@ -192,8 +203,9 @@ def serve(
 ) -> None:
     """Answer questions from the live databases until Ctrl-C.
 
-    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as described at /docs there.
-    Errors are replies too. On SIGINT or SIGTERM open questions are answered first.
+    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as described at its /docs. An
+    invalid question gets an error as its answer. On SIGINT or SIGTERM open questions are answered
+    first.
     """
     if http is None and not zenoh:
         raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")

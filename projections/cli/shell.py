@@ -20,9 +20,7 @@ class Shell(StrEnum):
 def help_(
     command: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[COMMAND]…", help="A command, such as db check.", show_default=False
-        ),
+        typer.Argument(metavar="COMMAND", help="A command, such as db check.", show_default=False),
     ] = None,
 ) -> None:
     """Show the help of a command, as its --help does."""

@@ -36,9 +36,12 @@ _MAX_NAME: Final = 100
 
 
 def simulate(
-    seed: Annotated[int, typer.Option(help="Which house.", min=0)] = DEFAULT_SEED,
+    seed: Annotated[int, typer.Option(metavar="N", help="Which house.", min=0)] = DEFAULT_SEED,
     run: Annotated[
-        str, typer.Option(help="Which run: a explores, b, c … are other sessions and tours.")
+        str,
+        typer.Option(
+            metavar="NAME", help="Which run: a explores, b, c … are other sessions and tours."
+        ),
     ] = "a",
     out: Annotated[
         Path | None,
@@ -48,7 +51,7 @@ def simulate(
     ] = None,
     key: PublishKeyOption = "tb/detections",
     speed: Annotated[
-        float, typer.Option(help="Times as fast as the robot drives; 0: no waiting.", min=0.0)
+        float, typer.Option(metavar="X", help="Times real time; 0: without waiting.", min=0.0)
     ] = 10.0,
     camera: Annotated[
         Path | None,

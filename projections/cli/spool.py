@@ -21,22 +21,24 @@ _ALL: Final = 1_000_000_000
 def spool(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="[FILE]", help="The spool [default: that of `mapfold detect`]."),
+        typer.Argument(metavar="FILE", help="The spool [default: that of `mapfold detect`]."),
     ] = None,
     retry: Annotated[
         bool,
         typer.Option(
             "--retry",
-            help="Put what was refused behind what waits; the next start with this spool sends it.",
+            help="Queue the refused envelopes again; the next start with this spool sends them.",
         ),
     ] = False,
     discard: Annotated[
         bool,
-        typer.Option("--discard", help="Drop what was refused; the log that refused it has it."),
+        typer.Option(
+            "--discard", help="Drop the refused envelopes; the log that refused them keeps them."
+        ),
     ] = False,
     json_: JsonOption = False,
 ) -> None:
-    """What a robot's spool holds: envelopes that wait for a recorder, and those that one refused.
+    """List a robot's spool: envelopes that wait for a recorder, and those that one refused.
 
     A recorder refuses an envelope that it cannot use, with a reason, and keeps it in its log under
     mapfold/rejected. It stays in the spool until --retry or --discard. Exit 3 while there is one.
@@ -45,9 +47,11 @@ def spool(
         raise MisuseError("--retry and --discard: give one of them")
     path = file or spool_path()
     if not path.is_file():
-        raise MisuseError(f"{path}: no such file; give the one that --spool of a robot names")
+        raise MisuseError(
+            f"{path}: no such file; give a robot's spool, the --spool of `mapfold detect`"
+        )
     if not Spool.is_spool(path):
-        raise MisuseError(f"{path}: no spool, but another program's database; give a spool's file")
+        raise MisuseError(f"{path}: another program's database; give a spool")
     opened = Spool(path)
     try:
         retried = opened.retry_refused() if retry else 0

@@ -43,8 +43,10 @@ from .terminal import Bar, display, emit, say
 MOST_LINES = 5
 """Things of a kind that a text answer names without --all."""
 
-AllOption = Annotated[bool, typer.Option("--all", help="Name every thing, however many.")]
-AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Look from here: {W}.")]
+AllOption = Annotated[
+    bool, typer.Option("--all", help=f"List all changes, not only {MOST_LINES} of a kind.")
+]
+AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Use the map as of here: {W}.")]
 
 
 @contextlib.contextmanager
@@ -83,10 +85,12 @@ def merges(
     ] = None,
     refused: Annotated[
         bool,
-        typer.Option("--refused", help="Instead the merges that a command refused, and which."),
+        typer.Option(
+            "--refused", help="Show instead the merges that a command refused, and the command."
+        ),
     ] = False,
     objects: Annotated[
-        bool, typer.Option("--objects", help="Instead the objects that became one, and why.")
+        bool, typer.Option("--objects", help="Show instead the objects that became one, and why.")
     ] = False,
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
@@ -94,9 +98,9 @@ def merges(
     settings_file: SettingsOption = None,
     no_cache: NoCacheOption = False,
 ) -> None:
-    """Every merge of places, and which keyframe made it.
+    """List every merge of places, and which keyframe made it.
 
-    When, by which keyframe, which place survived, which were absorbed, and what moved to the
+    With its time, the place that survived, the places that were absorbed, and what moved to the
     survivor.
     """
     if refused + objects + (show is not None or draw is not None) > 1:
@@ -167,12 +171,13 @@ def why(
         str | None,
         typer.Argument(
             metavar="PLACE|OBJECT_ID|RUN:KF",
-            help="A place by its id, also an absorbed one, or by its name; an object; a keyframe.",
+            help="A place by its id, also an absorbed one, or by its name; an object; the first"
+            " of two keyframes.",
         ),
     ] = None,
     other: Annotated[
         str | None,
-        typer.Argument(metavar="RUN:KF", help="After a keyframe another one: as --same of both."),
+        typer.Argument(metavar="RUN:KF", help="The second keyframe, as with --same."),
     ] = None,
     same: Annotated[
         tuple[str, str] | None,
@@ -189,9 +194,9 @@ def why(
     settings_file: SettingsOption = None,
     no_cache: NoCacheOption = False,
 ) -> None:
-    """Why a place or an object is what it is, event by event.
+    """Explain why a place or an object is what it is, event by event.
 
-    Commands that named, joined, kept apart or moved something of it are named too.
+    Commands that named, joined, kept apart or moved a part of it are listed, too.
     """
     if (thing is None) == (same is None):
         raise MisuseError("give a place, an object, or two keyframes as RUN:KEYFRAME RUN:KEYFRAME")
@@ -217,7 +222,7 @@ def _explanation(
 def diff(
     log: LogArgument,
     first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
-    second: Annotated[str, typer.Argument(metavar="W2", help="To here: the same.")] = "end",
+    second: Annotated[str, typer.Argument(metavar="W2", help="To here, given as W1.")] = "end",
     known_at: Annotated[
         str | None,
         typer.Option(
@@ -232,7 +237,7 @@ def diff(
     settings_file: SettingsOption = None,
     no_cache: NoCacheOption = False,
 ) -> None:
-    """What changed from one moment of the map to another.
+    """Show what changed from one moment of the map to another.
 
     Keyframes, places, objects and adjacency, and the commands recorded in between.
     """
@@ -247,7 +252,7 @@ def diff(
         display(difference_text(found, most=None if all_ else MOST_LINES))
 
 
-_BISECT_HELP = f"""The first event that made a condition over the map true.
+_BISECT_HELP = f"""Find the first event that made a condition over the map true.
 
 EXPR compares numbers and ids, joined by and, or, not and parentheses, for example
 "place_count < 3", "same_place('run:12', 'run:90')", "located_in('obj-…') == 'run_p2'";
@@ -262,11 +267,9 @@ def bisect(
     log: LogArgument,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
     start: Annotated[
-        str, typer.Option("--from", metavar="W", help=f"Begin with the map as of here: {W}.")
+        str, typer.Option("--from", metavar="W", help=f"Search from here: {W}.")
     ] = "0",
-    end: Annotated[
-        str, typer.Option("--to", metavar="W", help="End with the map as of here.")
-    ] = "end",
+    end: Annotated[str, typer.Option("--to", metavar="W", help="Search to here.")] = "end",
     scan: Annotated[
         bool,
         typer.Option("--scan", help="List every turn to true and to false, not only the first."),

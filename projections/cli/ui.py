@@ -44,7 +44,10 @@ _KINDS: Final = ("place", "object", "keyframe", "merge")
 def ui(
     log: LogArgument,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Listen here; others need the printed token.")
+        str,
+        typer.Option(
+            metavar="ADDRESS", help="Address to listen on; other machines need the printed token."
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
@@ -58,7 +61,8 @@ def ui(
         str | None,
         typer.Option(
             metavar="THING",
-            help="And to the story of place:ID, object:ID, keyframe:RUN/ID or merge:OFFSET.",
+            help="Print the link to the history of this: place:ID, object:ID, keyframe:RUN/ID or"
+            " merge:OFFSET.",
         ),
     ] = None,
     allow_edits: Annotated[
@@ -78,11 +82,13 @@ def ui(
     ] = None,
     db: Annotated[
         str | None,
-        typer.Option(metavar="URL", help="Show how far the tail of this database is."),
+        typer.Option(metavar="URL", help="Show how far behind this database is."),
     ] = None,
     vector_db: Annotated[
         str | None,
-        typer.Option("--vector-db", metavar="URL", help="The vectors' one [default: --db]."),
+        typer.Option(
+            "--vector-db", metavar="URL", help="The database of the vectors [default: --db]."
+        ),
     ] = None,
     connect: ConnectOption = None,
     zenoh_config: ConfigOption = None,
@@ -92,8 +98,8 @@ def ui(
 ) -> None:
     """Show a log's map in a browser, at any point in time.
 
-    The map at every moment, merges and their causes, what changed, what would be under other
-    settings. Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
+    The map at every moment, merges and their causes, changes, and the map under other settings.
+    Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
     """
     settings = settings_of(settings_file, set_)
     if vector_db is not None and db is None:
@@ -116,7 +122,7 @@ def ui(
 
     scored = read_truth(truth) if truth else None
     with ExitStack() as stack:
-        listener = stack.enter_context(closing(bind(host, port, "--host and --port")))
+        listener = stack.enter_context(closing(bind(host, port, "--host or --port")))
         local = is_loopback(listener)
         stop = stack.enter_context(stop_on_signals())
         tails = None if db is None else _tails(stack, log, db, vector_db)

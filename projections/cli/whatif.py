@@ -53,7 +53,7 @@ def whatif(
         typer.Option(
             "--try",
             metavar="'NAME=VALUE …'",
-            help="One alternative of its own; give it several times for several.",
+            help="One alternative; may be repeated.",
         ),
     ] = None,
     grid: Annotated[
@@ -61,7 +61,7 @@ def whatif(
         typer.Option(
             "--grid",
             metavar="NAME=VALUE,…",
-            help="Every combination of these values, with those of other --grid.",
+            help="An alternative for every combination of these values and those of other --grid.",
         ),
     ] = None,
     base: Annotated[
@@ -76,7 +76,7 @@ def whatif(
         typer.Option(
             "--without",
             metavar="COMMAND_ID",
-            help="One alternative: the map without this command; may be given several times.",
+            help="One alternative: the map without this command; may be repeated.",
         ),
     ] = None,
     at: AtOption = "end",
@@ -101,7 +101,7 @@ def whatif(
     ] = None,
     settings_file: SettingsOption = None,
 ) -> None:
-    """The map under other settings, or without one of its commands.
+    """Show the map under other settings, or without one of its commands.
 
     Places, noise, merges and objects under each, and how the maps differ. ARI is the adjusted Rand
     index against the base: 1 is the same partition of keyframes into places or observations into

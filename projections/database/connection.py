@@ -251,7 +251,7 @@ def database_errors(url: str) -> Iterator[None]:
 def _not_installed(name: str, where: str) -> str:
     return (
         f"{where}: the server has no {_PRODUCTS.get(name, name)}; install the extension {name} on"
-        " it, or use docker/compose.yaml, or leave --db away for the embedded server"
+        " it, or use docker/compose.yaml, or omit --db for the embedded server"
     )
 
 
@@ -275,7 +275,7 @@ def _advice(error: psycopg.Error, url: str) -> str:
         return "create it with createdb, or name another in the URL"
     if "does not exist" in text and "role" in text:
         return "create it with createuser, or name another in the URL"
-    return "start the server or check the URL, or leave --db away for the embedded server"
+    return "start the server or check the URL, or omit --db for the embedded server"
 
 
 def _first_line(error: Exception) -> str:

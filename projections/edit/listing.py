@@ -83,7 +83,7 @@ def _poses(command: CorrectPoses) -> str:
 def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
     """A table of the commands, two lines for each, and what to do next."""
     if not found:
-        return f"no command in this log; `{advised('edit')}` gives one\n"
+        return f"no command in this log; `{advised('edit')}` records one\n"
     undone = undone_by([recorded for recorded, _ in found])
     first_of = _first_offsets(found)
     rows = []

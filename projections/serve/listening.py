@@ -43,7 +43,7 @@ def bind(host: str, port: int, option: str = "--http") -> socket.socket:
     except OSError as error:
         listener.close()
         raise TransportError(
-            f"http {host}:{port}: {error.strerror or error}; give {option} another"
+            f"cannot listen on {host}:{port}: {error.strerror or error}; give another {option}"
         ) from None
     return listener
 

@@ -59,8 +59,8 @@ def _section(name: str, command: Any) -> str:
     usage = " ".join([name, *map(_usage, arguments), *(["[OPTIONS]"] if options else [])])
     said = inspect.cleandoc(command.help).replace("\b\n", "")  # a mark to click: do not wrap
     lines = [f"## {name}", "", said, "", f"    {usage}", ""]
-    rows = [f"| `{_cell(_name(p))}` | {_cell(p.help)} |" for p in arguments]
-    rows += [f"| `{_cell(_flags(p))}` | {_cell(p.help)} |" for p in options]
+    rows = [f"| `{_cell(_name(p))}` | {_cell(_help(p))} |" for p in arguments]
+    rows += [f"| `{_cell(_flags(p))}` | {_cell(_help(p))} |" for p in options]
     if rows:
         lines += ["| | |", "|---|---|", *rows, ""]
     return "\n".join(lines)
@@ -80,8 +80,17 @@ def _flags(option: Any) -> str:
     return flags if option.is_flag else f"{flags} {_name(option)}"
 
 
-def _cell(text: str | None) -> str:
-    return (text or "").replace("|", "\\|").replace("\n", " ")
+def _help(parameter: Any) -> str:
+    """The help text with the default behind it, as ``--help`` shows it."""
+    default = parameter.default
+    shown = parameter.show_default and not getattr(parameter, "is_flag", False)
+    if not shown or default is None or default == "" or callable(default):
+        return str(parameter.help or "")
+    return f"{parameter.help} [default: {getattr(default, 'value', default)}]"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
 
 
 def man_page() -> str:
@@ -113,7 +122,7 @@ def _man_section(name: str, command: Any) -> str:
             continue
         is_argument = each.param_type_name == "argument"
         lines += [".TP", f".B {_roff(_name(each) if is_argument else _flags(each))}"]
-        lines.append(_roff(each.help or ""))
+        lines.append(_roff(_help(each)))
     return "\n".join(lines)
 
 

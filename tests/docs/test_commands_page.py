@@ -30,6 +30,22 @@ def test_every_command_and_parameter_has_help(by_name: dict[str, Any]) -> None:
     ] == []
 
 
+def test_values_have_a_name_of_their_own(by_name: dict[str, Any]) -> None:
+    """Else ``--help`` shows their type, as ``--seed <int range>``."""
+    named_by_type = [
+        (name, p.name)
+        for name, command in by_name.items()
+        for p in command.params
+        if p.metavar is None and not getattr(p, "is_flag", False)
+    ]
+    assert named_by_type == []
+
+
+def test_the_pages_have_the_defaults() -> None:
+    assert "| `--seed N` | Which simulated house. [default: 7] |" in PAGE.read_text("utf-8")
+    assert "Which simulated house. [default: 7]" in MAN_PAGE.read_text("utf-8")
+
+
 @pytest.mark.parametrize("path", ["", "log", "db", "query", "edit"])
 def test_lists_of_commands_show_whole_sentences(path: str) -> None:
     program = command_line()

@@ -314,7 +314,7 @@ def test_killed_at_any_moment_it_is_recorded_once_or_not_at_all(
 
 
 def test_edits_lists_who_when_why_what_and_what_undid_it(mapfold: Commands) -> None:
-    assert mapfold("edits", "log").out == "no command in this log; `mapfold edit log` gives one\n"
+    assert mapfold("edits", "log").out == "no command in this log; `mapfold edit log` records one\n"
     assert mapfold("edits", "log", "--json").json == []
     for args in (
         ("forget-run", "run-b", "--command-id", "c1", "--issued-by", "ann@lab"),

@@ -96,11 +96,11 @@ def test_an_origin_places_the_map_on_earth(mapfold: Commands, log: Path) -> None
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ((), "nothing to write: give --graphml, --dot, --geojson, --csv, --nav2"),
+        ((), "nothing to write; give at least one of --graphml, --dot, --geojson, --csv, --nav2"),
         (("--dot", "m.dot", "--origin", "1,2"), "--origin is for --geojson"),
-        (("--geojson", "m.json", "--origin", "Berlin"), "--origin Berlin: wants LAT,LON"),
-        (("--geojson", "m.json", "--origin", "1,nan"), "--origin 1,nan: wants LAT,LON"),
-        (("--geojson", "m.json", "--origin", "95,2"), "latitude is -89 to 89"),
+        (("--geojson", "m.json", "--origin", "Berlin"), "--origin Berlin: write it as LAT,LON"),
+        (("--geojson", "m.json", "--origin", "1,nan"), "--origin 1,nan: write it as LAT,LON"),
+        (("--geojson", "m.json", "--origin", "95,2"), "give a latitude of -89 to 89"),
         (("--dot", "file/m.dot"), "file/m.dot: cannot be written: File exists; choose another"),
         (
             ("--csv", "file/t"),

@@ -269,7 +269,7 @@ def test_url_is_that_of_the_site(fleet: Fleet) -> None:
 def test_what_cannot_be_is_refused_before_anything_is_done(fleet: Fleet) -> None:
     for options, wrong in (
         (["--engine", "ray"], "--engine ray: there are local and dask://HOST:PORT"),
-        (["--engine", "dask://h:1", "--jobs", "2"], "--jobs is of --engine local"),
+        (["--engine", "dask://h:1", "--jobs", "2"], "--jobs is for --engine local"),
         (["--db", "postgresql://h/maps"], "no {site} in it"),
         (["--set", "eps_m=-1"], "--set eps_m=-1"),
     ):

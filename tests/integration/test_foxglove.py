@@ -347,7 +347,7 @@ def test_the_command_says_where_it_is_and_ends_by_a_signal(mapfold: Commands) ->
         assert found, server.text
         said = mapfold("foxglove", SAMPLE, "--port", found[1], code=2).err
         assert f"cannot listen on 127.0.0.1:{found[1]}" in said
-        assert "give another --port" in said
+        assert "give another --host or --port" in said
     finally:
         assert server.end() == 0
     assert server.said[-1] == "closed"

@@ -287,7 +287,7 @@ class TestCommand:
             (["--track", "--class", "cup"], "--track reads questions"),
             (["--track", "--method", "plain"], "--track follows the poses"),
             (["--set", "eps_m=1.0"], "--log LOG"),
-            (["--method", "magic"], "joint and plain"),
+            (["--method", "magic"], "choose joint or plain"),
             (["--image", "big"], "--image"),
             (["--hfov", "0"], "field of view"),
             (["--as-of", "end", "--log", "nowhere"], "nowhere"),
