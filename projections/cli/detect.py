@@ -306,7 +306,9 @@ def detect(
     check_sources(images, zenoh_image, poses, zenoh_pose)
     timing = timing_of(start, fps)
     if out is not None and keep_crops:
-        raise MisuseError("--keep-crops publishes crops, and --out nothing; leave one out")
+        raise MisuseError(
+            "--keep-crops publishes crops, and --out publishes nothing; give one of them"
+        )
     check_key(key, "--key")
     address = None if metrics is None else parse_address(metrics, "--metrics")
     name = run_id_of(run_id)

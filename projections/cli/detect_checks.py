@@ -29,7 +29,7 @@ def check_sources(
 ) -> None:
     """Raise MisuseError unless there is one source of pictures and at most one of poses."""
     if (images is None) == (zenoh_image is None):
-        raise MisuseError("where are the pictures? give one of --images and --zenoh-image")
+        raise MisuseError("pictures come from one source: give either --images or --zenoh-image")
     if poses is not None and zenoh_pose is not None:
         raise MisuseError("--poses and --zenoh-pose: give one of them")
     keys = [each for each in (zenoh_image, zenoh_pose) if each is not None]
@@ -40,7 +40,7 @@ def check_sources(
 def timing_of(start: str, fps: float | None) -> Timing:
     """Parse ``--start`` and ``--fps``."""
     if fps is not None and not 0.0 < fps <= 10_000.0:
-        raise MisuseError(f"--fps {fps:g}: a number above 0 and up to 10,000")
+        raise MisuseError(f"--fps {fps:g}: give a number above 0, up to 10,000")
     try:
         start_s = float(start)
     except ValueError:
@@ -54,7 +54,7 @@ def timing_of(start: str, fps: float | None) -> Timing:
             moment = moment.replace(tzinfo=datetime.UTC)
         start_s = moment.timestamp()
     if not 0.0 <= start_s <= MAX_TIMESTAMP_S:
-        raise MisuseError(f"--start {start}: not from 1970 on")
+        raise MisuseError(f"--start {start}: give a time from 1970 on")
     return Timing(start_s, fps)
 
 

@@ -49,7 +49,9 @@ def metrics_of(address: tuple[str, int], detection: Detection) -> Iterator[None]
         counters = as_document(report)
         waiting = counters.pop("waiting")
         found = [
-            MetricValue(f"mapfold_detect_{name}", f"As `detect --json` has {name}.", number, True)
+            MetricValue(
+                f"mapfold_detect_{name}", f"As {name} of `mapfold detect --json`.", number, True
+            )
             for name, number in counters.items()
             if type(number) is int
         ]
@@ -100,7 +102,7 @@ def summary(run_id: str, report: Report, where: str) -> str:
         f"{counts.unreadable:,} unreadable" if counts.unreadable else "",
         f"{report.dropped:,} dropped for newer pictures" if report.dropped else "",
         f"{counted(report.too_large, 'picture')} too large" if report.too_large else "",
-        f"{counted(report.bad_poses, 'message')} that are no pose" if report.bad_poses else "",
+        f"{counted(report.bad_poses, 'message')} that are not poses" if report.bad_poses else "",
         f"{counts.not_finite:,} boxes of NaN" if counts.not_finite else "",
         f"{counts.too_small:,} boxes of no size" if counts.too_small else "",
         f"{counts.cut:,} boxes too many" if counts.cut else "",
@@ -121,7 +123,7 @@ def advice(report: Report, live: LivePictures | None, *, posed: bool, spool: Pat
     if posed and counts.keyframes and counts.without_pose == counts.keyframes:
         yield (
             f"no keyframe has a pose: none was known within {NEAR_S * 1000:.0f} ms of its picture;"
-            " do both use the same clock?"
+            " check that both use the same clock"
         )
     if live is not None and live.poses is not None and live.poses.bad_reason is not None:
         yield visible(f"the last message that is no pose: {live.poses.bad_reason}")

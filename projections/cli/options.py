@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 NoCacheOption = Annotated[
     bool,
-    typer.Option("--no-cache", help="Neither read nor keep the history beside the log."),
+    typer.Option("--no-cache", help="Do not use the cached history beside the log, nor write it."),
 ]
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
 

@@ -156,7 +156,7 @@ def ui(
             say(f"warning: others can reach {host}; anybody with the link below can read the log")
         say(f"showing {log} at {url}")
         if name != host:
-            say(f"on another machine write an address of this one there, not {name}")
+            say(f"from another machine, put an address of this one in the link instead of {name}")
         say("Ctrl-C ends it")
         if open_:
             webbrowser.open(url)

@@ -129,7 +129,9 @@ def _same_place(facts: Facts, a: str, b: str) -> bool:
 _KF, _PLACE, _OBJECT = Names.KEYFRAME, Names.PLACE, Names.OBJECT
 
 _ALL = (
-    Function("place_count", (), Type.NUMBER, lambda f: f.place_count(), "places that stand"),
+    Function(
+        "place_count", (), Type.NUMBER, lambda f: f.place_count(), "places, without absorbed ones"
+    ),
     Function(
         "noise_count", (), Type.NUMBER, lambda f: f.noise_count(), "posed keyframes in no place"
     ),
@@ -179,7 +181,7 @@ _ALL = (
         (_PLACE, _PLACE),
         Type.NUMBER,
         lambda f, a, b: f.transitions(a, b),
-        "drives between two places",
+        "shared transitions of two places",
     ),
     Function(
         "merged",
@@ -189,20 +191,20 @@ _ALL = (
         "a place was absorbed",
         rises=True,
     ),
-    Function("name", (_PLACE,), Type.TEXT, lambda f, p: f.name(p), "what a place is called"),
+    Function("name", (_PLACE,), Type.TEXT, lambda f, p: f.name(p), "the name of a place"),
     Function(
         "named",
         (Names.NAME,),
         Type.BOOLEAN,
         lambda f, n: f.place_called(n) is not None,
-        "a place is called so",
+        "a place has this name",
     ),
     Function(
         "place_called",
         (Names.NAME,),
         Type.TEXT,
         lambda f, n: f.place_called(n),
-        "the place that is called so",
+        "the place of this name",
     ),
     Function(
         "refused_count",

@@ -296,7 +296,7 @@ def test_a_picture_of_8k(stage: Stage, tmp_path: Path) -> None:
     [
         (("--images", "none"), "no such folder or video"),
         (("--images", "empty"), "no .jpg, .jpeg or .png in this folder"),
-        ((), "where are the pictures?"),
+        ((), "give either --images or --zenoh-image"),
         (("--images", "camera", "--zenoh-image", "k"), "give one of --images and --zenoh-image"),
         (("--images", "camera", "--head", "resnet"), "choose one of yolov8"),
         (("--images", "camera", "--device", "tpu"), "choose cpu or cuda"),
@@ -363,7 +363,7 @@ def test_poses_that_are_none_are_counted(
     assert detect.end(signal.SIGINT) == 3
     said = json.loads(detect.output())
     assert (said["bad_poses"], said["unreadable"], said["keyframes"]) == (2, 1, 0)
-    assert "2 messages that are no pose" in detect.lines[-2]
+    assert "2 messages that are not poses" in detect.lines[-2]
     assert "without the numbers x, y and yaw" in detect.lines[-1]
 
 

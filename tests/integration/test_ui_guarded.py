@@ -154,7 +154,7 @@ class TestOffLoopback:
     def test_everything_needs_the_token(self, exposed: UiServer) -> None:
         assert exposed.said[0].startswith("warning: others can reach 0.0.0.0")
         assert exposed.host == "127.0.0.1"  # no browser need know what 0.0.0.0 is
-        assert exposed.said[2].startswith("on another machine write an address of this one")
+        assert exposed.said[2].startswith("from another machine, put an address of this one")
         for path in ("/", "/index.html", "/api/log", "/api/live", "/openapi.json", "/nothing"):
             for wrong in ("", "?token=", "?token=wrong", f"?token={str(exposed.token)[:-1]}"):
                 got = exposed.ask(path + wrong)
