@@ -133,14 +133,6 @@ def module_database(pg_server: EmbeddedServer, _template: str) -> Iterator[Targe
 
 
 @pytest.fixture
-def copied_database(pg_server: EmbeddedServer, module_database: Targets) -> Iterator[Targets]:
-    """A copy of ``module_database`` as it is by now, for a test that writes; no rebuild needed."""
-    name = _fresh_database(pg_server, urlsplit(module_database.graph_url).path[1:])
-    yield Targets(pg_server.url_of(name), pg_server.url_of(name))
-    _drop_database(pg_server, name)
-
-
-@pytest.fixture
 def bare_pg_url(pg_server: EmbeddedServer) -> Iterator[str]:
     """URL of a database without our extensions."""
     name = _fresh_database(pg_server, "template0")

@@ -1,8 +1,6 @@
 """`db check` finds every kind of damage, names it, and `--repair` undoes it."""
 
-import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import psycopg
@@ -24,35 +22,9 @@ from tests.thorough import every_other, mostly_slow
 SETTINGS = Settings()
 
 
-def log_in(folder: Path) -> Path:
-    return write_log(folder / "log", walk(80) + list(bridge()) + walk(20, first=80, seed=4))
-
-
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    return log_in(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def _rebuilt_log(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Path:
-    found = log_in(tmp_path_factory.mktemp("rebuilt"))
-    rebuild(found, module_database, SETTINGS)
-    return found
-
-
-@pytest.fixture
-def rebuilt_log(_rebuilt_log: Path, tmp_path: Path) -> Path:
-    """A copy of the log that ``copied_database`` was made from."""
-    return shutil.copytree(_rebuilt_log, tmp_path / "log")
-
-
-@pytest.fixture
-def rebuilt_pg(copied_database: Targets) -> Iterator[psycopg.Connection]:
-    """An autocommit connection to ``copied_database``, as a psql user would have it."""
-    with psycopg.connect(copied_database.graph_url, autocommit=True) as connection:
-        connection.execute("LOAD 'age'")
-        connection.execute('SET search_path = ag_catalog, "$user", public')
-        yield connection
+    return write_log(tmp_path / "log", walk(80) + list(bridge()) + walk(20, first=80, seed=4))
 
 
 def test_a_sound_projection(log: Path, two_databases: Targets) -> None:
@@ -125,24 +97,19 @@ DAMAGE = {
 
 
 def test_every_kind_of_damage_is_named_and_repaired(
-    rebuilt_log: Path, copied_database: Targets, rebuilt_pg: psycopg.Connection
+    log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
+    rebuild(log, one_database, SETTINGS)
     for damage in every_other(DAMAGE):
         statement, expected = DAMAGE[damage]
-        assert rebuilt_pg.execute(statement).rowcount == 1, damage  # type: ignore[arg-type]
-        reports = check(rebuilt_log, copied_database, SETTINGS)
+        assert pg.execute(statement).rowcount == 1, damage  # type: ignore[arg-type]
+        reports = check(log, one_database, SETTINGS)
         found = [(d.table, d.kind) for report in reports for d in report.differences]
         assert found == expected, damage
         for report in reports:
             if report.differing:
-                rebuild(
-                    rebuilt_log,
-                    copied_database,
-                    SETTINGS,
-                    until=report.next_offset,
-                    only=report.sink,
-                )
-    assert [r.differing for r in check(rebuilt_log, copied_database, SETTINGS)] == [0, 0]
+                rebuild(log, one_database, SETTINGS, until=report.next_offset, only=report.sink)
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
 def test_a_count_on_an_edge(tmp_path: Path, one_database: Targets, pg: psycopg.Connection) -> None:
@@ -160,10 +127,11 @@ def test_a_count_on_an_edge(tmp_path: Path, one_database: Targets, pg: psycopg.C
 
 
 def test_all_differences_are_counted_though_not_all_are_named(
-    rebuilt_log: Path, copied_database: Targets, rebuilt_pg: psycopg.Connection
+    log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
-    gone = rebuilt_pg.execute('DELETE FROM semantic_map."HAS_KEYFRAME"').rowcount
-    (graph,) = check(rebuilt_log, copied_database, SETTINGS, only="graph")
+    rebuild(log, one_database, SETTINGS)
+    gone = pg.execute('DELETE FROM semantic_map."HAS_KEYFRAME"').rowcount
+    (graph,) = check(log, one_database, SETTINGS, only="graph")
     assert graph.differing == gone > NAMED
     assert len(graph.differences) == NAMED
 
@@ -194,41 +162,43 @@ DROPS = {
 
 @pytest.mark.parametrize("sink", mostly_slow(DROPS))
 def test_dropped_tables_are_reported_and_not_written_to(
-    rebuilt_log: Path, copied_database: Targets, rebuilt_pg: psycopg.Connection, sink: str
+    log: Path, one_database: Targets, pg: psycopg.Connection, sink: str
 ) -> None:
-    rebuilt_pg.execute(DROPS[sink])  # type: ignore[arg-type]
-    found = {s.sink: s for s in projection_status(rebuilt_log, copied_database, SETTINGS).sinks}
+    rebuild(log, one_database, SETTINGS)
+    pg.execute(DROPS[sink])  # type: ignore[arg-type]
+    found = {s.sink: s for s in projection_status(log, one_database, SETTINGS).sinks}
     assert found[sink].condition == "missing"
     assert "mapfold replay" in str(found[sink].note)
-    write_log(rebuilt_log, walk(5, first=100))
+    write_log(log, walk(5, first=100))
     message = f"the checkpoint of the {sink} has 120 events, but .* dropped; .* mapfold replay"
     for act in (
-        lambda: check(rebuilt_log, copied_database, SETTINGS),
-        lambda: tail(rebuilt_log, copied_database, SETTINGS, once=True),
+        lambda: check(log, one_database, SETTINGS),
+        lambda: tail(log, one_database, SETTINGS, once=True),
     ):
         with pytest.raises(ProjectionMissing, match=message):
             act()
-    rebuild(rebuilt_log, copied_database, SETTINGS)
-    assert [r.differing for r in check(rebuilt_log, copied_database, SETTINGS)] == [0, 0]
+    rebuild(log, one_database, SETTINGS)
+    assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
 @pytest.mark.parametrize("sink", mostly_slow(DROPS))
 def test_a_rebuild_beside_a_check_makes_no_difference(
-    rebuilt_log: Path, copied_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
+    log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:
     """To the check's snapshot the tables of such a rebuild would be empty."""
     monkeypatch.setattr(sys.modules["projections.database.shadows"], "LOCK_TIMEOUT_S", 0.3)
+    rebuild(log, one_database, SETTINGS)
     load = checkpoints.load
 
     def rebuild_meanwhile(connection: Connection, sink: SinkName) -> Checkpoint | None:
         found = load(connection, sink)
         monkeypatch.setattr(checkpoints, "load", load)
         with pytest.raises(DatabaseError, match="readers kept the map locked"):
-            rebuild(rebuilt_log, copied_database, SETTINGS)
+            rebuild(log, one_database, SETTINGS)
         return found
 
     monkeypatch.setattr(checkpoints, "load", rebuild_meanwhile)
-    assert [r.differing for r in check(rebuilt_log, copied_database, SETTINGS, only=sink)] == [0]
+    assert [r.differing for r in check(log, one_database, SETTINGS, only=sink)] == [0]
 
 
 def door(pg: psycopg.Connection) -> None:
@@ -254,20 +224,21 @@ FOREIGN = {
 
 
 def test_foreign_tables_are_found_and_copied_and_removed_by_the_sql_given(
-    rebuilt_log: Path, copied_database: Targets, rebuilt_pg: psycopg.Connection
+    log: Path, one_database: Targets, pg: psycopg.Connection
 ) -> None:
-    door(rebuilt_pg)
-    graph, vectors = check(rebuilt_log, copied_database, SETTINGS)
+    rebuild(log, one_database, SETTINGS)
+    door(pg)
+    graph, vectors = check(log, one_database, SETTINGS)
     assert {t.table: (t.what, t.rows) for t in graph.foreign} == FOREIGN
     assert (graph.differing, graph.sound, vectors.sound) == (0, False, True)
-    with psycopg.connect(copied_database.graph_url) as anyone:
+    with psycopg.connect(one_database.graph_url) as anyone:
         for table in graph.foreign:
             anyone.execute(table.keep)  # type: ignore[arg-type]
             anyone.execute(table.remove)  # type: ignore[arg-type]
-    assert all(report.sound for report in check(rebuilt_log, copied_database, SETTINGS))
+    assert all(report.sound for report in check(log, one_database, SETTINGS))
     for table in FOREIGN:
         count = sql.SQL("SELECT count(*) FROM {}").format(sql.Identifier("public", table))
-        assert rebuilt_pg.execute(count).fetchone() == (FOREIGN[table][1],)
+        assert pg.execute(count).fetchone() == (FOREIGN[table][1],)
 
 
 @pytest.mark.slow
