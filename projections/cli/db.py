@@ -141,7 +141,8 @@ def retry_command(
         emit({"sinks": [asdict(r) for r in reports]})
     for report in () if as_json else reports:
         done = "rebuilt" if report.rebuilt else f"{len(report.still)} still cannot be folded"
-        display(f"{report.sink}: {report.parked} parked, {done}")
+        found = f"{report.parked} parked, {done}" if report.parked else "no event is parked"
+        display(f"{report.sink}: {found}")
         for letter in report.still:
             display(f"  offset {letter.offset:,}: {letter.reason}")
     finish(findings=any(report.still for report in reports))

@@ -54,7 +54,7 @@ KnownAtOption = Annotated[
     typer.Option(
         "--known-at",
         metavar="V",
-        help="Under the commands recorded before here [default: where the map ends].",
+        help="Apply only the commands recorded before here [default: the end of the map].",
     ),
 ]
 
@@ -71,7 +71,7 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
-        help="Change one setting of the fold: eps_m=1.0, camera.hfov_deg=90.",
+        help="Change a setting of the fold, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
     ),
 ]
 SettingsOption = Annotated[
@@ -138,7 +138,7 @@ def past_settings(
 def say_defaults(settings: Settings) -> None:
     """Print, after a fold with default settings, that the live map may have others."""
     if settings == Settings():
-        say("folded with the default settings; a live map made with others needs its --set here")
+        say("folded with the default settings; if the live map has others, give them by --set")
 
 
 # Databases

@@ -228,7 +228,8 @@ def diff(
         typer.Option(
             "--known-at",
             metavar="V",
-            help="Both maps under the commands before here [default: each under those before it].",
+            help="Apply only the commands recorded before here, to both maps [default: to each map"
+            " those before its end].",
         ),
     ] = None,
     json_: JsonOption = False,

@@ -90,6 +90,8 @@ def test_check_and_repair(own_server: Commands, log: Path) -> None:
     assert "db check --repair" in found.err
     assert "rebuilt" in own_server("db", "check", log, "--repair", code=3).err
     own_server("db", "check", log)
+    none = "graph: no event is parked\nvectors: no event is parked\n"
+    assert own_server("db", "retry", log).out == none
     own_server("db", "stop")
     assert not server(own_server).running
 
