@@ -47,7 +47,7 @@ from .detect_checks import (
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
 from .options import (
     ConfigOption,
-    ConnectOption,
+    ConnectBesideListenOption,
     JsonOption,
     ListenOption,
     PublishKeyOption,
@@ -285,7 +285,7 @@ def detect(
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
     ] = None,
     json_: JsonOption = False,
-    connect: ConnectOption = None,
+    connect: ConnectBesideListenOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
 ) -> None:

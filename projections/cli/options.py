@@ -183,6 +183,16 @@ ConnectOption = Annotated[
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
+ConnectBesideListenOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--connect",
+        metavar="ENDPOINT",
+        help="Router or peer to connect to; may be repeated."
+        f" [default: {DEFAULT_ENDPOINT}; none with --listen]",
+        rich_help_panel=_ZENOH_PANEL,
+    ),
+]
 ListenOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -50,7 +50,13 @@ from .bridged import (
     say_topics,
     warn_of_silence,
 )
-from .options import ConfigOption, ConnectOption, JsonOption, ListenOption, zenoh_options
+from .options import (
+    ConfigOption,
+    ConnectBesideListenOption,
+    JsonOption,
+    ListenOption,
+    zenoh_options,
+)
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
 from .terminal import say, say_metrics
@@ -64,7 +70,7 @@ def record(
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
     ],
-    connect: ConnectOption = None,
+    connect: ConnectBesideListenOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
     key: Annotated[
@@ -245,7 +251,14 @@ def _metrics(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> 
 
 
 def router(
-    listen: ListenOption = None, connect: ConnectOption = None, zenoh_config: ConfigOption = None
+    listen: ListenOption = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect", metavar="ENDPOINT", help="Router to connect to; may be repeated."
+        ),
+    ] = None,
+    zenoh_config: ConfigOption = None,
 ) -> None:
     """Run a Zenoh router in this process until Ctrl-C.
 

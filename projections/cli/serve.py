@@ -22,7 +22,7 @@ from projections.serve.answering import DEFAULT_MAX_BYTES
 
 from .options import (
     ConfigOption,
-    ConnectOption,
+    ConnectBesideListenOption,
     DbOption,
     HfovOption,
     ImageOption,
@@ -177,7 +177,7 @@ def serve(
         ),
     ] = None,
     zenoh: Annotated[bool, typer.Option(help="Answer over Zenoh.")] = True,
-    connect: ConnectOption = None,
+    connect: ConnectBesideListenOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
     workers: Annotated[

@@ -35,9 +35,9 @@ def completion(
     """Print a script that completes commands and options in a shell.
 
     \b
-    bash   eval "$(mapfold completion bash)"       in ~/.bashrc
-    zsh    eval "$(mapfold completion zsh)"        in ~/.zshrc, after compinit
-    fish   mapfold completion fish | source        in ~/.config/fish/config.fish
+        bash   eval "$(mapfold completion bash)"       in ~/.bashrc
+        zsh    eval "$(mapfold completion zsh)"        in ~/.zshrc, after compinit
+        fish   mapfold completion fish | source        in ~/.config/fish/config.fish
     """
     from typer._completion_shared import get_completion_script
 

@@ -22,7 +22,7 @@ from eventsrc.transport.session import ZenohOptions, check_keys, open_session
 
 from .options import (
     ConfigOption,
-    ConnectOption,
+    ConnectBesideListenOption,
     JsonOption,
     ListenOption,
     PublishKeyOption,
@@ -88,7 +88,7 @@ def simulate(
         float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
     ] = 30.0,
     json_: JsonOption = False,
-    connect: ConnectOption = None,
+    connect: ConnectBesideListenOption = None,
     listen: ListenOption = None,
     zenoh_config: ConfigOption = None,
 ) -> None:

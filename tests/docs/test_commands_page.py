@@ -10,6 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from eventsrc.transport.config import DEFAULT_ENDPOINT
 from projections.cli import command_line
 from tests.docs.commands_page import MAN_PAGE, PAGE, commands, man_page, page
 
@@ -44,6 +45,26 @@ def test_values_have_a_name_of_their_own(by_name: dict[str, Any]) -> None:
 def test_the_pages_have_the_defaults() -> None:
     assert "| `--seed N` | Which simulated house. [default: 7] |" in PAGE.read_text("utf-8")
     assert "Which simulated house. [default: 7]" in MAN_PAGE.read_text("utf-8")
+
+
+def test_the_default_of_connect_is_that_of_the_command(by_name: dict[str, Any]) -> None:
+    """A router connects to nothing by default, and neither does a program that listens."""
+    for name, command in by_name.items():
+        helps = {option.name: option.help for option in command.params}
+        if "connect" not in helps:
+            continue
+        if name == "mapfold router":
+            assert "default" not in helps["connect"]
+        else:
+            assert DEFAULT_ENDPOINT in helps["connect"]
+            assert ("none with --listen" in helps["connect"]) == ("listen" in helps), name
+
+
+def test_tables_in_help_are_code_in_the_page() -> None:
+    """Without the indent their lines run together in the page."""
+    said = page()
+    assert '\n    bash   eval "$(mapfold completion bash)" ' in said
+    assert "\n    place_count() " in said
 
 
 @pytest.mark.parametrize("path", ["", "log", "db", "query", "edit"])
