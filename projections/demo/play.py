@@ -161,7 +161,7 @@ def _next_commands(
     if merge is not None:
         before_and_behind = merge.offset, merge.offset + 1
         yield f"   {command_line('diff', log, *before_and_behind, *settings)}    # that merge"
-        yield f"   {command_line('merges', log, *settings)}"
+        yield f"   {command_line('merges', log, *settings, '--refused')}    # undone since"
     yield f"   {command_line('edits', log, *settings)}"
     yield f"   {command_line('relocalize', folder.question(1))}"
     yield f"   {command_line('status', log, *settings)}"

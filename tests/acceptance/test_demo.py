@@ -182,6 +182,7 @@ def test_the_commands_it_ends_with_work_as_printed(played: Played, tmp_path: Pat
         timeout=_DEADLINE_S,
     )
     assert done.returncode == 0, done.stderr
+    assert "undo-merge demo-undo-merge" in done.stdout  # not "no merges", as it is undone
     for asked in played.numbers["relocalize"]["questions"][:1]:
         assert asked["places"][0]["place_id"] in done.stdout
     assert page[:2] == ["mapfold", "ui"]
