@@ -267,14 +267,14 @@ def _advice(error: psycopg.Error, url: str) -> str:
             "the server no longer finds that file: was the extension removed, or a folder above it"
             " closed to the server's user?" + (f" Its log: {log}" if log is not None else "")
         )
-    if log is not None:
-        return f"the embedded server went away; its log: {log}"
     if "password" in text or "authentication" in text or "pg_hba" in text:
         return "check user and password in the URL"
     if "does not exist" in text and "database" in text:
         return "create it with createdb, or name another in the URL"
     if "does not exist" in text and "role" in text:
         return "create it with createuser, or name another in the URL"
+    if log is not None:
+        return f"the embedded server went away; its log: {log}"
     return "start the server or check the URL, or omit --db for the embedded server"
 
 

@@ -116,6 +116,14 @@ def test_a_missing_database(pg_server: EmbeddedServer) -> None:
         connect(pg_server.url_of("nowhere"))
 
 
+def test_a_missing_database_of_the_embedded_server(
+    pg_server: EmbeddedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAPFOLD_HOME", str(pg_server.data.parent))
+    with pytest.raises(DatabaseUnavailable, match=r'"nowhere" does not exist; create it with'):
+        connect(pg_server.url_of("nowhere"))
+
+
 def test_a_missing_user(pg_server: EmbeddedServer) -> None:
     url = pg_server.url.replace("postgres@", "stranger@")
     with pytest.raises(DatabaseUnavailable, match=r"stranger.*does not exist; create it with"):
