@@ -173,6 +173,11 @@ def import_(
     for bag in report.bags:
         for line in bag_lines(bag):
             say(line)
+    if not report.bags and bags != BagOptions():
+        say(
+            "no bag of ROS 2 among the files: --detections and the other options for bags are not"
+            " used"
+        )
     say(_summary(log, report))
     for line in _passed_over(report):
         say(line)
