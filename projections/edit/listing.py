@@ -98,7 +98,7 @@ def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
                 iso_time(times[offset] / 1e9),
                 visible(command.issued_by),
                 f"{command.kind} {visible(what(command))}",
-                "not worked out" if effect is None else str(effect),
+                "not computed" if effect is None else str(effect),
                 visible(command.command_id),
                 state,
                 visible(command.reason),
@@ -107,7 +107,7 @@ def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
     header = ("offset", "time", "by", "command", "changed", "command id", "undone", "reason")
     text = table(header, rows, right={"offset"})
     if any(effect is None for _, effect in found):
-        text += "--effects works out what the others changed\n"
+        text += "--effects computes what these commands changed\n"
     return text
 
 

@@ -347,7 +347,7 @@ def test_effects_that_are_not_known_are_worked_out_when_asked(mapfold: Commands)
     for damage in damages[:: stride(3)]:
         cache.unlink() if damage is None else cache.write_bytes(damage)
         assert [e["effect"] for e in mapfold("edits", "log", "--json").json] == [None] * 3
-    assert "not worked out" in mapfold("edits", "log").out
+    assert "not computed" in mapfold("edits", "log").out
     assert mapfold("edits", "log", "--json", "--effects").json == known
     assert mapfold("edits", "log", "--json").json == known
     other = mapfold("edits", "log", "--json", "--set", "eps_m=1.0").json
