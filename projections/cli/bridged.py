@@ -177,7 +177,7 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
 def recording_of(
     choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
 ) -> tuple[RosRecording, tuple[str, ...]]:
-    """The recipe for envelopes, and all topics that are kept."""
+    """The topics and settings from which envelopes are made, and all topics that are kept."""
 
     def full(topic: str, option: str) -> str:
         return topic_of(choice.namespace, topic, option)

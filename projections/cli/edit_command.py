@@ -109,9 +109,9 @@ def kind_of(
 ) -> Callable[[Callable[..., MakeCommand]], Callable[..., MakeCommand]]:
     """Add a subcommand to ``app``.
 
-    The function takes the arguments of the kind and returns the maker of the command; the options
-    that all kinds share are added. Without ``settings`` the options ``--set`` and ``--settings``
-    are those of the function.
+    The function takes the arguments of the kind and returns the function that makes the command;
+    the options that all kinds share are added. Without ``settings`` the options ``--set`` and
+    ``--settings`` are those of the function.
     """
     shared = {
         key: value

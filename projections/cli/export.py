@@ -164,7 +164,7 @@ def export(
     say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
 
 
-def _recorder(name: str, told_apart_by: str) -> Callable[[RecordedFold, Path], int]:
+def _recorder(name: str, identity: str) -> Callable[[RecordedFold, Path], int]:
     """The function that writes the recordings of an option. Raises MisuseError if its extra is not
     installed."""
     try:
@@ -177,7 +177,7 @@ def _recorder(name: str, told_apart_by: str) -> Callable[[RecordedFold, Path], i
         raise MisuseError(
             f"--{name} needs {error.name}, which is not installed; pip install 'mapfold[{name}]'"
         ) from None
-    recording_id = hashlib.sha256(told_apart_by.encode()).hexdigest()[:32]
+    recording_id = hashlib.sha256(identity.encode()).hexdigest()[:32]
     return partial(recording.write_recording, recording_id=recording_id)
 
 

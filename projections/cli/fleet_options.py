@@ -78,7 +78,7 @@ QuestionJobsOption = Annotated[int | None, _jobs_option("twice the number of cor
 
 
 def sites_of(place: Path) -> list[Site]:
-    """The sites of DIR or LIST; says which subfolders are left out."""
+    """The sites of DIR or LIST; prints which subfolders are left out."""
     return find_sites(place, say)
 
 

@@ -100,7 +100,8 @@ def settings_from(
 def settings_of(
     file: Path | None, assignments: list[str] | None
 ) -> Callable[[Corrections], Settings]:
-    """`settings_from` as a function of corrections, for later. Raises SettingsError at once."""
+    """`settings_from` as a function of the corrections, which are read later. Raises SettingsError
+    for invalid options at once."""
     settings_from(file, assignments)
     return partial(settings_from, file, assignments)
 

@@ -285,7 +285,7 @@ def refuse_unknown_classes(
             names = sorted(class_names())
             near = get_close_matches(crop.class_name or "", names, 3, 0.5)
             there = (
-                f"the nearest are {', '.join(near)}"
+                f"similar ones: {', '.join(near)}"
                 if near
                 else f"there are {', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''}"
                 if names

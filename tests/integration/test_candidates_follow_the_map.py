@@ -160,7 +160,7 @@ class TestClasses:
         ("name", "said"),
         mostly_slow(
             [
-                ("lmap", "no object of class 'lmap'; the nearest are lamp"),
+                ("lmap", "no object of class 'lmap'; similar ones: lamp"),
                 ('x" } --', r"there are .*chair, .*"),
                 ("☕", r"there are .*chair, .*"),
             ]

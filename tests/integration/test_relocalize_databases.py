@@ -232,7 +232,7 @@ class TestCommand:
         file.write_text(json.dumps([{"class": first}, {"class": second}]))
         assert mapfold(*asked, file).json == said
         refused = mapfold("relocalize", "--log", log, "--class", "bakers rack", code=2)
-        assert "the nearest are baker's rack" in refused.err
+        assert "similar ones: baker's rack" in refused.err
 
     def test_a_question_of_several_views(
         self, mapfold: Commands, log: Path, tmp_path: Path

@@ -70,7 +70,7 @@ def test_a_session_is_tracked(connected: Callable[[], Session], walked_map: Targ
 def test_an_unknown_class_is_named_with_the_nearest(connected: Callable[[], Session]) -> None:
     good, answer = ask(connected(), "mapfold/relocalize", b'[{"class": "baker rack"}]')
     assert not good
-    assert "no object of class 'baker rack'; the nearest are baker's rack" in str(answer)
+    assert "no object of class 'baker rack'; similar ones: baker's rack" in str(answer)
 
 
 @pytest.mark.usefixtures("service")
