@@ -67,6 +67,9 @@ SETTINGS: Final[Mapping[str, str]] = {
 }
 
 
+_POINTERS_TO_LOG: Final = ("pg_ctl: could not start server", "Examine the log output.")
+
+
 @dataclass(frozen=True, slots=True)
 class Cluster:
     """A data folder and the programs that serve it. Call `create` before `start`."""
@@ -201,14 +204,14 @@ def _remove_stale_locks(*locks: Path) -> None:
 
 @contextlib.contextmanager
 def _server_errors(what: str, data: Path) -> Iterator[None]:
-    """Turn failures into one EmbeddedServerError that quotes the server's log."""
+    """Turn failures into one EmbeddedServerError that quotes the program and the server's log."""
     advice = "or give a database of your own with --db"
     try:
         yield
     except subprocess.CalledProcessError as error:
         log = data / LOG_NAME
-        reason = _last_lines(log.read_text("utf-8", "replace")) if log.exists() else ""
-        reason = reason or _last_lines(str(error.output))
+        logged = log.read_text("utf-8", "replace") if log.exists() else ""
+        reason = " / ".join([*_last_lines(str(error.output)), *_last_lines(logged)])
         raise EmbeddedServerError(
             f"{data}: the embedded server did not {what}: {reason} (log: {log}); fix it, {advice}"
         ) from None
@@ -218,9 +221,10 @@ def _server_errors(what: str, data: Path) -> Iterator[None]:
         ) from None
 
 
-def _last_lines(text: str) -> str:
-    """The last three lines in one; the reason stands before the FATAL line."""
-    return " / ".join([line.strip() for line in text.splitlines() if line.strip()][-3:])
+def _last_lines(text: str) -> list[str]:
+    """The last three lines that say something; the reason stands before the FATAL line."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line for line in lines if line and line not in _POINTERS_TO_LOG][-3:]
 
 
 def _shell_quoted(value: str) -> str:

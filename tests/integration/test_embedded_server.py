@@ -165,6 +165,19 @@ def test_a_server_that_cannot_start_quotes_its_log(home: Path) -> None:
     assert not server.running
 
 
+def test_a_server_that_cannot_be_stopped_quotes_the_program_that_tried(home: Path) -> None:
+    server = EmbeddedServer(home).start()
+    process_id = server.data / "postmaster.pid"
+    right = process_id.read_bytes()
+    process_id.write_bytes(b"no number\n")
+    with pytest.raises(
+        EmbeddedServerError, match=r"did not stop: pg_ctl: invalid data in PID file"
+    ):
+        server.stop()
+    process_id.write_bytes(right)
+    assert not server.stop()
+
+
 def test_a_home_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(EmbeddedServerError, match="MAPFOLD_HOME"):
