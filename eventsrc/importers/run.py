@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple
 
 from eventsrc.append import Checked, NewMap, check_payloads, checked_event, rejected_event
 from eventsrc.envelope import Offset, RunId, has_keyframe_id
-from eventsrc.errors import MisuseError
+from eventsrc.errors import MisuseError, NotALog
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
@@ -346,7 +346,12 @@ def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -
     """Open the source ``name``: a folder is a bag of ROS 2 or a log, ``-`` is standard input, a
     file is JSON lines, MCAP or part of a bag. Raises MisuseError."""
     if name != STDIN and Path(name).is_dir():
-        return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
+        if is_bag(Path(name)):
+            return RosBag(Path(name), files, bags)
+        try:
+            return OtherLog(Path(name))
+        except NotALog as error:
+            raise MisuseError(f"{name}: no bag of ROS 2 and no log: {error}") from None
     if Path(name).name == METADATA:
         raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
     try:

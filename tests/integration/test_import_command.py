@@ -35,6 +35,16 @@ def test_plain_gzip_and_standard_input_give_the_same_log(run: Commands) -> None:
         assert payloads_of(run, name) == PAYLOADS
 
 
+def test_a_folder_without_a_bag_and_without_a_log_is_refused(run: Commands) -> None:
+    (run.folder / "pictures").mkdir()
+    said = run("import", "a", "pictures", code=2)
+    assert said.err == (
+        "mapfold: pictures: no bag of ROS 2 and no log: pictures holds no log segment (….mcap);"
+        " check the path\n"
+    )
+    assert not (run.folder / "a").exists()
+
+
 def test_a_log_and_its_segments_import_into_the_same_events(run: Commands) -> None:
     said = run("import", "a", "-", stdin=b"\n".join([*PAYLOADS, b"junk"]), code=3)
     assert said.err.strip().endswith("`mapfold log cat a --key mapfold/rejected` shows them")
