@@ -6,23 +6,23 @@ from typing import Any
 from eventsrc.envelope import Offset
 from projections.history import Timeline
 from projections.history.diff import difference_of, rows_of
-from projections.history.history import History
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document
-from projections.history.past_view import view_at
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.fold import fold_events
 from projections.model.space_vectors import new_map
 from projections.model.view import MapView
+from tests.memory_history import MemoryHistory
+from tests.past_view import view_at
 
 
-class MemoryHistory(KnownHistory):
+class KnownInMemory(KnownHistory):
     """A `KnownHistory` that folds the log into records in memory: no tables, no cache."""
 
     def __init__(self, known: KnownHistory) -> None:
         super().__init__(known.reader, known.settings, known.corrections, cache=False)
-        self._records = History(known.settings, known.corrections)
+        self._records = MemoryHistory(known.settings, known.corrections)
         self._view = MapView(known.settings, keep_embeddings=False, corrections=known.corrections)
         semantic_map = new_map(known.reader, known.settings, known.corrections)
         for folded in fold_events(known.reader.read(), semantic_map):
@@ -114,5 +114,5 @@ def told(timeline: Timeline, ends: Iterable[int]) -> dict[str, Any]:
 
 def expected(timeline: Timeline, ends: Iterable[int]) -> dict[str, Any]:
     """The same from memory."""
-    known = MemoryHistory(timeline.knowing())
+    known = KnownInMemory(timeline.knowing())
     return {"maps": maps(known, ends), **stories(known)}

@@ -10,6 +10,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from foxglove import Capability, Context, layouts, start_server
@@ -28,8 +29,11 @@ from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.corrections import Corrections
 from projections.deltas import PlacesMerged
-from projections.history.history import History
-from projections.history.past_view import view_at
+from projections.history.column_rows import TableWriter
+from projections.history.history_recorder import map_at
+from projections.history.stored_history import StoredHistory
+from projections.history.stored_view import StoredView
+from projections.history.tables import Tables
 from projections.model.change_lines import change_lines
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, fold_events, gc_paused
@@ -97,7 +101,8 @@ and does not report when; a client clears its display at that answer."""
 
 class PastMaps:
     """Every past map of a log's first ``end`` events under ``corrections``, from one fold, which
-    raises FoldError at an event that cannot be folded."""
+    raises FoldError at an event that cannot be folded. ``floors`` are those that the log's
+    occupancy maps name."""
 
     def __init__(
         self,
@@ -111,22 +116,21 @@ class PastMaps:
         self.moments = Moments(reader.read(FIRST_OFFSET, end))
         self._lines: list[tuple[Offset, str]] = []
         self._merges: list[PlacesMerged] = []
-        self._history = History(settings, corrections)
-        self._latest = MapView(settings, keep_embeddings=False, corrections=corrections)
+        tables = Tables()
+        writer = TableWriter(tables)
+        view = MapView(settings, keep_embeddings=False, corrections=corrections)
         semantic_map = new_map(reader, settings, corrections)
         events = reader.read(FIRST_OFFSET, end)
         with gc_paused():
             for offset, deltas in fold_events(events, semantic_map, ahead=READ_AHEAD):
-                self._latest.apply_event(offset, deltas)
-                self._history.apply(offset, deltas)
-                self._lines += ((offset, line) for line in change_lines(self._latest, deltas))
+                view.apply_event(offset, deltas)
+                writer.add(offset, deltas)
+                self._lines += ((offset, line) for line in change_lines(view, deltas))
                 self._merges += (delta for delta in deltas if isinstance(delta, PlacesMerged))
                 progress(offset, end)
-
-    @property
-    def floors(self) -> list[str | None]:
-        """The floors that the log's occupancy maps name."""
-        return list(self._latest.maps)
+        writer.flush()
+        self.floors = list(view.maps)
+        self._history = StoredHistory(settings, corrections, tables, partial(map_at, reader))
 
     def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:
         """The changes of the events from ``start`` to before ``end``: offset and line of each."""
@@ -139,7 +143,7 @@ class PastMaps:
         """The map after ``end`` events, and its merges of places."""
         merges = self._merges[: bisect_left(self._merges, end, key=lambda merge: merge.offset)]
         with gc_paused():
-            return view_at(self._history, self._latest, end), merges
+            return StoredView(self._history, end), merges
 
 
 class Playback(ServerListener):

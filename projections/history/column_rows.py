@@ -1,4 +1,4 @@
-"""Deltas as rows of columns, and the stripes that they fill while events are folded."""
+"""Deltas as rows of a history's tables, added while events are folded."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +34,9 @@ from projections.deltas import (
     RunSeen,
 )
 
-from .columns import Stripe, stripe_of
+from .columns import STRIPE_EVENTS, stripe_of
 from .records import EdgeChange, Merge, ObjectMerge, Refusal, cause_of
+from .tables import Tables, last_rows
 
 Row = Sequence[Any]
 Pair = tuple[PlaceOrdinal, PlaceOrdinal]
@@ -88,28 +89,20 @@ _ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
 }
 
 
-class StripeBuilder:
-    """Collects the rows of events from ``start`` on.
+class TableWriter:
+    """Adds the rows of further events to ``tables``, in stripes of `STRIPE_EVENTS`."""
 
-    ``located`` is the place of each object before, ``links`` the shared transitions of each pair
-    of places, ``merges`` the number of merges.
-    """
-
-    def __init__(
-        self,
-        start: Offset,
-        located: Mapping[ObjectOrdinal, PlaceOrdinal | None],
-        links: Mapping[Pair, int],
-        merges: int,
-    ) -> None:
-        self._start = self._end = start
-        self._located, self._links, self._merges = dict(located), dict(links), merges
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._start = self._end = tables.end
+        moved = tables.column("moved", "object")
+        last = last_rows(moved, tables.count("found"))
+        places = tables.rows_at("moved", last[last >= 0])
+        self._located = {found: place for _, found, place in places}
+        linked = tables.rows("linked", 0, tables.count("linked"))
+        self._links: dict[Pair, int] = {(a, b): count for _, a, b, count in linked}
+        self._merges = tables.count("merge")
         self._rows: defaultdict[str, list[Row]] = defaultdict(list)
-
-    @property
-    def events(self) -> int:
-        """The number of events in the next stripe so far."""
-        return self._end - self._start
 
     def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
@@ -138,13 +131,15 @@ class StripeBuilder:
                 self._document("refusal", told)
         for merge in merges:
             self._places_merged(offset, deltas, merge, moves, links)
+        if self._end - self._start == STRIPE_EVENTS:
+            self.flush()
 
-    def take(self) -> Stripe:
-        """The stripe of the events since the last one."""
-        stripe = stripe_of(self._start, self._end, self._rows)
-        self._start = self._end
-        self._rows.clear()
-        return stripe
+    def flush(self) -> None:
+        """Add the rows of the events since the last stripe."""
+        if self._end > self._start:
+            self._tables.add(stripe_of(self._start, self._end, self._rows))
+            self._start = self._end
+            self._rows.clear()
 
     def _document(self, table: str, record: Merge | Refusal | ObjectMerge) -> None:
         text = msgspec.json.encode(record).decode()

@@ -16,9 +16,9 @@ from projections.model.space_vectors import new_map
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 
-from .column_rows import StripeBuilder
-from .columns import STRIPE_EVENTS, Stripe
-from .tables import DamagedPart, Tables, last_rows
+from .column_rows import TableWriter
+from .columns import Stripe
+from .tables import DamagedPart, Tables
 from .timeline_cache import TimelineCache
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -83,20 +83,17 @@ class HistoryRecorder:
     def _fold(self, semantic_map: SemanticMap, end: Offset) -> None:
         """Fold up to ``end`` and add the rows to the tables."""
         tables = self._opened()
-        builder = _builder(tables)
+        writer = TableWriter(tables)
         events = self._reader.read(tables.end, end)
         try:
             with gc_paused():
                 for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
-                    builder.add(folded.offset, folded.deltas)
-                    if builder.events == STRIPE_EVENTS:
-                        tables.add(builder.take())
+                    writer.add(folded.offset, folded.deltas)
                     if self._progress and folded.offset % _PROGRESS_EVERY == 0:
                         self._progress(folded.offset, end)
         finally:
-            if builder.events:
-                tables.add(builder.take())
-                tables.shorten(self._read)
+            writer.flush()
+            tables.shorten(self._read)
         if self._progress:
             self._progress(end, end)
 
@@ -122,16 +119,6 @@ class HistoryRecorder:
                 self._cache.keep(stripes, again._map)
                 self._kept = end
         return stripes
-
-
-def _builder(tables: Tables) -> StripeBuilder:
-    """A builder for the rows that follow those of ``tables``."""
-    moved = tables.column("moved", "object")
-    last = last_rows(moved, tables.count("found"))
-    places = tables.rows_at("moved", last[last >= 0])
-    located = {found: place for _, found, place in places}
-    links = {(a, b): count for _, a, b, count in tables.rows("linked", 0, tables.count("linked"))}
-    return StripeBuilder(tables.end, located, links, tables.count("merge"))
 
 
 def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope import Offset
-from projections.deltas import KeyframeAdded, KeyframeOrdinal
+from projections.deltas import KeyframeOrdinal
 from projections.exact import distance_um, metres_to_um
 from projections.reducers.floors import shift_um
 from projections.settings import Settings
@@ -26,18 +26,6 @@ class Posed(NamedTuple):
     offsets: NDArray[np.int64]
     positions: NDArray[np.int64]
     floors: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, keyframes: Sequence[KeyframeAdded]) -> "Posed":
-        """The posed keyframes among these records."""
-        posed = [(k, k.pose) for k in keyframes if k.pose is not None]
-        names: dict[str | None, int] = {}
-        return cls(
-            np.array([k.keyframe for k, _ in posed], np.int64),
-            np.array([k.offset for k, _ in posed], np.int64),
-            np.array([(at.x_um, at.y_um) for _, at in posed], np.int64).reshape(-1, 2),
-            np.array([names.setdefault(k.floor, len(names)) for k, _ in posed], np.int64),
-        )
 
 
 class Neighbours:

@@ -19,6 +19,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -36,6 +37,7 @@ from projections.deltas import (
     ObjectsMerged,
     PlaceFormed,
     PlacesMerged,
+    RunSeen,
 )
 from projections.model.digest import map_digest
 from projections.model.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
@@ -43,9 +45,13 @@ from projections.model.space_vectors import new_map
 from projections.model.view import MapView
 from projections.settings import Settings
 
+from .column_rows import TableWriter
 from .history import History
+from .history_recorder import map_at
 from .known import Progress
 from .records import PlaceHistory
+from .stored_history import StoredHistory
+from .tables import Tables
 
 if TYPE_CHECKING:
     from projections.evaluate.truth import Truth
@@ -55,7 +61,7 @@ Offsets: TypeAlias = "array[int]"
 MIN_PARALLEL_EVENTS = 20_000
 """Events times settings from which processes are started: about two seconds of folding."""
 _POLL_S = 0.2
-_PLACE_DELTAS = frozenset({KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
+_PLACE_DELTAS = frozenset({RunSeen, KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
 _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
 """Also needed where objects may merge."""
@@ -129,7 +135,7 @@ def fold_result(
         for seen in each.sightings:
             at_once = history.object_survivor(each.found.object, Offset(seen.offset + 1))
             first[seen.observation] = numbers_of[at_once]
-    offsets = history.keyframe_offsets
+    offsets = array("q", history.keyframe_offsets)
     return FoldResult(
         settings=view.settings,
         digest=map_digest(view),
@@ -139,7 +145,7 @@ def fold_result(
         objects=tuple(None if n < 0 else view.all_objects[n].object_id for n in fused),
         posed=array("q", (k.ordinal for k in view.keyframes if k.pose is not None)),
         keyframe_offsets=offsets,
-        placed_offsets=history.placed_offsets,
+        placed_offsets=array("q", history.placed_offsets),
         placed_in=array("q", (NO_NUMBER if p < 0 else numbers[p] for p in history.placed_in)),
         merged=tuple(
             (merge.cause.offset, numbers[place], numbers[merge.survivor])
@@ -237,7 +243,9 @@ class _Fold:
         settings, corrections = rules.settings, rules.corrections
         self.map = new_map(reader, settings, corrections)
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
-        self.history = History(settings, corrections)
+        self._map_at = partial(map_at, reader)
+        self._tables = Tables()
+        self._writer = TableWriter(self._tables)
         self.seconds = 0.0
         objects_merge = bool(corrections.same) or settings.fusion == "evidence"
         self._needed = _PLACE_DELTAS | _OBJECT_DELTAS if objects_merge else _PLACE_DELTAS
@@ -245,10 +253,13 @@ class _Fold:
     def fold(self, read: ParsedEvent) -> None:
         offset, deltas = read.offset, fold_parsed(read, self.map)
         self.view.apply_event(offset, deltas)
-        self.history.apply(offset, [delta for delta in deltas if type(delta) in self._needed])
+        self._writer.add(offset, [delta for delta in deltas if type(delta) in self._needed])
 
     def result(self, truth: "Truth | None", *, keep_view: bool) -> FoldResult:
-        result = fold_result(self.view, self.history, truth, self.seconds)
+        self._writer.flush()
+        view = self.view
+        history = StoredHistory(view.settings, view.corrections, self._tables, self._map_at)
+        result = fold_result(view, history, truth, self.seconds)
         return replace(result, view=self.view) if keep_view else result
 
 

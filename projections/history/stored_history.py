@@ -1,8 +1,7 @@
-"""A history read from tables. The records that `History` keeps in memory are made on first
-access."""
+"""A history read from tables, whose records are made on first access."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from itertools import starmap
 from typing import Any, Final, TypeVar, cast
 
@@ -13,7 +12,6 @@ from eventsrc.envelope import KeyframeId, Offset, RunId
 from eventsrc.occupancy_map import OccupancyMap
 from projections.corrections import Corrections
 from projections.deltas import (
-    Delta,
     EventSkipped,
     KeyframeAdded,
     KeyframeOrdinal,
@@ -58,14 +56,11 @@ class StoredHistory(History):
     def __init__(
         self, settings: Settings, corrections: Corrections, tables: Tables, map_at: MapAt
     ) -> None:
-        # Not that of `History`, which makes empty lists: what is missing here is made on demand.
         self.settings = settings
         self.corrections = corrections
         self.next_offset = tables.end
         self.tables = tables
         self.map_at = map_at
-        self._neighbours = None
-        self._sighting_index = None
 
     def __getattr__(self, name: str) -> Any:
         if name not in _PARTS:
@@ -74,17 +69,10 @@ class StoredHistory(History):
         setattr(self, name, found)
         return found
 
-    def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
-        """Raise TypeError: the history is read-only."""
-        raise TypeError(f"a stored history is read-only; {len(deltas)} deltas of event {offset}")
-
-    @property
+    @cached_property
     def neighbours(self) -> Neighbours:
-        """Neighbourhoods of the keyframes."""
-        if self._neighbours is None:
-            found = Neighbours(_posed(self.tables), self.settings)
-            self._neighbours = len(self.keyframes), found
-        return self._neighbours[1]
+        """The index of keyframes within ε of each other."""
+        return Neighbours(_posed(self.tables), self.settings)
 
     def keyframe_count(self, end: Offset) -> int:
         """Keyframes added by the events below ``end``."""
@@ -253,7 +241,6 @@ def _items(
     rows = tables.group(table, column)[value]
     if not len(rows):
         return []
-    # A sequence; the records say list because a fold appends to theirs.
     found = Items(
         rows,
         lambda of: list(starmap(delta, tables.rows_at(table, of))),

@@ -15,8 +15,6 @@ from eventsrc.log import LogReader
 from projections import deltas as d
 from projections.history import Timeline
 from projections.history.explanation import explain_object
-from projections.history.history import History
-from projections.history.past_view import view_at
 from projections.model.digest import map_digest
 from projections.model.export import state_document
 from projections.model.fold import fold_log
@@ -26,6 +24,8 @@ from projections.settings import Settings
 from tests.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
 from tests.fixtures_timetravel import write_log
 from tests.folds import Folded
+from tests.memory_history import MemoryHistory
+from tests.past_view import view_at
 from tests.property.test_snapshots import _plain
 from tests.rooms_with_things import drive, drives, long_drive
 from tests.thorough import mostly_slow
@@ -130,7 +130,7 @@ def test_maps_of_things_carried_away_are_the_same_whichever_way_they_are_made(se
             list(map(_plain, each)) for each in whole.deltas[cut:]
         ]
         assert snapshot(again.map, again.view, "log") == snapshot(whole.map, whole.view, "log")
-    history = History(EVIDENCE)
+    history = MemoryHistory(EVIDENCE)
     for offset, deltas in enumerate(whole.deltas):
         history.apply(Offset(offset), deltas)
     for end in range(70, len(documents) + 1, 17):

@@ -17,14 +17,14 @@ from eventsrc.envelope import Offset
 from projections import deltas as d
 from projections.history.bisect import CountIndex, HistoryFacts
 from projections.history.diff import difference_of, rows_of
-from projections.history.history import History
-from projections.history.past_view import view_at
 from projections.model.digest import map_digest
 from projections.model.export import state_document, state_text
 from projections.model.records import Estimate, ObjectRecord, Relocation
 from projections.model.snapshot import dump_view, load_view, pack, unpack
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.memory_history import MemoryHistory
+from tests.past_view import view_at
 from tests.told_objects import STEPS, Step, Story, random_steps
 
 EVIDENCE = Settings(fusion="evidence")
@@ -38,8 +38,8 @@ def view_of(events: Sequence[Sequence[d.Delta]], rules: Settings = EVIDENCE) -> 
     return view
 
 
-def history_of(events: Sequence[Sequence[d.Delta]]) -> History:
-    history = History(EVIDENCE)
+def history_of(events: Sequence[Sequence[d.Delta]]) -> MemoryHistory:
+    history = MemoryHistory(EVIDENCE)
     for offset, deltas in enumerate(events):
         history.apply(Offset(offset), deltas)
     return history

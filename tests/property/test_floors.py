@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from projections.corrections import Corrections, Keyframe
 from projections.deltas import PlacesMerged
-from projections.history.history import History
 from projections.model.digest import map_digest
 from projections.model.snapshot import restore, snapshot
 from projections.model.view import MapView
@@ -23,6 +22,7 @@ from tests.folds import (
     recounted_locations,
     recounted_places,
 )
+from tests.memory_history import MemoryHistory
 from tests.naive_map import NaiveMap, micrometres
 from tests.property.test_whole_fold import worlds
 from tests.rooms_with_things import drives
@@ -269,7 +269,7 @@ def snapshot_in_the_middle(corrections: Corrections, documents: list[dict[str, A
 
 def test_neighbours_of_a_history_are_on_one_floor() -> None:
     folded = fold(drive({}, {"floor": 1}))
-    history = History(Settings())
+    history = MemoryHistory(Settings())
     for offset, deltas in enumerate(folded.deltas):
         history.apply(offset, deltas)
     near = history.neighbours

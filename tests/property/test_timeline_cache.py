@@ -46,7 +46,7 @@ def kept_early(stripe: int = 7) -> Iterator[None]:
     history = "projections.history"
     with (
         patch(f"{history}.timeline_cache.MIN_EVENTS", 1),
-        patch(f"{history}.history_recorder.STRIPE_EVENTS", stripe),
+        patch(f"{history}.column_rows.STRIPE_EVENTS", stripe),
         patch(f"{history}.tables.STRIPE_EVENTS", 2 * stripe),
         patch(f"{history}.columns.STRIPE_EVENTS", 4 * stripe),
     ):

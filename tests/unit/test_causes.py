@@ -13,12 +13,12 @@ from projections.deltas import (
     Pose,
 )
 from projections.history.explanation import explain_place
-from projections.history.history import History
 from projections.history.merges import merge_document
 from projections.history.records import Cause, cause_of
 from projections.history.rendering import explanation_text, merge_row, merge_text
 from projections.history.same_place import explain_same_place
 from projections.settings import Settings
+from tests.memory_history import MemoryHistory
 
 
 def keyframe(number: int) -> list[Delta]:
@@ -32,9 +32,9 @@ def keyframe(number: int) -> list[Delta]:
 
 
 @pytest.fixture
-def commanded() -> History:
+def commanded() -> MemoryHistory:
     """Two places merged by an event without a keyframe."""
-    history = History(Settings())
+    history = MemoryHistory(Settings())
     history.apply(0, keyframe(0))
     history.apply(1, keyframe(1))
     merged = PlacesMerged(2, 0, (1,), 1, (PlaceLink(0, 1, 10**7),), 1, (1,))
@@ -42,7 +42,7 @@ def commanded() -> History:
     return history
 
 
-def test_the_cause_is_the_command(commanded: History) -> None:
+def test_the_cause_is_the_command(commanded: MemoryHistory) -> None:
     (merge,) = commanded.merges
     assert merge.cause == Cause(2, "command")
     assert merge.cause.name == merge.cause.when == merge.cause.title == "command at offset 2"
@@ -50,7 +50,7 @@ def test_the_cause_is_the_command(commanded: History) -> None:
     assert merge_document(commanded, merge)["time"] is None
 
 
-def test_every_text_names_the_command(commanded: History) -> None:
+def test_every_text_names_the_command(commanded: MemoryHistory) -> None:
     (merge,) = commanded.merges
     explanation = explain_place(commanded, commanded.places[1], 3)
     texts = [

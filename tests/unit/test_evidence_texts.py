@@ -9,7 +9,6 @@ from eventsrc.envelope import Offset
 from projections import deltas as d
 from projections.history.diff import difference_of
 from projections.history.explanation import Explanation, explain_object
-from projections.history.history import History
 from projections.history.merges import object_merge_document
 from projections.history.rendering import (
     difference_text,
@@ -18,6 +17,7 @@ from projections.history.rendering import (
 )
 from projections.model.view import MapView
 from projections.settings import Settings
+from tests.memory_history import MemoryHistory
 
 EVIDENCE = Settings(fusion="evidence")
 
@@ -92,8 +92,8 @@ EVENTS: list[list[d.Delta]] = [
 ]
 
 
-def told(events: Sequence[Sequence[d.Delta]]) -> tuple[History, MapView]:
-    history, view = History(EVIDENCE), MapView(EVIDENCE)
+def told(events: Sequence[Sequence[d.Delta]]) -> tuple[MemoryHistory, MapView]:
+    history, view = MemoryHistory(EVIDENCE), MapView(EVIDENCE)
     for offset, deltas in enumerate(events):
         history.apply(Offset(offset), deltas)
         view.apply_event(Offset(offset), deltas)

@@ -11,11 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.envelope import Offset
 from eventsrc.log import LogReader
+from eventsrc.occupancy_map import OccupancyMap
+from projections.corrections import NO_CORRECTIONS
 from projections.database.graph_sink import GraphSink
 from projections.database.live_fold import LiveFold
 from projections.database.vector_sink import VectorSink
-from projections.history.history import History
+from projections.history.stored_history import StoredHistory
+from projections.history.tables import Tables
 from projections.model.fold import fold_log
 from projections.settings import Settings
 
@@ -39,6 +43,10 @@ def folding() -> object:
         return fold_log(reader, Settings())[0]
 
 
+def no_map(offset: Offset) -> OccupancyMap:
+    raise AssertionError(offset)
+
+
 @pytest.mark.usefixtures("no_search_for_cycles")
 @pytest.mark.parametrize(
     "make",
@@ -49,7 +57,7 @@ def folding() -> object:
         GraphSink,
         lambda: LiveFold(Settings()).tracker,
         VectorSink,
-        lambda: History(Settings()),
+        lambda: StoredHistory(Settings(), NO_CORRECTIONS, Tables(), no_map),
     ],
     ids=["view", "map", "live view", "graph sink", "tracker", "vector sink", "history"],
 )

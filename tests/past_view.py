@@ -1,4 +1,4 @@
-"""The map at any offset, made from a history without folding again."""
+"""The map at any offset, made from the records of a history, one by one."""
 
 from bisect import bisect_left
 
@@ -6,6 +6,8 @@ from msgspec.structs import astuple, replace
 
 from eventsrc.envelope import Offset
 from projections.deltas import PlaceOrdinal
+from projections.history.history import History
+from projections.history.records import ObjectHistory, count_before, last_before
 from projections.model.records import (
     Estimate,
     KeyframeRecord,
@@ -17,9 +19,6 @@ from projections.model.records import (
 )
 from projections.model.view import MapView
 from projections.reducers.survivors import PlaceSurvivors
-
-from .history import History
-from .records import ObjectHistory, count_before, last_before
 
 
 def view_at(history: History, latest: MapView, end: Offset) -> MapView:
