@@ -25,9 +25,9 @@ def is_cdr(payload: bytes) -> bool:
 
 
 class CdrFields:
-    """Reads the fields of a payload that `is_cdr`, in order. ``field`` is the name for messages.
+    """Reads the fields of a payload that `is_cdr`, in order. ``field`` is its name in errors.
 
-    Every method raises CdrFault if the payload ends too soon.
+    Every method but `left` raises CdrFault if the payload ends too soon.
     """
 
     def __init__(self, payload: bytes) -> None:

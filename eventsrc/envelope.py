@@ -115,7 +115,8 @@ COVARIANCE_SIZE = 9
 MAX_VARIANCE = 1e6
 """Bound of a pose's variances: a standard error of a kilometre, or of 1000 radians."""
 _SAME = 1e-6
-"""How far two symmetric entries of a covariance may differ, relative to their largest value."""
+"""How far two symmetric entries of a covariance may differ, and exceed the largest value that their
+variances allow, relative to that value."""
 _ROUNDING = 1e-12
 """How far rounding may move an entry beside a variance of 0, relative to the largest variance."""
 

@@ -10,7 +10,7 @@ The rules:
   recorder ends. Until then keyframes out of order and a publisher's resending may fill it, and
   nothing is written that would have to be taken back.
 * The ``mapfold/loss`` event of a gap stays in the log when a late keyframe closes the gap. So the
-  keyframes missing at the end of the log are its holes, not the sum of its loss events.
+  keyframes that are missing now are counted by the holes, not by the sum of the loss events.
 * A keyframe recorded twice is no loss. It is counted as a duplicate.
 * A publisher may announce its last keyframe. When that was the settle time ago, and the run's
   highest recorded keyframe is lower, the ids in between are a hole too. When the recorder ends,

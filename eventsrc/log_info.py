@@ -52,9 +52,9 @@ class LogInfo:
     """Counts and time bounds of a log.
 
     Times are int nanoseconds, earliest and latest whatever their order in the log, None while it is
-    empty; stamps are those of envelopes. ``lost`` is the number of events reported as lost, less
-    the keyframes that came late. ``formats`` are the encodings and schemas of verbatim messages,
-    by topic.
+    empty; stamps are those of envelopes. ``lost`` is the number of messages, keyframes and events
+    that the log reports as lost, less the keyframes that came late. ``formats`` are the encodings
+    and schemas of verbatim messages, by topic.
     """
 
     log_id: str
@@ -193,7 +193,7 @@ def _add_formats(tally: _Tally, segment: OpenSegment, body: bytes) -> None:
 
 
 def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) -> int:
-    """The number of lost events: losses reported, less the keyframes that came late.
+    """`LogInfo.lost`: the sum of all reported losses, less the keyframes that came late.
 
     Gaps of keyframes are counted from the gap ledger, because late keyframes may have filled them.
     """

@@ -108,8 +108,8 @@ _OF_ROS: Final = (
     ("unknown_keys", "Messages left out because their keys are no topics of ROS."),
 )
 _STREAM_COUNTERS: Final = (
-    ("keyframes", "Keyframes made."),
-    ("detections", "Detections in them."),
+    ("keyframes", "Keyframes made of ROS detections."),
+    ("detections", "Detections in these keyframes."),
     ("with_embedding", "Detections with an embedding."),
     ("unclassified", "Detections without a class."),
     ("without_pose", "Keyframes without a pose."),
@@ -122,7 +122,7 @@ _STREAM_COUNTERS: Final = (
 _GAUGES: Final = (
     ("missing", "Keyframes missing from the log's runs."),
     ("queue_depth", "Messages that wait for the log's writer."),
-    ("queue_size", "The most messages that may wait."),
+    ("queue_size", "Bound of queue_depth."),
     ("next_offset", "Events in the log."),
     ("unsealed", "Finished segments that wait to be sealed."),
 )
@@ -142,7 +142,7 @@ class _RecorderCollector(Collector):
         if report.streams:
             yield from _ros_metrics(report)
         failing = report.sealing_error is not None
-        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 if it fails.", failing)
+        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 if sealing fails.", failing)
         free = shutil.disk_usage(self._log).free
         yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Free space for the log.", free)
 

@@ -1,8 +1,8 @@
 """Occupancy maps: a grid of cells that are free, occupied or unknown, as `mapfold/map` events.
 
 A map is validated when it comes in, kept as an event of the log, and in force for the events after
-it. `eventsrc.grid_messages` makes one from a nav_msgs/OccupancyGrid,
-`eventsrc.importers.map_yaml` from the map.yaml of a map server.
+it. `eventsrc.grid_messages` makes one from a nav_msgs/OccupancyGrid, `eventsrc.importers.map_yaml`
+from the map.yaml of a map server.
 """
 
 import hashlib

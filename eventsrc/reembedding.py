@@ -30,7 +30,7 @@ from .upcast import read_envelope
 DEFAULT_TOPIC: Final = "tb/crops"
 DEFAULT_BATCH: Final = 64
 _MOST_VALUES: Final = 1_000_000
-"""Bound of the bytes of vectors in one event."""
+"""Bound of the numbers in the vectors of one event."""
 _MOST_NAMED: Final = 20
 
 Vector: TypeAlias = NDArray[np.float32]

@@ -2,7 +2,8 @@
 
 ``mapfold/rejected``  a payload that is no valid envelope, with its bytes and the reason
 ``mapfold/loss``      a detected gap: publisher, first and last missing, cause
-``mapfold/command``   a command (`eventsrc.commands`), by `mapfold edit` or a recorder it asked
+``mapfold/command``   a command (`eventsrc.commands`), appended by `mapfold edit` or, at its
+                      request, by a recorder
 ``mapfold/ros``       how envelopes are made of the messages of ROS behind it
                       (`eventsrc.ros.derivation`)
 ``mapfold/map``       an occupancy grid: where walls are (`eventsrc.occupancy_map`)

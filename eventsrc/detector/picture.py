@@ -28,7 +28,7 @@ _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _END: Final = 0xD9
 _NEXT_MARKER: Final = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])")
 _ENDS: Final = (b"\xff\xd9", b"IEND\xaeB`\x82")
-"""The first bytes of a JPEG and of a PNG."""
+"""The last bytes of a JPEG and of a PNG."""
 _READ_BYTES: Final = 64 * 1024
 
 

@@ -126,9 +126,9 @@ class LivePoses:
         self.dropped = 0
         """Number of unread messages dropped for newer ones."""
         self.bad = 0
-        """Number of messages that are no pose."""
+        """Number of messages that are no pose or too large."""
         self.bad_reason: str | None = None
-        """The reason why the last of them is no pose."""
+        """The reason for the last of them."""
 
     def put(self, payload: bytes, received_s: float) -> None:
         """Queue a message; it is decoded when a pose is asked for."""
@@ -141,7 +141,7 @@ class LivePoses:
             self._came.notify()
 
     def refuse(self, reason: str) -> None:
-        """Count a message that is no pose."""
+        """Count a message that is no pose, or is too large to be read."""
         with self._came:
             self.bad += 1
             self.bad_reason = reason

@@ -16,7 +16,8 @@ from eventsrc.envelope import RunId
 TOGETHER_NS: Final = 10 * 1_000_000_000
 """A run whose first stamp is at most this long before the last log time counts as simultaneous."""
 CLOCK_SET_NS: Final = 24 * 3600 * 1_000_000_000
-"""A keyframe with a stamp older than this means that the robot's clock was set back."""
+"""A keyframe stamped longer than this before its run's latest log time means that the robot's clock
+was set back."""
 
 
 class LogTimes:

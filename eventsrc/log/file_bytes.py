@@ -1,8 +1,7 @@
 """Read the bytes of a file that may be huge, sparse, or on a failing disk.
 
 Files are read in blocks, on demand, so memory does not grow with the file; searches skip the holes
-of a sparse file. The file is not mapped, because a bad sector under a mapping kills
-the process.
+of a sparse file. The file is not mapped, because a bad sector under a mapping kills the process.
 """
 
 import errno

@@ -1,10 +1,10 @@
 """JSON schemas that viewers can read: one tree without references or alternatives.
 
 Foxglove makes the fields of a message from its channel's schema, and reads no ``$ref``, ``anyOf``
-or ``prefixItems``: it then shows nothing of the channel. So a reference is replaced by the
-schema it names, an optional field has the type of its value, a tuple is an array of its first
-item's type, and of several types a field has the first. Such a schema describes payloads; it does
-not validate them: a field may also be null.
+or ``prefixItems``: it then shows nothing of the channel. So a reference is replaced by the schema
+it names, an optional field has the type of its value, a tuple is an array of its first item's type,
+and of several types a field has the first. Such a schema describes payloads; it does not validate
+them: a field may also be null.
 """
 
 from typing import Any, Final

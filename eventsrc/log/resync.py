@@ -1,13 +1,13 @@
 """Resynchronise behind a damaged record of an active segment: find where reading can go on.
 
-The file is a row of chunks, each followed by its commit mark. A mark counts only where a record
-begins, because the payloads in a chunk may contain anything, marks included. So records are skipped
-by their lengths:
+The file is a sequence of chunks, each followed by its commit mark. A mark counts only where a
+record begins, because the payloads in a chunk may contain anything, marks included. So records are
+skipped by their lengths:
 
 * If the head of a chunk is good, its end is known even if its content is damaged. A chunk that
   would end behind the end of the file was being written when its writer died: nothing follows.
 * If the head is damaged too, the next commit mark is searched for. It must be made with the mark
-  seed of the segment, which publishers do not know, and must not claim more events than the bytes
+  seed of the segment, which publishers do not have, and must not declare more events than the bytes
   before it can hold.
 """
 

@@ -1,6 +1,6 @@
 """Scan an active segment, damaged or not, for its good chunks; read the events of a scan.
 
-The file is a row of chunks and commit marks. A chunk is good if its CRC holds and its sequence
+The file is a sequence of chunks and commit marks. A chunk is good if its CRC holds and its sequence
 numbers continue. Where no good chunk is, `resync` says where reading can go on. Then:
 
 * Bytes at the end that no good chunk and no commit mark follow are *torn*: a write that a crash cut

@@ -114,9 +114,8 @@ class Sealer:
     def _seal(self, segment: Finished) -> None:
         base, following = segment
         active = segment_path(self._log, base, ACTIVE)
-        if (
-            active.exists()
-        ):  # else an earlier call sealed it, and only the sync of the folder failed
+        # Without the active file an earlier call sealed it, and only the sync of the folder failed.
+        if active.exists():
             notes = origin_notes(head_of(active, base))
             previous = self._previous_sha256
             plan = SegmentPlan(self._log, self._log_id, base, previous, following, notes)

@@ -18,8 +18,8 @@ from .mcap_records import BadRecord, Channel, Schema
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
     """Where a chunk is in its file (bytes) and which offsets it holds, ``first`` to before
-    ``following``. ``channels`` is None if unknown. ``body``, if given, returns the records instead:
-    they are put together from a file that another program wrote."""
+    ``following``. ``channels`` is None if unknown. ``body``, if given, returns the records
+    instead: made from a file that another program wrote."""
 
     position: int
     length: int
@@ -127,7 +127,7 @@ def chunk_events(
     segment: SegmentFile, chunk: ChunkRef, start: Offset, end: Offset, keys: Collection[str] | None
 ) -> Iterator[Event]:
     """The events of one chunk with offsets from ``start`` to before ``end``, in order. Raises
-    LogDamaged for bytes that are not what was written, and for a chunk that contradicts itself."""
+    LogDamaged if the chunk's CRC, records or offsets are wrong."""
     body = segment.read_chunk(chunk)
     try:
         yield from _events(segment, chunk, body, start, end, keys)
@@ -152,7 +152,7 @@ def _events(
     for channel_id, sequence, log_ns, publish_ns, at, stop in _mcap.iter_messages(body):
         offset = base + sequence
         if offset != expected:
-            raise BadRecord(f"offset {offset} stands in place of {expected}")
+            raise BadRecord(f"offset {offset} where {expected} should be")
         expected = offset + 1
         if offset < start:
             continue

@@ -214,8 +214,8 @@ def _size_of(segment: SegmentPath) -> int:
 
 
 def _majority_log_id(segments: list[SegmentPath]) -> str | None:
-    """The log id that most segments carry; None without a majority: then that of
-    the first segment is used."""
+    """The log id that most segments carry; None without a majority: then that of the
+    first segment is used."""
     carried = []
     for segment in segments:
         try:

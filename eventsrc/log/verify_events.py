@@ -110,8 +110,8 @@ class _Run:
 
 
 class RunStamps:
-    """Checks the stamps of runs. Each keyframe is added once, in offset order; three
-    numbers of each are kept."""
+    """Checks the stamps of runs. Each keyframe is added once, in offset order; three numbers of
+    each are kept."""
 
     def __init__(self) -> None:
         self._runs: dict[RunId, _Run] = {}

@@ -241,8 +241,8 @@ class LogWriter:
         return self.durable_offset
 
     def begin_segment(self) -> None:
-        """Commit, and begin the next segment unless this one is empty. For an import of
-        events older than the ones before: verification then reports no clock that was set back."""
+        """Commit, and begin the next segment unless this one is empty. For an import of events
+        older than the ones before: verification then reports no clock that was set back."""
         self.sync()
         if self._active.committed > self._active.base:
             self._rotate()

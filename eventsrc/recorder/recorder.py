@@ -32,7 +32,7 @@ DEFAULT_KEYS: Final = ("tb/detections",)
 DEFAULT_CROPS: Final = ("tb/crops/*",)
 _CACHE_TIMEOUT_S: Final = 2.0
 _MAX_CACHED: Final = 1_000
-"""Limit for the messages that a bridge has cached of one topic."""
+"""Limit for the messages fetched from a bridge's cache of one topic."""
 _MAX_REJECTED: Final = 2
 """A message of up to this many times the size limit (or the default limit, if larger) is rejected,
 kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it

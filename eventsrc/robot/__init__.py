@@ -1,1 +1,1 @@
-"""What runs on the robot: envelopes are published, and kept until a recorder acknowledges them."""
+"""The robot's side: publish envelopes, and keep each until a recorder acknowledges it."""

@@ -25,7 +25,7 @@ from .transforms import TimeSeries, Transform, TransformBuffer, compose, interpo
 
 _MOST_POSES: Final = 50_000
 _UPRIGHT: Final = 0.5
-"""A z axis with a larger vertical component is not a camera's optical axis."""
+"""Least vertical component, at 30° from the horizontal, of a z axis that is no optical axis."""
 _METRES, _RADIANS = 6, 9
 _Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
 """The base, the camera and the error of the pose."""
@@ -156,7 +156,7 @@ def heading(t: Transform) -> float:
 def heading_of_camera(t: Transform, frame: str) -> float:
     """The heading of a camera on the ground, radians: along z in an optical frame, along x in a
     frame of the robot's body. A frame without ``optical`` in its name counts as optical if its z
-    axis is nearer to horizontal than to vertical."""
+    axis is within 30° of the horizontal."""
     x, y, z = rotate(t, 0.0, 0.0, 1.0)
     if "optical" in frame or abs(z) < _UPRIGHT:
         return math.atan2(y, x)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A model of furniture; objects of the same model look nearly the same."""
+    """A product model; objects of the same model look nearly the same."""
 
     name: str
     class_name: str

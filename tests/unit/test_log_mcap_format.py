@@ -97,7 +97,7 @@ def test_an_active_segment_made_by_hand_reads(log_path: Path) -> None:
     ("body", "says"),
     [
         (message(2, 1, 1, b"x"), "3"),  # no channel 3 is defined here
-        (channel_alone() + message(3, 1, 1, b"x"), "offset 503 stands in place of 502"),
+        (channel_alone() + message(3, 1, 1, b"x"), "offset 503 where 502 should be"),
         (channel_alone(), "ends before offset 502"),
         (channel_alone() + record(0x05, b"short"), "cut short"),
         (channel_alone() + message(2, 1, 1, b"x")[:-1], "does not fit"),
