@@ -23,7 +23,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple, TypeVar
+from typing import Final, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -48,6 +48,15 @@ from eventsrc.text import visible
 from eventsrc.upcast import read_envelope
 
 from .event import Event
+
+_LOST: Final = {
+    "keyframe_gap": "missing keyframes of run {}",
+    "queue_full": "messages on key {} lost because the queue was full",
+    "too_large": "messages on key {} lost because they were too large",
+    "transport_miss": "messages of publisher {} that were not received",
+    "rot": "recorded events lost to damage",
+}
+"""Text of a loss by its cause, for the id of its publisher."""
 
 
 class OpenGaps(NamedTuple):
@@ -266,8 +275,8 @@ class EventFindings:
         if gap is not None:
             self._gaps.add_report(event.offset, gap)
         elif loss is not None:
-            what = f"{loss.cause} of {loss.publisher}"
-            self._add("loss", what, event.offset, f"lost by {what}", loss.count)
+            what = _LOST[loss.cause].format(loss.publisher)
+            self._add("loss", what, event.offset, what, loss.count)
 
     def _parse(self, model: type[Model], event: Event) -> Model | None:
         try:
@@ -310,8 +319,8 @@ class EventFindings:
         for offset, message in self._stamps.findings():
             self._add("time", message, offset, message)
         for run_id, missing, first, last in self._gaps.still_open():
-            what = f"keyframe_gap of {run_id}"
-            self._add("loss", what, first, f"lost by {what}", missing)
+            what = _LOST["keyframe_gap"].format(run_id)
+            self._add("loss", what, first, what, missing)
             self._add("loss", what, last, "", 0)
         for group in sorted(self._groups.values(), key=lambda g: g.first):
             yield Finding(

@@ -35,18 +35,17 @@ _MAX_NAME: Final = 500
 
 def topic_of(namespace: str, topic: str, option: str) -> str:
     """The topic in a log of messages of the ROS topic ``topic`` from a bridge with ``namespace``.
-    Raises MisuseError, which names ``option``, for an invalid name.
-    """
+    Raises MisuseError, which names ``option``, for an invalid name."""
     name = topic.removeprefix("/")
     if not _is_name(name):
         raise MisuseError(
-            f"{option} {visible(topic[:80])!r} is not a topic of ROS 2, such as /detections or "
-            "/camera/detections"
+            f"{option} {visible(topic[:80])!r} is no name of a ROS 2 topic; examples: "
+            "/detections, /camera/detections"
         )
     bare = namespace.strip("/")
     if bare and not _is_name(bare):
         raise MisuseError(
-            f"--namespace {visible(namespace[:80])!r} is not a namespace of ROS 2, such as /bot1"
+            f"--namespace {visible(namespace[:80])!r} is no ROS 2 namespace; example: /bot1"
         )
     return f"/{bare}/{name}" if bare else f"/{name}"
 

@@ -237,7 +237,7 @@ class Session:
 
 
 def check_keys(key_exprs: Sequence[str]) -> None:
-    """Raise MisuseError if one is malformed or two overlap: messages under both come twice."""
+    """Raise MisuseError if one is malformed, or two overlap: messages under both come twice."""
     parsed = []
     for text in key_exprs:
         try:
@@ -247,8 +247,8 @@ def check_keys(key_exprs: Sequence[str]) -> None:
     for one, other in itertools.combinations(parsed, 2):
         if one.intersects(other):
             raise MisuseError(
-                f"key expressions {str(one)!r} and {str(other)!r} overlap: what matches both would "
-                "come twice; give the wider one alone"
+                f"key expressions {str(one)!r} and {str(other)!r} overlap: messages that match "
+                "both would be received twice; give the wider one alone"
             )
 
 

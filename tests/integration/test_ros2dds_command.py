@@ -114,7 +114,7 @@ def test_tokens_are_found_by_their_selectors() -> None:
     "topic", ["", "/", "a b", "/tf/*", "/tf$*", "/x?y", "//tf", "/1a", "ä", "a/"]
 )
 def test_what_is_no_topic_is_refused(topic: str) -> None:
-    with pytest.raises(MisuseError, match="not a topic of ROS 2"):
+    with pytest.raises(MisuseError, match="no name of a ROS 2 topic"):
         topic_of("", topic, "--detections")
     with pytest.raises(MisuseError, match="not a namespace"):
         topic_of("/**", "/tf", "--detections")
@@ -177,7 +177,7 @@ def test_options_for_ros_need_ros2dds(tmp_path: Path) -> None:
     said = run("record", "L", "--namespace", "/bot1", code=2)
     assert "go with --ros2dds" in said.err
     said = run("record", "L", "--ros2dds", "--topic", "/a b", code=2)
-    assert "is not a topic of ROS 2" in said.err
+    assert "is no name of a ROS 2 topic" in said.err
     (tmp_path / "labels").write_text("cup\n\nchair\n")
     refused = [["--run-id", "a\nb"], ["--max-gap", "nan"], ["--labels", "no"], ["--pose", "*"]]
     for wrong in every_other(refused):

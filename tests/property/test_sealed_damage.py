@@ -5,6 +5,7 @@ import contextlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -343,8 +344,27 @@ def test_a_gap_is_reported_with_the_offsets_of_its_open_reports(quick_path: Path
     findings = verify_log(log).findings
     told = [(f.kind, f.first_offset, f.last_offset, f.count) for f in findings]
     assert told == [("loss", 5, 7, 4)]
-    assert "lost by keyframe_gap of r (4, first at offset 5)" in findings[0].message
+    assert "missing keyframes of run r (4, first at offset 5)" in findings[0].message
     assert log_info(log).lost == 4
+
+
+@pytest.mark.parametrize(
+    ("cause", "message"),
+    [
+        ("queue_full", "messages on key r lost because the queue was full (2, first at offset 0)"),
+        ("too_large", "messages on key r lost because they were too large (2, first at offset 0)"),
+        ("transport_miss", "messages of publisher r that were not received (2, first at offset 0)"),
+        ("rot", "recorded events lost to damage (2, first at offset 0)"),
+    ],
+)
+def test_a_loss_is_described_by_its_cause(quick_path: Path, cause: Any, message: str) -> None:
+    log = quick_path / "log"
+    with LogWriter(log) as writer:
+        writer.append(
+            LOSS_KEY, Loss(publisher="r", count=2, cause=cause).model_dump_json().encode()
+        )
+    (finding,) = verify_log(log).findings
+    assert (finding.kind, finding.message) == ("loss", message)
 
 
 DAY = 24 * 3600 * 10**9
