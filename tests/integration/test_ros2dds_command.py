@@ -116,7 +116,7 @@ def test_tokens_are_found_by_their_selectors() -> None:
 def test_what_is_no_topic_is_refused(topic: str) -> None:
     with pytest.raises(MisuseError, match="no name of a ROS 2 topic"):
         topic_of("", topic, "--detections")
-    with pytest.raises(MisuseError, match="not a namespace"):
+    with pytest.raises(MisuseError, match="no ROS 2 namespace"):
         topic_of("/**", "/tf", "--detections")
 
 
