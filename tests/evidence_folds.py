@@ -25,7 +25,7 @@ SLOW = settings(
 def recounted_votes(view: MapView, deltas: list[d.Delta]) -> list[int | None]:
     """The place of each Object, from the keyframes that saw it since it stands where it does."""
     votes: dict[int, list[int]] = {}
-    for delta, following in zip(deltas, [*deltas[1:], None], strict=True):
+    for delta, following in zip(deltas, [*deltas, None][1:], strict=True):
         if isinstance(delta, d.ObjectSeen):
             keyframe = view.observations[delta.observation].keyframe
             votes.setdefault(delta.object, []).append(keyframe)

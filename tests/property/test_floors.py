@@ -14,12 +14,12 @@ from projections.model.snapshot import restore, snapshot
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
+from tests.evidence_folds import recounted_votes
 from tests.folds import (
     Folded,
     fold,
     near_matrix,
     recounted_adjacency,
-    recounted_locations,
     recounted_places,
 )
 from tests.memory_history import MemoryHistory
@@ -117,7 +117,7 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map_with_floors(
         # A conflict counts the floor as content, which the naive map does not know of.
         if len(folded.view.keyframes) == len(naive.keyframes):
             assert map_digest(folded.view) == naive.digest()
-    check_floors(folded.view)
+    check_floors(folded)
 
 
 @given(building=buildings())
@@ -138,16 +138,16 @@ def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
     few = rng.sample(FLOORS, 3)
     documents = [{**document, **rng.choice(few)} for document in documents]
     settings = Settings(fusion="evidence", eps_m=1.0, places=places)
-    view = check_snapshots(settings, documents)
-    check_floors(view)
-    for found in view.objects.values():
+    folded = check_snapshots(settings, documents)
+    check_floors(folded)
+    for found in folded.view.objects.values():
         estimate = found.estimate
         assert estimate is not None
         assert abs(estimate.x_um) < 10**8, "as far as a picture shows, on its own floor"
 
 
-def check_snapshots(settings: Settings, documents: list[dict[str, Any]]) -> MapView:
-    """A fold that is stored and restored after each event is one that is not; returns its view."""
+def check_snapshots(settings: Settings, documents: list[dict[str, Any]]) -> Folded:
+    """A fold that is stored and restored after each event is one that is not, which is returned."""
     whole, restored = Folded.start(settings), Folded.start(settings)
     for document in documents:
         whole.extend([document])
@@ -156,11 +156,12 @@ def check_snapshots(settings: Settings, documents: list[dict[str, Any]]) -> MapV
         kept = snapshot(restored.map, restored.view, "log")
         restored = Folded(*restore(kept, settings, "log"), [])
         assert restored.view.floors == whole.view.floors
-    return whole.view
+    return whole
 
 
-def check_floors(view: MapView) -> None:
+def check_floors(folded: Folded) -> None:
     """No place and no Object is on two floors, and all sums are those of a recount."""
+    view, deltas = folded.view, [delta for each in folded.deltas for delta in each]
     for place in view.places.values():
         assert {view.keyframes[k].floor for k in place.members} == {view.floor_of(place.ordinal)}
     for found in view.objects.values():
@@ -171,7 +172,7 @@ def check_floors(view: MapView) -> None:
     sums = {p.ordinal: (p.keyframe_count, p.sum_x_um, p.sum_y_um) for p in view.places.values()}
     assert sums == recounted_places(view)
     assert view.adjacency == recounted_adjacency(view)
-    assert [o.place for o in view.objects.values()] == recounted_locations(view)
+    assert [o.place for o in view.objects.values()] == recounted_votes(view, deltas)
 
 
 def drive(*floors: dict[str, Any]) -> list[dict[str, Any]]:
@@ -252,7 +253,7 @@ def test_a_join_and_a_same_object_across_floors_are_obeyed_on_the_first_floor_on
     )
     folded = Folded.start(corrections=corrections).extend(documents)
     view = folded.view
-    check_floors(view)
+    check_floors(folded)
     assert [view.floor_of(p) for p in view.places] == ["0", "1", "1"]
     assert len(folded.all(PlacesMerged)) == 1
     by_det = {o.det_id: o.object for o in view.observations}
