@@ -14,10 +14,11 @@ from typing import BinaryIO, NamedTuple
 
 from eventsrc.append import Checked, NewMap, check_payloads, checked_event, rejected_event
 from eventsrc.envelope import Offset, RunId, has_keyframe_id
-from eventsrc.errors import MisuseError, NotALog
+from eventsrc.errors import MisuseError
 from eventsrc.gaps import GapLedger
 from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
+from eventsrc.log.format import list_segments
 from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.system_events import (
     EMBEDDINGS_KEY,
@@ -334,24 +335,23 @@ def check_sources(names: Sequence[str]) -> None:
     for name in names:
         if name == STDIN:
             continue
+        path = Path(name)
         try:
-            Path(name).stat()
+            path.stat()
+            is_source = not path.is_dir() or is_bag(path) or bool(list_segments(path))
         except FileNotFoundError:
             raise MisuseError(f"{name}: no such file; check the path") from None
         except OSError as error:
             raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
+        if not is_source:
+            raise MisuseError(f"{name}: neither a bag of ROS 2 nor a log; check the path")
 
 
 def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -> Source:
     """Open the source ``name``: a folder is a bag of ROS 2 or a log, ``-`` is standard input, a
     file is JSON lines, MCAP or part of a bag. Raises MisuseError."""
     if name != STDIN and Path(name).is_dir():
-        if is_bag(Path(name)):
-            return RosBag(Path(name), files, bags)
-        try:
-            return OtherLog(Path(name))
-        except NotALog as error:
-            raise MisuseError(f"{name}: no bag of ROS 2 and no log: {error}") from None
+        return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
     if Path(name).name == METADATA:
         raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
     try:
