@@ -61,7 +61,7 @@ class SavedLedger(BaseModel):
     runs: Annotated[tuple[Run, ...], FailFast()]
 
     def states(self) -> list[RunState[RunId]]:
-        """What `GapLedger.restore` takes."""
+        """The argument of `GapLedger.restore`."""
         return [RunState(*run) for run in self.runs]
 
 

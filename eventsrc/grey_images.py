@@ -30,7 +30,7 @@ _FAULTS: Final = (
     struct.error,
     zlib.error,
 )
-"""What Pillow raises for damaged images; found by `tests/property/test_map_images.py`."""
+"""Exceptions of Pillow for damaged images; found by `tests/property/test_map_images.py`."""
 _WIDE_MODES: Final = ("I", "I;16", "I;16B", "I;16L")
 _DEEP_GREY: Final = 257
 

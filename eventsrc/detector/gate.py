@@ -17,7 +17,7 @@ _SLACK = 1e-6
 
 
 class Pose(NamedTuple):
-    """Where the robot is in the map frame: metres, and radians to the left of the x axis."""
+    """The robot's pose in the map frame: metres, and radians to the left of the x axis."""
 
     x: float
     y: float

@@ -41,7 +41,7 @@ class Source(Protocol):
 
     name: str
     unit: str
-    """What `at` counts: ``line``, ``message`` or ``offset``."""
+    """The unit that `at` counts: ``line``, ``message`` or ``offset``."""
     at: int | None
     """Number of the message that `messages` yielded last."""
     size_bytes: int | None

@@ -77,7 +77,7 @@ def quarantine(path: Path, suffix: str, reason: str) -> Moved:
 
 
 class RenamedSegments(NamedTuple):
-    """What `rename_segments` did; ``log_id`` is None if no head could be read."""
+    """The result of `rename_segments`; ``log_id`` is None if no head could be read."""
 
     log_id: str | None
     moved: list[Moved]

@@ -70,7 +70,7 @@ class _Leftover:
     marked: int
     """How many of the scan's first chunks have a commit mark."""
     position: int
-    """Where these end in the file."""
+    """The byte in the file after the last of these."""
 
     @property
     def finishable(self) -> bool:

@@ -80,7 +80,7 @@ class Bridge:
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """What the envelopes contain and what they lack, by topic of detections."""
+        """The fields that envelopes contain and lack, by topic of detections."""
         return self._derivation.counts
 
     @property

@@ -123,7 +123,7 @@ class RecorderReport:
     unknown_keys: int = 0
     """Messages that came for a bridge's topics under keys of none, and were left out."""
     streams: tuple[tuple[str, Counts], ...] = ()
-    """What was made of each topic of detections of a bridge, and what that lacks."""
+    """The envelopes from each topic of detections of a bridge, and the fields that they lack."""
 
     @property
     def lost(self) -> int:

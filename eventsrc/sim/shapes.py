@@ -26,17 +26,17 @@ class Rect:
 
     @property
     def centre(self) -> Point:
-        """Its middle."""
+        """The coordinates of the centre."""
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
 
     @property
     def width(self) -> float:
-        """Its extent along x."""
+        """The extent along x."""
         return self.x1 - self.x0
 
     @property
     def height(self) -> float:
-        """Its extent along y."""
+        """The extent along y."""
         return self.y1 - self.y0
 
     def grown(self, by: float) -> "Rect":

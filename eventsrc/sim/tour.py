@@ -125,7 +125,7 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TruePose:
-    """Where the robot truly is, ``time_s`` seconds after its start: metres, radians."""
+    """The true pose of the robot ``time_s`` seconds after its start: metres, radians."""
 
     time_s: float
     x: float

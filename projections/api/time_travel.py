@@ -64,7 +64,7 @@ class Timeline:
         return [merge_document(known.history, each) for each in known.merges(self._offset(point))]
 
     def why(self, thing: str, point: int | str = "end") -> dict[str, Any]:
-        """What happened to a place or an object, as ``mapfold why --json``.
+        """The history of a place or an object, as ``mapfold why --json``.
 
         Raises NoSuchThing with the nearest names.
         """

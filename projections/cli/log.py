@@ -199,7 +199,7 @@ def info(log: LogArgument, json_: JsonOption = False) -> None:
 
 
 def info_document(report: LogInfo) -> dict[str, Any]:
-    """What `log info --json` prints."""
+    """The output of `log info --json`."""
     return {
         **asdict(report),
         "path": str(report.path),
@@ -334,7 +334,7 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
 
 
 def verification_document(result: Verification) -> dict[str, Any]:
-    """What `log verify --json` prints."""
+    """The output of `log verify --json`."""
     return {**asdict(result), "path": str(result.path)}
 
 

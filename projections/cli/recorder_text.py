@@ -129,7 +129,7 @@ def say_restart(log: Path, writer: LogWriter) -> None:
 
 
 def restart_as_json(writer: LogWriter) -> dict[str, int]:
-    """What was recovered and cut off, for ``--json``."""
+    """Counts of what a restart recovered and cut off, for ``--json``."""
     found = writer.restart
     return {
         "recovered_segments": found.recovered_segments,

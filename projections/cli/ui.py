@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _EVERY_ADDRESS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  not a bind
 """The address of this machine for a server that listens on all addresses."""
 _KINDS: Final = ("place", "object", "keyframe", "merge")
-"""What ``--select`` may name."""
+"""Values of ``--select``."""
 
 
 def ui(

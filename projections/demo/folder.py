@@ -46,7 +46,7 @@ class DemoFolder:
         return self.path / f"question-{crops}.json"
 
     def stderr_of(self, child: str) -> Path:
-        """Where a child process' stderr goes."""
+        """The file of a child process' stderr."""
         return self.path / f"{child}.txt"
 
 

@@ -120,7 +120,7 @@ def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
 
 
 def tell_corrected(corrected: Corrected) -> Iterator[str]:
-    """What was corrected, and the map under it."""
+    """The correction, and the map under it."""
     offsets = {recorded.command.kind: recorded.offset for recorded in corrected.commands}
     places = counted(len(corrected.folded.view.places), "place")
     if corrected.apart:
@@ -215,7 +215,7 @@ class DemoResult:
 def result_document(
     result: DemoResult, seconds: dict[str, float], folder: DemoFolder
 ) -> dict[str, Any]:
-    """What ``mapfold demo --json`` prints; ``seconds`` by stage."""
+    """The output of ``mapfold demo --json``; ``seconds`` by stage."""
     view, replayed = result.folded.view, result.replayed
     counts = view.counts()
     return {

@@ -179,7 +179,7 @@ class KnownHistory:
         return _before(self.history.object_merges, self._checked(end))
 
     def why(self, thing: str, end: Offset | None = None) -> Explanation:
-        """What happened to a place or an object, and which commands are about it.
+        """The history of a place or an object, and the commands about it.
 
         ``thing`` is an id, or the name of a place. Raises NoSuchThing with the nearest names.
         """

@@ -72,7 +72,7 @@ class Cause:
 
     @property
     def when(self) -> str:
-        """Its time, or its name where it has none."""
+        """The time of the event, or its name if it has no time."""
         return self.time or self.name
 
     @property
@@ -207,11 +207,11 @@ class PlaceHistory:
         )
 
     def change(self, end: Offset) -> PlaceChanged | None:
-        """Its size and sums after the events below ``end``."""
+        """The place's size and sums after the events below ``end``."""
         return last_before(self.changes, end)
 
     def name(self, end: Offset) -> str | None:
-        """Its name after the events below ``end``; None without a name."""
+        """The place's name after the events below ``end``; None without a name."""
         named = last_before(self.names, end)
         return None if named is None else named.name
 
@@ -249,19 +249,19 @@ class ObjectHistory:
         )
 
     def values(self, end: Offset) -> ObjectSeen | ObjectsMerged | None:
-        """Its count, sums and times after the events below ``end``."""
+        """The object's count, sums and times after the events below ``end``."""
         seen, merged = last_before(self.sightings, end), last_before(self.merges, end)
         if seen is None or merged is None or seen.obs_count > merged.values.obs_count:
             return seen
         return merged.values
 
     def class_name(self, end: Offset) -> str:
-        """Its class after the events below ``end``."""
+        """The object's class after the events below ``end``."""
         classified = last_before(self.classes, end)
         return self.found.class_name if classified is None else classified.class_name
 
     def looked_for(self, end: Offset) -> ObjectMissing | None:
-        """Its count of keyframes that should show it and do not, after the events below ``end``;
+        """The count of keyframes that should show it and do not, after the events below ``end``;
         None if it was relocated since."""
         looked, moved = last_before(self.misses, end), last_before(self.relocations, end)
         if looked is None or (moved is not None and moved.offset > looked.offset):

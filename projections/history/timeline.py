@@ -153,7 +153,7 @@ class Timeline:
     def why(
         self, thing: str, end: Offset | None = None, *, known_at: Offset | None = None
     ) -> Explanation:
-        """What happened to a place or an object; raises NoSuchThing with the nearest names."""
+        """The history of a place or an object; raises NoSuchThing with the nearest names."""
         return self._known(end, known_at).why(thing, end)
 
     def why_same(

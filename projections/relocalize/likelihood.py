@@ -104,8 +104,8 @@ class Terms:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What all crops of a question share: the map's constants, the question's camera, parameters,
-    walls."""
+    """Values that all crops of a question share: the map's constants, and the question's camera,
+    parameters and walls."""
 
     constants: MapConstants
     camera: Camera

@@ -45,7 +45,7 @@ class RankedPlace(TypedDict):
 
 
 class Pose(TypedDict):
-    """Where the robot is, in the map's frame."""
+    """The robot's pose in the map frame."""
 
     x: Metres
     y: Metres
@@ -180,7 +180,7 @@ class Refusal(TypedDict):
 
 
 class StateQuery(BaseModel):
-    """What is asked of a state."""
+    """Parameters of a question about the state."""
 
     x: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
         None, description="Metres in the map's frame; only with y."
