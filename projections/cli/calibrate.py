@@ -80,7 +80,8 @@ def calibrate_command(
     issued_by: Annotated[
         str | None,
         typer.Option(
-            metavar="USER@HOST", help="With --write: who gives the command [default: you]."
+            metavar="USER@HOST",
+            help="With --write: who gives the command [default: your user@host].",
         ),
     ] = None,
     connect: ConnectOption = None,

@@ -172,7 +172,7 @@ def detect(
             metavar="N",
             min=1,
             max=1024,
-            help="Threads of each model [default: one a core].",
+            help="Threads of each model [default: the number of cores].",
             rich_help_panel=_MODELS,
         ),
     ] = None,

@@ -67,7 +67,9 @@ _COMMON: dict[str, tuple[Any, Any]] = {
     "issued_by": (
         Annotated[
             str | None,
-            typer.Option(metavar="USER@HOST", help="Who gives the command [default: you]."),
+            typer.Option(
+                metavar="USER@HOST", help="Who gives the command [default: your user@host]."
+            ),
         ],
         None,
     ),

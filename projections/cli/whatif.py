@@ -97,7 +97,9 @@ def whatif(
     ] = None,
     processes: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Fold in this many processes [default: processors]."),
+        typer.Option(
+            metavar="N", min=1, help="Fold in this many processes [default: the number of cores]."
+        ),
     ] = None,
     settings_file: SettingsOption = None,
 ) -> None:

@@ -83,7 +83,10 @@ def _flags(option: Any) -> str:
 def _help(parameter: Any) -> str:
     """The help text with the default behind it, as ``--help`` shows it."""
     default = parameter.default
-    shown = parameter.show_default and not getattr(parameter, "is_flag", False)
+    shown = parameter.show_default
+    if getattr(parameter, "is_flag", False):  # --gaps and --no-gaps; --json alone has none to show
+        shown = shown and bool(parameter.secondary_opts)
+        default = (parameter.opts if default else parameter.secondary_opts or [""])[0].lstrip("-")
     if not shown or default is None or default == "" or callable(default):
         return str(parameter.help or "")
     return f"{parameter.help} [default: {getattr(default, 'value', default)}]"

@@ -45,6 +45,7 @@ def test_values_have_a_name_of_their_own(by_name: dict[str, Any]) -> None:
 def test_the_pages_have_the_defaults() -> None:
     assert "| `--seed N` | Which simulated house. [default: 7] |" in PAGE.read_text("utf-8")
     assert "Which simulated house. [default: 7]" in MAN_PAGE.read_text("utf-8")
+    assert "| `--zenoh, --no-zenoh` | Answer over Zenoh. [default: zenoh] |" in page()
 
 
 def test_the_default_of_connect_is_that_of_the_command(by_name: dict[str, Any]) -> None:
