@@ -110,7 +110,7 @@ def _read(name: str, suffix: str, file: BinaryIO) -> Trajectory:
     for one, other in pairwise(poses):
         if one.key == other.key:
             raise TrajectoryError(
-                f"{name}, line {other.line}: {by} {one.key!r} stands at line {one.line} too; "
+                f"{name}, line {other.line}: {by} {one.key!r} is on line {one.line} too; "
                 "keep one of them"
             )
     return Trajectory(name, by, poses, lines.is_open and kind != "JSON lines")

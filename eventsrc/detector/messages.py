@@ -145,7 +145,7 @@ def _pose_of_json(payload: bytes, received_s: float) -> tuple[float, Pose]:
         raise MessageError("a pose without the numbers x, y and yaw")
     stamp_s = received_s if stamp is None else stamp
     if not 0.0 <= stamp_s <= MAX_TIMESTAMP_S:
-        raise MessageError(f"a pose with the stamp {stamp_s:g}, which are no seconds since 1970")
+        raise MessageError(f"a pose with the stamp {stamp_s:g}, which is no Unix time")
     return stamp_s, _checked(float(numbers[0] or 0.0), float(numbers[1] or 0.0), yaw)
 
 

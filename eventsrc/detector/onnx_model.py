@@ -65,7 +65,7 @@ class OnnxModel:
         try:
             self._session = ort.InferenceSession(str(path), options, providers=wanted)
         except self._faults as fault:
-            raise ModelError(f"{path}: no ONNX model that runs here: {_reason(fault)}") from None
+            raise ModelError(f"{path}: cannot be loaded as ONNX: {_reason(fault)}") from None
         if device == "cuda" and self._session.get_providers()[0] != wanted[0]:
             raise MisuseError(
                 "--device cuda: onnxruntime could not start CUDA, whose libraries may be missing"

@@ -194,7 +194,7 @@ class ActiveSegment:
         try:
             if self._folder != identity_of(self._log):
                 raise self.disable(
-                    f"{fault}; {self._log} is another folder than it was. Put the right one back "
+                    f"{fault}; {self._log} was replaced by another folder. Put the right one back "
                     "and start again"
                 )
             self.close()
@@ -223,8 +223,8 @@ class ActiveSegment:
             raise LogError(self._failure)
 
     def _fail(self, error: OSError) -> LogError:
-        """Cut off what is half written and `disable` the segment. After a failed sync it is unknown
-        which pages are on the disk, and after a full disk the next write fails as well."""
+        """Cut off the half-written group and `disable` the segment. After a failed sync it is
+        unknown which pages are on the disk; after a full disk the next write fails as well."""
         message = (
             f"{self.path}: {error.strerror or error}: {self.waiting} events from offset "
             f"{self.committed} on could not be written; every event before it is safe. "

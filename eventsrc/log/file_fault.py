@@ -23,7 +23,7 @@ class Identity(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What is wrong with a file; ``whole`` if everything written to it is still in its place and
+    """The fault of a file; ``whole`` if everything written to it is still in its place and
     other bytes follow."""
 
     text: str

@@ -170,7 +170,7 @@ class _CrcReader:
         self.crc = 0
 
     def read(self, length: int) -> bytes:
-        """Exactly ``length`` bytes. Memory grows with what is there, not with what is declared."""
+        """Exactly ``length`` bytes. Memory grows with the bytes read, not with ``length``."""
         data = b"".join(self._pieces(length))
         self.crc = crc32(data, self.crc)
         return data
@@ -203,7 +203,7 @@ def _records(
         crc = source.crc
         opcode, length = FRAME.unpack(source.read(FRAME.size))
         if opcode == 0:  # as in a hole of a sparse file, which may be gigabytes of such "records"
-            raise BadRecord("zeros where a record should stand")
+            raise BadRecord("zeros where a record should be")
         if opcode not in (Opcode.CHUNK, Opcode.DATA_END, *opcodes):
             source.skip(length)
             if opcode == Opcode.FOOTER:

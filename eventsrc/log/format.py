@@ -174,18 +174,18 @@ def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
 def _checked_head(metadata: Metadata) -> dict[str, str]:
     values = _mcap.checked_metadata(metadata)
     if not _BASE.fullmatch(values.get("base", "")) or "log_id" not in values:
-        raise BadRecord("the segment's metadata names no log or no base")
+        raise BadRecord("the segment's metadata has no log id or no base")
     if not _SEED.fullmatch(values.get(MARK_SEED, "0")):
-        raise BadRecord("the segment's metadata names no good mark seed")
+        raise BadRecord("the segment's metadata has an invalid mark seed")
     if not _NANOSECONDS.fullmatch(values.get(BEGUN, "0")):
-        raise BadRecord("the segment's metadata names no good time")
+        raise BadRecord("the segment's metadata has an invalid time")
     return values
 
 
 ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
 UNREADABLE_VERSION = 0
-"""Of a channel whose version is not a number: forged, or another program's. Its events are read and
-not folded."""
+"""The version of a channel whose metadata has no number for it: forged, or of another program. Its
+events are read and not folded."""
 _VERSION = re.compile(r"[0-9]{1,9}")
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {

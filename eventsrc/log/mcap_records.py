@@ -248,7 +248,7 @@ def decode_mark(data: bytes, seed: int) -> tuple[Offset, Offset]:
         raise BadRecord("cut short inside a commit mark")
     opcode, _, first, following = _MARK.unpack_from(data)
     if opcode != MARK_OPCODE or seed_of_mark(data) != seed:
-        raise BadRecord("no commit mark where one should stand")
+        raise BadRecord("no commit mark where one should be")
     return first, following
 
 

@@ -262,7 +262,7 @@ class _Builder:
         self.sha256.update(data)
 
     def sync(self) -> None:
-        """Bring what is written to the disk."""
+        """Sync the bytes written so far."""
         sync_file(self._fd)
         if not self._cached:
             drop_cached(self._fd, self._synced, self._at)

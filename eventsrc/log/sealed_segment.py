@@ -76,7 +76,7 @@ class SealedFile(SegmentFile):
             raise BadRecord("no footer")
         footer = _mcap.decode_as(Footer, tail[_mcap.FRAME.size :])
         if not 0 < footer.summary_start <= size - _mcap.TAIL_BYTES:
-            raise BadRecord("the footer points nowhere")
+            raise BadRecord("the footer points outside the file")
         length = size - _mcap.TAIL_BYTES - footer.summary_start
         if length > _mcap.MAX_SUMMARY_BYTES:
             raise BadRecord(f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}")
@@ -152,7 +152,7 @@ def sealed_edges(text: str, base: Offset) -> list[Offset]:
     ValueError."""
     edges = [Offset(base + int(number)) for number in text.split(",")]
     if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
-        raise BadRecord("the seal names chunks in no order")
+        raise BadRecord("the chunk edges in the seal do not ascend")
     return edges
 
 
@@ -208,7 +208,7 @@ def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
         return _DATA_END_BYTES, "no magic at its end"
     start = int.from_bytes(tail[9:17], "little")
     if not _DATA_END_BYTES < start < size:
-        return _DATA_END_BYTES, "the footer points nowhere"
+        return _DATA_END_BYTES, "the footer points outside the file"
     if size - start > _mcap.MAX_SUMMARY_BYTES + _mcap.TAIL_BYTES:
         return _DATA_END_BYTES, f"the footer claims a summary of {size - start:,} bytes"
     return start, None

@@ -206,7 +206,7 @@ class EventFindings:
         self._logged_ns = 0
 
     def begin_segment(self, *, imported: bool) -> None:
-        """Go on with the next segment; one that was imported may be older than what is before."""
+        """Begin the next segment. Events of an imported one may be older than those before it."""
         if imported:
             self._logged_ns = 0
 

@@ -80,7 +80,7 @@ class Bridge:
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """The fields that envelopes contain and lack, by topic of detections."""
+        """Counts of the envelopes made, by topic of detections."""
         return self._derivation.counts
 
     @property

@@ -66,7 +66,7 @@ class NewerCommand(MapfoldError):
 
 
 class NoAnswer(TransportError):
-    """No recorder answered: none of this log takes commands, or the answer was lost."""
+    """No recorder replied: none of this log accepts commands, or the reply was lost."""
 
 
 def send_command(

@@ -121,9 +121,9 @@ class RecorderReport:
     unread: tuple[tuple[str, int, str], ...] = ()
     """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
     unknown_keys: int = 0
-    """Messages that came for a bridge's topics under keys of none, and were left out."""
+    """Messages of a bridge left out, since their keys belong to no recorded topic."""
     streams: tuple[tuple[str, Counts], ...] = ()
-    """The envelopes from each topic of detections of a bridge, and the fields that they lack."""
+    """Counts of the envelopes made, by topic of detections of a bridge."""
 
     @property
     def lost(self) -> int:

@@ -110,7 +110,7 @@ class Refusals(BaseModel):
 
 
 def sent_key(key: str) -> str:
-    """The key of the progress of what is sent under ``key``; both may be key expressions."""
+    """The key of the `Sent` messages about ``key``; both may be key expressions."""
     return key + SENT_SUFFIX
 
 

@@ -310,7 +310,7 @@ class Spool:
         return self._count
 
     def close(self) -> None:
-        """Release the file to other processes. What waits stays in it."""
+        """Release the file to other processes. Waiting envelopes stay in it."""
         with self._lock:
             self._db.close()
 

@@ -48,7 +48,7 @@ def bernoulli(rng: np.random.Generator, probability: float) -> bool:
 
 
 def unit(vector: Vector) -> Vector:
-    """``vector`` scaled to length 1; the sum is correctly rounded, whatever the hardware."""
+    """``vector`` scaled to length 1; the sum is correctly rounded on any hardware."""
     length = math.sqrt(math.fsum((vector * vector).tolist()))
     scaled: Vector = vector / length
     return scaled

@@ -79,7 +79,7 @@ class transport_errors:  # noqa: N801 (used as a function is)
         if isinstance(error, zenoh.ZError):
             raise TransportError(f"{self._place}: {one_line(error)}") from None
         if is_panic(error):
-            raise TransportError(f"{self._place}: Zenoh failed inside: {one_line(error)}") from None
+            raise TransportError(f"{self._place}: Zenoh panicked: {one_line(error)}") from None
 
 
 @contextlib.contextmanager

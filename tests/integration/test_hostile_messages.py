@@ -122,7 +122,7 @@ def test_a_panic_of_zenoh_is_a_transport_error(endpoint: str) -> None:
     assert done.returncode == 0, done.stderr
     *panics, last = done.stdout.splitlines()
     assert len(panics) == 2
-    assert all(line.startswith("here: Zenoh failed inside: ") for line in panics)
+    assert all(line.startswith("here: Zenoh panicked: ") for line in panics)
     assert last == "interrupted"
 
 

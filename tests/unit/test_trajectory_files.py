@@ -92,7 +92,7 @@ def test_the_content_says_the_format_whatever_the_name(tmp_path: Path, name: str
         ("1 2 3 0 0 0 0 0\n", "line 1: the quaternion has length 0 instead of 1"),
         ("1774357234500000000 2 3 0 0 0 0 1\n", "it looks like nanoseconds"),
         ("-1 2 3 0 0 0 0 1\n", "line 1: stamp -1: not seconds"),
-        ("1 2 3 0 0 0 0 1\n\n1 2 3 0 0 0 0 1\n", "line 3: stamp 1.0 stands at line 1 too"),
+        ("1 2 3 0 0 0 0 1\n\n1 2 3 0 0 0 0 1\n", "line 3: stamp 1.0 is on line 1 too"),
         ("one,two\n1,2\n", "line 1: neither keyframe_id nor stamp among one, two"),
         ("stamp,x,yaw\n1,2,3\n", "line 1: no y among stamp, x, yaw"),
         ("stamp,x,y\n1,2,3\n", "line 1: neither yaw nor qx, qy, qz, qw"),
