@@ -37,7 +37,8 @@ _RETRY_AFTER: Final = {"Retry-After": "1"}
 _ABOUT: Final = """Answers come from the map as it is in the databases when they are asked.
 
 Every refusal is `{"error": {"kind", "message"}}`. HEAD is answered like GET, without the body. A
-parameter that a path does not have, that is empty or that is given twice is refused with 400.
+parameter that a path does not have, that is empty or that is given twice is refused with 400,
+except at `/health` and `/metrics`: monitors add parameters of their own.
 """
 
 
@@ -125,7 +126,6 @@ def create_app(
         summary="200 while questions can be answered, else 503",
         response_model=Health,
         responses=refusals(asking=True),
-        dependencies=[only()],
     )
     async def health(request: Request) -> Response:
         return await answered(request, "health", answerer.health)
@@ -135,7 +135,6 @@ def create_app(
         summary="Numbers for Prometheus",
         response_class=Response,
         responses=METRICS | refusals(),
-        dependencies=[only()],
     )
     async def metrics_text() -> Response:
         return Response(counted.text(), media_type=METRICS_TYPE)
