@@ -54,12 +54,10 @@ def append_payload(
     *,
     logged_ns: int | None = None,
     max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
-    version: int | None = None,
 ) -> Result:
     """Append ``payload``, received under ``key``, and return the result of its validation.
 
-    ``logged_ns`` is the time of receipt, by default the current time. ``version`` is the envelope
-    version that another log has recorded it in; by default it is detected.
+    ``logged_ns`` is the time of receipt, by default the current time.
     """
     logged = writer.now_ns() if logged_ns is None else logged_ns
     (checked,) = check_payloads(
@@ -67,7 +65,6 @@ def append_payload(
         first=writer.next_offset,
         logged_ns=logged,
         max_bytes=max_bytes,
-        version=version,
     )
     writer.append_all([checked_event(key, payload, checked, logged)])
     return checked.result
@@ -99,7 +96,8 @@ def check_payloads(
 
     ``first`` and ``logged_ns`` stand in for the keyframe id and the time of a bare list
     (`eventsrc.upcast`), which has neither. For validation any offset and any time will do, so both
-    may be earlier than those that the events get.
+    may be earlier than those that the events get. ``version`` is the envelope version that another
+    log has recorded them in; by default it is detected.
     """
     pending = [
         PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
-from eventsrc.clock import Clock, system_clock
+from eventsrc.clock import system_clock
 from eventsrc.envelope import MAX_TIMESTAMP_S
 from eventsrc.errors import MisuseError
 from eventsrc.text import visible
@@ -135,7 +135,7 @@ def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[Picture]:
         video.close()
 
 
-def _from_stdin(read: Read, timing: Timing, clock: Clock = system_clock) -> Iterator[Picture]:
+def _from_stdin(read: Read, timing: Timing) -> Iterator[Picture]:
     """The pictures of a stream if it begins like a picture, else those of a path a line."""
     start = b""
     while len(start) < len(PNG_START) and b"\n" not in start:
@@ -144,17 +144,17 @@ def _from_stdin(read: Read, timing: Timing, clock: Clock = system_clock) -> Iter
             break
         start += piece
     if start.startswith((JPEG_START, PNG_START)):
-        yield from _from_stream(start, read, timing, clock)
+        yield from _from_stream(start, read, timing)
     elif start.strip():
         yield from _from_paths(_paths(start, read), timing)
 
 
-def _from_stream(start: bytes, read: Read, timing: Timing, clock: Clock) -> Iterator[Picture]:
+def _from_stream(start: bytes, read: Read, timing: Timing) -> Iterator[Picture]:
     pending = [start]
     parts = split_stream(lambda size: pending.pop() if pending else read(size))
     for index, part in enumerate(parts):
         stamp_s = timing.stamp_s(index)
-        stamp_s = clock() / 1e9 if stamp_s is None else stamp_s
+        stamp_s = system_clock() / 1e9 if stamp_s is None else stamp_s
         yield Picture(f"stdin, picture {index}", stamp_s, _decoder(part))
 
 

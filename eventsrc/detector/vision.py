@@ -119,10 +119,10 @@ def colour_order(pixels: NDArray[np.uint8], order: Literal["rgb", "mono"]) -> Pi
     return turned
 
 
-def encode_jpeg(pixels: Pixels, quality: int = JPEG_QUALITY) -> bytes:
+def encode_jpeg(pixels: Pixels) -> bytes:
     """A JPEG of the pixels."""
     cv2 = _cv2()
-    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise PictureError("it cannot be encoded as JPEG")
     return bytes(data)
@@ -169,11 +169,6 @@ class Letterbox:
         offset, scale = np.array(self.offset * 2), np.array(self.scale * 2)
         limit = np.array((self.width, self.height) * 2, np.float64)
         moved: NDArray[np.float64] = np.clip((boxes - offset) / scale, 0.0, limit)
-        return moved
-
-    def to_input(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes in the picture as pixels of the input."""
-        moved: NDArray[np.float64] = boxes * np.array(self.scale * 2) + np.array(self.offset * 2)
         return moved
 
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
 
 from eventsrc.errors import MapfoldError
 from eventsrc.grid_messages import read_grid_message
@@ -18,8 +17,6 @@ from eventsrc.ros.stream import Counts
 from .bag_files import Bag, BagContents, bag_name
 from .bag_streams import BagOptions, Choice, choose, sampled
 from .source import ImportedMessage
-
-_CDR: Final = "cdr"
 
 
 @dataclass(frozen=True)

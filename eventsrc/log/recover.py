@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from eventsrc.advised import advised
-from eventsrc.clock import Clock, system_clock
+from eventsrc.clock import system_clock
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.progress import reported
@@ -90,9 +90,7 @@ class RecoveryReport:
         return lost or bool(self.moved)
 
 
-def recover_log(
-    log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES, clock: Clock = system_clock
-) -> RecoveryReport:
+def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryReport:
     """Recover a log.
 
     Raises LogNotFound, NotALog or LogBusy; LogDamaged when its segments belong to two logs in equal
@@ -102,7 +100,7 @@ def recover_log(
     if not (log.is_dir() and half_renamed(log)):
         segments_of(log)
     try:
-        with WriterLock(log, clock):
+        with WriterLock(log, system_clock):
             return _Recovery(log, max_losses).run()
     except OSError as error:
         raise LogError(

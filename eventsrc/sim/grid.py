@@ -16,7 +16,6 @@ from eventsrc.errors import MapfoldError
 
 from .shapes import Point, Rect, Walls, rect_clearance
 
-ROBOT_RADIUS_M = 0.18
 CLEARANCE_M = 0.28
 _COMFORT_M = 0.45
 _CELL_M = 0.1

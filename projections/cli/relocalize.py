@@ -17,6 +17,7 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.errors import QuestionError
+from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
 from projections.relocalize import (
     UNKNOWN_BELOW,
@@ -126,8 +127,9 @@ def relocalize(
             with LogReader(log) as reader:
                 end = point(reader, as_of or "end")
                 corrections = read_corrections(reader, end)
-            settings = past_settings(log, settings_file, set_, corrections)
-            search = ExactIndex.of_log(log, str(end), settings, corrections=corrections).search
+                settings = past_settings(log, settings_file, set_, corrections)
+                _, view = fold_log(reader, settings, end, corrections=corrections)
+            search = ExactIndex(view).search
             say_defaults(settings)
         if track:
             print_tracked(lines, search, top=top, camera=camera)

@@ -6,20 +6,18 @@ missing and where it moved.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from eventsrc.envelope import Offset
 from eventsrc.text import counted
-from projections.deltas import MergeEvidence, ObjectEstimated, ObjectMissing, ObservationOrdinal
+from projections.deltas import MergeEvidence, ObjectEstimated, ObjectMissing
 from projections.exact import UM_PER_M
 from projections.model.records import Estimate
 
 from .history import History
 from .records import ObjectHistory, last_before
 
-ClassOf = Callable[[ObservationOrdinal], str]
-"""The class of an observation."""
 _NATS = 1000
 
 

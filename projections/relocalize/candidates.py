@@ -12,24 +12,18 @@ last bit.
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope import RunId
-from eventsrc.log import LogReader
-from eventsrc.log.seek import Note, resolve
 from eventsrc.text import counted
-from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import QuestionError
 from projections.exact import Q40, quantise
-from projections.model.fold import fold_log
 from projections.model.records import Estimate
 from projections.model.view import MapView
-from projections.settings import Settings
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
 from .question import Box, Crop, Vector, describe_value
@@ -139,24 +133,6 @@ class ExactIndex:
         self.constants = MapConstants.of(view.settings, self._different())
         maps = view.maps_in_force()
         self._walls = {floor: WallMap(given.map) for floor, given in maps.items()}
-
-    @classmethod
-    def of_log(
-        cls,
-        log: Path,
-        point: str,
-        settings: Settings,
-        *,
-        note: Note | None = None,
-        corrections: Corrections = NO_CORRECTIONS,
-    ) -> Self:
-        """The index of the map at ``point`` of a log: offset, ISO time, run:keyframe or end.
-
-        ``note`` is called with remarks for the user about ``point`` (`eventsrc.log.seek.resolve`).
-        """
-        with LogReader(log) as reader:
-            end = resolve(reader, point, note=note)
-            return cls(fold_log(reader, settings, end, corrections=corrections)[1])
 
     def _different(self) -> Cosines:
         """The statistics of cosines between different things in one picture, over a sample."""

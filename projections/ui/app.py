@@ -62,11 +62,11 @@ class StaticFile(NamedTuple):
     etag: str
 
 
-def static_files(folder: Path = _FOLDER) -> dict[str, StaticFile]:
+def static_files() -> dict[str, StaticFile]:
     """The files by URL path; ``/`` is index.html."""
     found = {
-        f"/{path.relative_to(folder).as_posix()}": _read(path)
-        for path in sorted(folder.rglob("*"))
+        f"/{path.relative_to(_FOLDER).as_posix()}": _read(path)
+        for path in sorted(_FOLDER.rglob("*"))
         if path.is_file() and not path.name.startswith(".")
     }
     found["/"] = found.get("/index.html") or _static(_NO_PAGE, "text/html")

@@ -76,7 +76,7 @@ def test_a_letterbox_is_undone(
     assert 1 <= box.inner[1] <= size[1]
     assert box.inner[0] == size[0] or box.inner[1] == size[1]
     in_picture = np.array([at]) * np.array((width, height) * 2)
-    laid = box.to_input(in_picture)
+    laid = in_picture * np.array(box.scale * 2) + np.array(box.offset * 2)
     assert (laid >= 0).all()
     assert (laid <= np.array(size * 2) + 1e-6).all()
     assert np.allclose(box.to_picture(laid), in_picture, atol=1e-6)

@@ -5,7 +5,6 @@ import math
 
 import pytest
 
-from eventsrc.sim.grid import ROBOT_RADIUS_M
 from eventsrc.sim.house import House, build_house
 from eventsrc.sim.shapes import Segment, wrap
 from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, drive, keyframes, plan_tour
@@ -15,6 +14,7 @@ pytestmark = pytest.mark.seconds
 
 SEEDS_AND_RUNS = [(7, "a"), (7, "b"), (3, "a"), (12, "c")]
 Drive = tuple[House, str, list[TruePose]]
+ROBOT_RADIUS_M = 0.18
 
 
 @pytest.fixture(params=mostly_slow((each,) for each in SEEDS_AND_RUNS), ids=str, scope="module")
