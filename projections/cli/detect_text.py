@@ -50,7 +50,7 @@ def metrics_of(address: tuple[str, int], detection: Detection) -> Iterator[None]
         waiting = counters.pop("waiting")
         found = [
             MetricValue(
-                f"mapfold_detect_{name}", f"As {name} of `mapfold detect --json`.", number, True
+                f"mapfold_detect_{name}", f"As {name} in the report of detect --json.", number, True
             )
             for name, number in counters.items()
             if type(number) is int

@@ -47,9 +47,7 @@ def spool(
         raise MisuseError("--retry and --discard: give one of them")
     path = file or spool_path()
     if not path.is_file():
-        raise MisuseError(
-            f"{path}: no such file; give a robot's spool, the --spool of `mapfold detect`"
-        )
+        raise MisuseError(f"{path}: no such file; give the file that a detector got as --spool")
     if not Spool.is_spool(path):
         raise MisuseError(f"{path}: another program's database; give a spool")
     opened = Spool(path)
