@@ -11,8 +11,8 @@
   younger ones are acknowledged, it was lost, and everything from it on is sent again; otherwise
   lost envelopes would fill the window for good. The same holds when the last subscriber has left
   and another has come, however soon.
-* Progress (`Sent`) is published at most twice a second and at the end, so that a recorder can also
-  miss the last keyframes of a run.
+* Progress (`Sent`) is published at most twice a second and at the end, so that a recorder also
+  finds when the last keyframes of a run are missing.
 * Refused envelopes are quarantined: sending them again would block everything behind them.
 * Acks and refusals arrive on Zenoh's thread, which only queues them. They are applied whether or
   not there is a subscriber: a recorder sends its last acks just after it has unsubscribed.
@@ -68,9 +68,8 @@ class Sender:
         self._changed = threading.Condition()
         self._answers: deque[Ack | Refusals] = deque()
         self._sent = 0  # the highest seq that was ever sent
-        self._unreported: dict[
-            RunId, int
-        ] = {}  # by run: the highest keyframe sent, not reported yet
+        self._unreported: dict[RunId, int] = {}
+        """By run: the highest keyframe sent, if its progress is not published yet."""
         self._progress_due_s = 0.0
         self._woken = self._stopping = False
         self._failure: TransportError | None = None

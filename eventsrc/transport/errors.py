@@ -84,6 +84,6 @@ class transport_errors:  # noqa: N801 (used as a function is)
 
 @contextlib.contextmanager
 def ignore_transport_errors() -> Iterator[None]:
-    """Ignore what Zenoh raises while something is closed: there is nothing left to do about it."""
+    """Ignore exceptions of Zenoh within a ``with`` block that closes something."""
     with contextlib.suppress(TransportError), transport_errors("closing"):
         yield
