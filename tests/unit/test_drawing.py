@@ -2,6 +2,7 @@
 
 import re
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -127,12 +128,10 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     assert any("lost robot" in text for text in texts)
 
 
-@pytest.mark.slow
-def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
-    view = _two_places()
-    for number in range(3, 300):
-        box = (0.0, 0.0, 1.0, 1.0)
-        name = f"a rather long class name {number}"
+def _add_objects(view: MapView, names: Iterable[str]) -> None:
+    """Objects of these classes, from number 3 on, all at one spot."""
+    box = (0.0, 0.0, 1.0, 1.0)
+    for number, name in enumerate(names, start=3):
         view.apply(
             d.ObservationAdded(
                 number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False
@@ -140,6 +139,12 @@ def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
         )
         view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
         view.apply(d.ObjectSeen(2, number, number, 0, 2, 4_000_000, 1_000_000, 0.0, 0.0))
+
+
+@pytest.mark.slow
+def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
+    view = _two_places()
+    _add_objects(view, (f"a rather long class name {number}" for number in range(3, 300)))
     texts = _texts(compose(view, "", Floor()))
     drawn = sum(text.startswith("a rather long") for text in texts)
     assert 0 < drawn < 297
@@ -160,17 +165,8 @@ def test_a_lost_robot_without_an_estimate_is_drawn_too(tmp_path: Path) -> None:
 def test_a_class_may_be_called_anything(tmp_path: Path, suffix: str) -> None:
     """``$…$`` is not parsed as a formula, and letters that the font lacks raise no warning."""
     view, out = _two_places(), tmp_path / f"map.{suffix}"
-    for number, name in enumerate(
-        ("$\\frac$", "a $x$ $b", "\u2615 \U0001f916", "\u65e5\u672c"), start=3
-    ):
-        box = (0.0, 0.0, 1.0, 1.0)
-        view.apply(
-            d.ObservationAdded(
-                number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False
-            )
-        )
-        view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
-        view.apply(d.ObjectSeen(2, number, number, 0, 2, 4_000_000, 1_000_000, 0.0, 0.0))
+    names = "$\\frac$", "a $x$ $b", "\u2615 \U0001f916", "\u65e5\u672c"
+    _add_objects(view, names)
     draw_map(view, out, title="lo$g$")
     assert out.stat().st_size > 10_000
     assert suffix != "svg" or ">lo$g$</text>" in out.read_text("utf-8")
