@@ -162,7 +162,7 @@ def test_crops_are_recorded_under_a_prefix(tmp_path: Path) -> None:
     [
         ((), "Missing option '--encoder'"),
         (("--encoder", "none.onnx"), "none.json: No such file or directory"),
-        (("--encoder", "text.onnx"), "no ONNX model"),
+        (("--encoder", "text.onnx"), "cannot be loaded as ONNX"),
         (("--encoder", "text.onnx", "--device", "tpu"), "--device tpu"),
     ],
 )

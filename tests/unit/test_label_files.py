@@ -54,7 +54,7 @@ def test_what_is_no_list_is_one_line(content: bytes, reason: str, tmp_path: Path
 
 def test_numbers_are_no_names(tmp_path: Path) -> None:
     (tmp_path / "labels").write_text('["a", 1]')
-    with pytest.raises(MisuseError, match="no list of names"):
+    with pytest.raises(MisuseError, match="not a list of names"):
         labels_by_number(tmp_path / "labels")
     with pytest.raises(MisuseError, match="check the path"):
         labels_by_number(tmp_path / "none")
