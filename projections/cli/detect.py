@@ -300,15 +300,13 @@ def detect(
     """
     if detector is None or encoder is None:
         say(WITHOUT_MODELS)
-        given = [name for name, path in (("--detector", detector), ("--encoder", encoder)) if path]
-        missing = [name for name in ("--detector", "--encoder") if name not in given]
+        models = (("--detector", detector), ("--encoder", encoder))
+        missing = [name for name, path in models if path is None]
         raise MisuseError(f"no {' and no '.join(missing)} given")
     check_sources(images, zenoh_image, poses, zenoh_pose)
     timing = timing_of(start, fps)
     if out is not None and keep_crops:
-        raise MisuseError(
-            "--keep-crops publishes crops, and --out publishes nothing; give one of them"
-        )
+        raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
     check_key(key, "--key")
     address = None if metrics is None else parse_address(metrics, "--metrics")
     name = run_id_of(run_id)
@@ -368,8 +366,7 @@ def detect(
         detection.close(wait)
     report = detection.report()
     say(summary(name, report, where))
-    kept_in = spool or spool_path()
-    for line in advice(report, live, posed=bool(poses or zenoh_pose), spool=kept_in):
+    for line in advice(report, live, posed=bool(poses or zenoh_pose), spool=spool or spool_path()):
         say(line)
     if json_:
         emit({"run_id": name, "space": opened.name, **as_document(report)})

@@ -307,7 +307,7 @@ def test_a_picture_of_8k(stage: Stage, tmp_path: Path) -> None:
         (("--images", "camera", "--start", "noon"), "neither seconds since 1970 nor an ISO time"),
         (("--images", "camera", "--fps", "-1"), "a number above 0"),
         (("--images", "camera", "--run-id", "a\nb"), "printable characters"),
-        (("--images", "camera", "--keep-crops"), "--out publishes nothing"),
+        (("--images", "camera", "--keep-crops"), "but --out nothing"),
         (("--images", "camera", "--detector", "text.onnx"), "cannot be loaded as ONNX"),
         (("--images", "camera", "--detector", "gone.onnx"), "no such model"),
         (("--images", "camera", "--encoder", "detector.onnx"), "detector.json: No such file"),
