@@ -48,8 +48,17 @@ def opened(page: Page, url: str) -> Page:
     return page
 
 
+def digest(page: Page) -> str:
+    """The digest shown, when the page has it."""
+    shown = page.locator(".digest code[data-digest]:not([data-digest=''])")
+    shown.wait_for()
+    return shown.get_attribute("data-digest") or ""
+
+
 def pixels(page: Page, side: str = "main") -> str:
-    """What a map's canvas shows, without what lies over it, when drawing has rested."""
+    """What a map's canvas shows, without what lies over it, when drawing has rested. The types of
+    places are drawn when they come with the digest."""
+    digest(page)
     drawn = "side => document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
     before = ""
     while (now := str(page.evaluate(drawn, side))) != before:

@@ -22,7 +22,7 @@ from tests.commands import Commands
 from tests.envelopes import payload
 from tests.logs import KEY, write_log
 from tests.property.test_floors import drive
-from tests.ui.browser import pixels
+from tests.ui.browser import digest, pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
 from tests.ui_server import UiServer, showing
@@ -247,7 +247,7 @@ def test_the_state_taken_away_has_types_and_floors(
 ) -> None:
     log, server = building
     page = visit(server, "#at=500")
-    page.wait_for_selector(".digest code:not([data-digest=''])")
+    digest(page)
     page.get_by_role("button", name="Take away").click()
     with page.expect_download() as waiting:
         page.get_by_role("menuitem", name="State as JSON").click()

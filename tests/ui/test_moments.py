@@ -15,7 +15,7 @@ from projections.model.view import MapView
 from projections.reducers.semantic_map import SemanticMap
 from projections.settings import Settings
 from tests.commands import Commands
-from tests.ui.browser import pixels, point_over
+from tests.ui.browser import digest, pixels, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui_server import UiServer
 
@@ -31,13 +31,6 @@ def go(page: Page, at: int) -> None:
 
 def moment(page: Page) -> int:
     return int(page.get_by_role("slider", name="Moment").get_attribute("aria-valuenow") or "-1")
-
-
-def digest(page: Page) -> str:
-    """The digest shown, when the page has it."""
-    shown = page.locator(".digest code[data-digest]:not([data-digest=''])")
-    shown.wait_for()
-    return shown.get_attribute("data-digest") or ""
 
 
 def test_the_map_at_a_moment_is_that_of_state(

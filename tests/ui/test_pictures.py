@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.ui.browser import digest
 from tests.ui.conftest import Visit
 from tests.ui_server import UiServer
 
@@ -34,7 +35,7 @@ def test_pictures(sample: UiServer, visit: Visit, pictures: Path, size: str, sch
         page.goto("about:blank")
         page.goto(origin + address)
         page.wait_for_selector("html[data-painted]")
-        page.wait_for_selector(".digest code:not([data-digest=''])")
+        digest(page)
         _settled(page, state)
         page.screenshot(path=pictures / f"{state}-{size}-{scheme}.png")
         assert page.evaluate("() => document.documentElement.scrollWidth") <= width
