@@ -116,6 +116,7 @@ def test_finding_the_event_that_made_a_condition_true(
     field = page.get_by_role("combobox", name="Condition over the map")
     field.click()
     page.keyboard.type("same")
+    expect(page.get_by_role("option").first).to_contain_text("same_place")
     page.keyboard.press("Tab")
     page.keyboard.type("sim-7-a:10")
     expect(page.get_by_role("option").first).to_contain_text("sim-7-a:10")
