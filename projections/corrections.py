@@ -52,7 +52,7 @@ Pose: TypeAlias = tuple[float, float, float]
 
 
 class Keyframe(NamedTuple):
-    """A keyframe by what the log calls it."""
+    """The identity of a keyframe in a log."""
 
     run_id: RunId
     keyframe_id: KeyframeId
@@ -138,7 +138,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         )
 
     def without_names(self) -> "Corrections":
-        """The same without names of places, which change no place."""
+        """These corrections without names of places, which change nothing else."""
         return msgspec.structs.replace(self, names=())
 
     def differs_in_names_only(self, other: "Corrections") -> bool:
@@ -167,8 +167,8 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         return pose
 
     def pose_command(self, envelope: Envelope, is_good: Callable[[Pose], bool]) -> RecordedCommand:
-        """The command that makes the envelope's corrected pose one that is not good: the last one
-        that does so to a pose that was good. Raises ValueError if the corrected pose is good."""
+        """The command that invalidates the envelope's pose: the last one that turns a good pose
+        into one that is not. Raises ValueError if the corrected pose is good."""
         pose, good, found = _logged_pose(envelope), True, None
         for recorded in self.in_force:
             command = recorded.command

@@ -5,7 +5,7 @@ MapfoldError
 ├── LogPointError               2  a point in the log does not exist
 ├── QuestionError               2  a question about the map cannot be asked as it is
 ├── FoldError                   1  an event cannot be folded; names its offset
-│   └── ImpossibleCommand       1  it could be, but for a command
+│   └── ImpossibleCommand       1  a command makes it one that cannot be folded
 └── DatabaseError               1  a database cannot be used as asked
     ├── DatabaseUnavailable     1  no server answers, or it refused the connection
     ├── ExtensionMissing        1  the server lacks AGE or pgvector

@@ -181,7 +181,7 @@ def _blocks(walls: Walls, side: int) -> Walls:
 
 
 def _cells(blocks: Walls, side: int, shape: tuple[int, ...]) -> Walls:
-    """Blocks as cells."""
+    """The value of each cell: that of its block."""
     cells: Walls = blocks.repeat(side, axis=0).repeat(side, axis=1)[: shape[0], : shape[1]]
     return cells
 

@@ -6,7 +6,7 @@ github.com/allenai/procthor, Apache License 2.0), which rate about a hundred cla
 living rooms, bedrooms and bathrooms as never, sometimes or often. Those ratings say where a thing
 may stand, not in what share of rooms it does: the shares, the other types and the classes that
 ProcTHOR does not have are estimates of our own. So this is a small table made by hand, guided by a
-published one. docs/decisions/place-types.md tells how well it does.
+published one. docs/decisions/place-types.md has its accuracy.
 
 There are five grades of the share of rooms that have at least one: 90, 50, 20, 5 and 0.7 %.
 """

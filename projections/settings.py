@@ -96,8 +96,8 @@ class LocalizerConstants(BaseModel):
     confidence_scale: _Scale = 1.0
     confidence_count: _Count = 0
     text_shift: Annotated[float, Field(ge=-2.0, le=2.0)] = 0.45
-    """The difference of a text's cosine with a picture from that of two pictures of different
-    things of one class; added before it is compared with cosines of pictures."""
+    """How much lower a text's cosine with a picture is than that of two pictures of different
+    things of one class; added to it before it is compared with cosines of pictures."""
 
 
 _YOUNGER = {
@@ -121,7 +121,8 @@ class Settings(BaseModel):
     fusion_radius_m: Annotated[float, Field(gt=0.0, le=1000.0)] = 3.0
     """An observation may fuse with an Object whose mean position is within this distance."""
     fusion_similarity: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.7
-    """… and whose mean embedding has at least this cosine with the observation's."""
+    """An observation may fuse with an Object whose mean embedding has at least this cosine with
+    the observation's."""
     embedding_model: Text | None = None
     """The map's embedding model; None takes that of the first embedded detection."""
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
@@ -140,8 +141,8 @@ class Settings(BaseModel):
     rooms: RoomsConstants = RoomsConstants()
     """The constants of places by rooms."""
     floor_height_m: Annotated[float, Field(ge=0.5, le=1000.0)] = 3.0
-    """From floor to floor: of envelopes with a height ``map_z`` but no ``floor``, the floor is the
-    number of these that is nearest to the height."""
+    """The height of a storey. An envelope with a height ``map_z`` but no ``floor`` is on the floor
+    whose number times this is nearest to ``map_z``."""
 
     @model_validator(mode="before")
     @classmethod

@@ -24,7 +24,7 @@ def wall_segments(given: OccupancyMap) -> list[list[float]]:
     while True:
         mask = pooled(walls, step)
         across, along = _turns(mask), _turns(mask.T)
-        # Each segment is two turns: counted before they are made, of noise there are millions.
+        # A segment has two turns. They are counted first: a noisy map has millions of segments.
         if np.count_nonzero(across) + np.count_nonzero(along) <= 2 * MOST_SEGMENTS:
             ends = np.concatenate([_segments(across), _segments(along)[..., ::-1]])
             return _in_map_frame(given, ends * step * given.resolution)

@@ -48,10 +48,10 @@ class WorkerProcess:
         except OSError as error:
             raise ProcessGone(str(error)) from error
 
-    def send(self, question: bytes) -> None:
-        """Send it a question. Raises ProcessGone."""
+    def send(self, request: bytes) -> None:
+        """Send a request. Raises ProcessGone."""
         try:
-            self._connection.send_bytes(question)
+            self._connection.send_bytes(request)
         except OSError as error:
             raise ProcessGone(str(error)) from error
 

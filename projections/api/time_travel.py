@@ -1,4 +1,4 @@
-"""`Timeline` for scripts and notebooks: the maps of one log at every point, and why they are so."""
+"""`Timeline` for scripts and notebooks: maps of one log at any point, and how they came about."""
 
 from pathlib import Path
 from typing import Any

@@ -17,8 +17,8 @@ LEAST_OF_A_CLASS = 4
 _MAD = 1.4826
 """A normal distribution's standard deviation, in units of its median absolute deviation."""
 _FEWEST_LEFT = 0.05
-"""Least share of a variance left in a residual: an observation whose leverage is nearly 1 has no
-information."""
+"""Share of an observation's variance that its residual must show for full weight; it shows less if
+the leverage is nearly 1."""
 _CAP = 25.0
 """Cap of squared residuals, in variances, which limits the effect of boxes of other things."""
 _ROUNDS = 200

@@ -42,7 +42,7 @@ CONFIDENCE_USUAL = Line(0.93, -0.24)
 KNOWN_FIRMNESS, CONFIDENCE_FIRMNESS = 12.0, 64.0
 """The precision of the prior of a map's line: that of its shift; that of its scale is four times as
 much. A question whose logit is near 0 has a precision of a quarter. How near poses are on own
-questions hangs on the tour as much as on the map, so that line hardly moves."""
+questions depends on the drive as much as on the map, so the line of `confidence` hardly moves."""
 _FIRM = 1e-9
 _ROUNDS = 60
 _ENOUGH = 1e-12

@@ -213,8 +213,8 @@ def localiser_text(own: OwnScores) -> str:
     if count < FEW:
         seen = "question" if count == 1 else "questions"
         tables += (
-            f"{count} {seen} about what was seen at another time: the figures say little, and"
-            " re-localisation's numbers stay near those of other maps\n"
+            f"{count} {seen} about what was seen at another time: too few for reliable figures, so"
+            " re-localisation is hardly corrected\n"
         )
     return tables
 

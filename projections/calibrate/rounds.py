@@ -50,7 +50,7 @@ class Round:
 
 def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
     """Estimate the constants from a map that was folded with ``used``, drawn towards ``prior``."""
-    with np.errstate(all="ignore"):  # of nonsense; what is not finite is left to the prior
+    with np.errstate(all="ignore"):  # a value that is not finite is replaced by the prior
         return _read(seen, used, prior)
 
 

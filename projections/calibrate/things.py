@@ -3,8 +3,8 @@
 A thing qualifies by three observations or more, spots at least 0.8 m apart, lines of sight that
 cross well (the smallest eigenvalue of the normal matrix Σ (I − d dᵀ) is at least 0.08 of their
 number) and meet (median residual at most 0.35 rad). Its position is the robust least-squares
-intersection of the lines of sight, each weighed by its distance from it, without any prior of range
-or size, so that ranges and sizes can be estimated from it.
+intersection of the lines of sight: one that passes it far off has little weight. There is no prior
+of range or size, so that ranges and sizes can be estimated from it.
 """
 
 import math

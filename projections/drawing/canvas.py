@@ -27,7 +27,8 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 _MARGIN_M = 0.35
 _AROUND_POSES_M = 0.4
-"""Margin in metres: a place's region reaches 0.55 m around its keyframes."""
+"""Added to the margin around poses, because a place's region reaches 0.55 m around its
+keyframes."""
 _WIDTH_IN = 13.0
 _HEAD_IN, _FOOT_IN = 0.7, 0.5
 _DPI = 120

@@ -31,7 +31,7 @@ from .questions import DEFAULT_SEED, draw_key, spread
 from .trials import RIGHT_WITHIN_M
 
 VISIT = 20
-"""The number of keyframes before and after one that are of the same visit."""
+"""Keyframes of a run are of one visit if their keyframe_ids differ by no more than this."""
 STAND_APART_M, SEEN_APART_M = 2.0, 3.0
 """Objects of one class are taken out together if they are nearer to each other, or within twice
 that if one was seen from a single spot; under ``fusion = "page"`` the positions that they were seen
@@ -147,7 +147,7 @@ def _by_class(view: MapView) -> dict[str, list[ObjectRecord]]:
 def _visit(
     runs: dict[RunId, list[KeyframeRecord]], keyframe: KeyframeRecord
 ) -> set[ObservationOrdinal]:
-    """The observations of keyframes within `VISIT` of one, counted in the order of the run."""
+    """The observations of the keyframes of its run within `VISIT` of one, by keyframe_id."""
     own, number = runs[keyframe.run_id], keyframe.keyframe_id
     first = bisect_left(own, number - VISIT, key=lambda each: each.keyframe_id)
     last = bisect_right(own, number + VISIT, key=lambda each: each.keyframe_id)

@@ -1,5 +1,5 @@
 """Certainty of an answer: `known`, the probability that the map has the things shown, and
-`thinness`, what the map has too little of for probabilities to hold. `features` has `confidence`,
+`thinness`, what the map has too little of for reliable probabilities. `features` has `confidence`,
 the probability that the pose is within 1.5 m.
 
 `known` and `confidence` are logistic models. Their inputs depend neither on the embedding model nor

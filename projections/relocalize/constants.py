@@ -69,8 +69,8 @@ class MapConstants:
 
     @classmethod
     def of(cls, settings: Settings, cosines: Cosines) -> Self:
-        """The constants of a map with these settings and these cosines of different things. A few
-        cosines are shrunk towards a guess."""
+        """The constants of a map with these settings and these cosines of different things; if the
+        cosines are few, their mean and deviation are shrunk towards a guess."""
         evidence, camera = settings.evidence, settings.camera
         different = evidence.different
         if different is None:

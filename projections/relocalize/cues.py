@@ -7,8 +7,8 @@ size        logarithm of the box's height in metres, log(height at 1 m) + log(di
 elevation   of the upper or lower edge above the camera: rise of the line of sight × distance
 
 Both are computed from the estimated position, so they contain its error; each comes with its
-gradient by the position. A thing seen from one spot may be half as far again, but then it is
-larger, too, and looks the same from that spot.
+gradient with respect to the position. A thing seen from one spot may be farther away than
+estimated, but then it is larger, too, and looks the same from that spot.
 """
 
 import math
@@ -32,8 +32,8 @@ _PRIOR_EDGES: Final = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cue:
-    """A quantity of n landmarks with its gradient by their position and its variance at a given
-    position, infinite where nothing is known."""
+    """A quantity of n landmarks, its gradient with respect to their position, and its variance at a
+    given position, infinite where nothing is known."""
 
     mean: Floats
     by_x: Floats

@@ -25,7 +25,7 @@ _MOST_SPOTS: Final = 600
 
 def likely_spots(marks: Sequence[Landmarks], grid_m: float) -> Floats:
     """Positions from which a landmark was seen, one for each square of a grid, at most
-    `_MOST_SPOTS`. With many crops, only landmarks that look most like each crop are used, which
+    `_MOST_SPOTS`. With many crops, only the landmarks that look most like each crop are used, which
     bounds the cost of a question with many views."""
     most = max(_LEAST_LANDMARKS, _LANDMARKS // len(marks))
     found = []
@@ -53,8 +53,8 @@ each floor takes 100,000 km (`floors`): some 240 floors."""
 
 
 def _keys(squares: Floats) -> tuple[Keys, Floats]:
-    """Keys of pairs (2, …) of whole numbers, which sort as the pairs do, and the least of both
-    numbers."""
+    """Keys of pairs (2, …) of whole numbers, which sort as the pairs do, and the least first and
+    least second number."""
     least = squares.reshape(2, -1).min(axis=1)
     above = squares - least.reshape(2, *(1,) * (squares.ndim - 1))
     across, up = above.astype(np.int64).view(np.uint64)
@@ -95,8 +95,8 @@ def cells_near(points: Floats, cell_m: float, reach_m: float) -> tuple[Floats, F
 @lru_cache(maxsize=8)
 def _steps(cell_m: float, reach_m: float) -> tuple[Floats, Flags]:
     """Steps (2, n) from the cell of a point, and which of them are within reach. The others are
-    needed for a cell that is within reach of another point while this one, as both are rounded, is
-    nearest."""
+    needed because points are rounded to cells: one of them may lead to a cell that only another
+    point reaches although this point is the nearest."""
     most = math.ceil((reach_m + 2.0 * cell_m) / cell_m)
     steps = np.array(list(itertools.product(range(-most, most + 1), repeat=2)), dtype=np.float64).T
     far = np.hypot(*steps) * cell_m

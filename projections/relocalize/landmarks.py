@@ -1,4 +1,4 @@
-"""Landmarks: the things in the map that a crop may show, and their cues for its box.
+"""Landmarks: the things in the map that a crop may show, and the cues to compare its box with.
 
 Where the map knows Objects with an estimate (fusion by evidence), a crop's matches are grouped by
 Object, whose position and covariance count. All others are triangulated from the matches themselves

@@ -53,14 +53,14 @@ _FAR: Final = 120.0
 _LEAST_PART: Final = 1e-24
 """``looks`` times seen_from below which a landmark does not change the mixture."""
 _MANY: Final = 4_000
-"""Number of pairs of landmark and position from which dropping those saves time."""
+"""Number of pairs of landmark and position from which leaving such landmarks out saves time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
     """Factors of the likelihood for pairs of a landmark and a position, arrays of one shape:
     ``looks``, already times seen_from; ``box`` without the bearing; ``heading``, at which the
-    landmark is where the crop shows it (without a box in the middle of the picture); ``variance``
+    landmark is where the crop shows it (without a box: in the middle of the picture); ``variance``
     of its bearing; ``near``, whether it is within twice the usual distance.
 
     The shape is (n, h) for all pairs of n landmarks and h positions, or one axis for some of them.

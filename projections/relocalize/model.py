@@ -15,7 +15,7 @@ class Model:
 
     # How a crop is explained: see `likelihood`.
     in_map: float = 0.85
-    """Probability beforehand that a crop's thing is in the map."""
+    """Prior probability that a crop's thing is in the map."""
     share: float = 0.5
     """Likelihood ratio of a landmark that fits no better than a thing anywhere would."""
     tail: float = 0.03

@@ -14,7 +14,7 @@ cross do not. Points from one spot, closer than 0.35 m, share their errors and c
 half. An error in the shared size moves all points outward together: by ``slide``, metres per unit
 of log size.
 
-BLAS is not used; of all orders only that of the candidates affects results.
+BLAS is not used. The order of the candidates is the only one that affects results.
 """
 
 import math

@@ -105,8 +105,8 @@ def robot_parts(view: MapView) -> dict[Path, Part]:
 def place_label(view: MapView, place: PlaceRecord) -> str:
     """The name of a Place or its likely type, and its id."""
     kind = view.type_of(place.ordinal)
-    told = place.name or (kind.type if kind is not None else None)
-    return place.place_id if told is None else f"{told} ({place.place_id})"
+    label = place.name or (kind.type if kind is not None else None)
+    return place.place_id if label is None else f"{label} ({place.place_id})"
 
 
 def _root(floor: str | None) -> Path:

@@ -181,11 +181,11 @@ def test_the_text_says_how_often_what_was_said_was_right() -> None:
     assert sure.split() == ["confidence", *["0.00", "of", "31", "-", "-", "0.97", "of", "31"]]
 
 
-def test_few_questions_are_said_to_say_little() -> None:
+def test_few_questions_are_called_too_few() -> None:
     nothing = OwnScores((), LocalizerConstants())
     assert localiser_text(nothing) == "re-localisation: no keyframe to ask from\n"
     one = OwnScores((_answer(True, 0.9, 0.9), _answer(False, 0.1, 0.1)), LocalizerConstants())
-    assert "1 question about what was seen at another time: the figures say" in localiser_text(one)
+    assert "1 question about what was seen at another time: too few for" in localiser_text(one)
 
 
 def test_the_usual_lines_rise() -> None:
