@@ -22,7 +22,7 @@ _SEARCHABLE: Final = {
         {"required": ["class"], "properties": {"class": {"type": "string"}}},
     ]
 }
-"""A crop that something can be searched with."""
+"""The schema of a crop with an embedding or a class."""
 _SIGN: Final = "[A-Za-z0-9+/]"
 _EMBEDDING_TEXT: Final = {
     "type": "string",
@@ -40,7 +40,7 @@ def question_schema(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
     common = {"camera": {"anyOf": [camera, {"type": "null"}]}, **(options or {})}
     movement = MovementModel.model_json_schema()["properties"]
     moved = {
-        key: {**value, "description": "Since the question before; read where they are tracked."}
+        key: {**value, "description": "Since the previous question; only read with a session."}
         for key, value in movement.items()
     }
     together = {key: [other for other in moved if other != key] for key in moved}
@@ -84,7 +84,10 @@ def _crops_schema() -> dict[str, Any]:
         "contains": {"anyOf": [{"minimum": least}, {"maximum": -least}]},  # not only zeros
     }
     crop["properties"]["embedding"]["anyOf"] = [_EMBEDDING_TEXT, numbers, _NULL]
-    crop |= {"title": "Crop", "description": "It needs an embedding or a class."}
+    crop |= {
+        "title": "Crop",
+        "description": "An object in a picture; it needs an embedding or a class.",
+    }
     return {"type": "array", "items": crop, "maxItems": MAX_CROPS}
 
 
@@ -92,15 +95,15 @@ def _views_schema(movement: dict[str, Any], together: dict[str, Any]) -> dict[st
     view = {
         "title": "View",
         "type": "object",
-        "description": "How the robot moved since the view before, and what it sees.",
+        "description": "The movement since the view before, and the crops of this view.",
         "properties": {**movement, "crops": _crops_schema()},
         "required": ["crops", *movement],
     }
     first = {
         **view,
         "title": "First view",
-        "description": "The movement is that since the question before, and is read only where"
-        " questions are tracked.",
+        "description": "The movement is that since the previous question, only read with a"
+        " session.",
         "required": ["crops"],
         "dependentRequired": together,
     }

@@ -1,4 +1,4 @@
-"""Answer questions of any transport: JSON in, JSON out, rate limited, errors as replies.
+"""Answer questions over any transport: JSON in, JSON out, rate limited, errors as replies.
 
 A question has the form of ``mapfold relocalize``; an object may also have ``top``, ``method`` and
 ``session``. Every refusal is ``{"error": {"kind", "message"}}`` with one of the kinds in
@@ -109,7 +109,7 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
     (ProjectionMismatch, "database", 503, "graph and vectors are not of one map"),
     (DatabaseUnavailable, "database", 503, "the database does not answer; ask again later"),
-    (DatabaseError, "database", 503, "the database cannot be asked; see the service's stderr"),
+    (DatabaseError, "database", 503, "the database cannot be queried; see the service's stderr"),
     (MapfoldError, "failed", 500, "failed; see the service's stderr"),
 )
 """Error, kind, HTTP status and the message in the reply (None: the error's own). Messages that name
@@ -139,7 +139,8 @@ class Answerer:
         self._sessions = Sessions()
         self.max_bytes = max_bytes
         self.database_up = True
-        """Whether the last query of the database succeeded."""
+        """False after a question or health probe that failed because of the database, until one
+        succeeds."""
 
     def relocalize(self, payload: bytes, options: Mapping[str, str]) -> dict[str, Any]:
         """The answer to a question, as ``relocalize --json`` gives it."""

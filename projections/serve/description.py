@@ -119,18 +119,20 @@ EXAMPLES: Final = (
 
 _RETRY_AFTER: Final = {
     "Retry-After": {
-        "description": "Seconds until it is worth asking again; where too much was asked.",
+        "description": "Seconds to wait before asking again; with the kind too_much.",
         "schema": {"type": "string"},
     }
 }
-_TOKEN: Final = {"WWW-Authenticate": {"description": "What to send.", "schema": {"type": "string"}}}
-_ALLOW: Final = {"Allow": {"description": "What can be sent.", "schema": {"type": "string"}}}
+_TOKEN: Final = {
+    "WWW-Authenticate": {"description": "The scheme of the token.", "schema": {"type": "string"}}
+}
+_ALLOW: Final = {"Allow": {"description": "The methods of the path.", "schema": {"type": "string"}}}
 _EVERYWHERE: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (400, "The request is wrong, or it does not fit the map", {}),
     (401, "The token is missing or wrong", _TOKEN),
     (403, "The Origin header names another site, which --cors does not allow", {}),
     (404, "No such path", {}),
-    (405, "The path has another method", _ALLOW),
+    (405, "The path does not have this method", _ALLOW),
     (408, "The request did not end within 10 seconds", {}),
     (421, "The Host header does not name this service", {}),
     (431, "The head of the request is too long", {}),
@@ -138,7 +140,7 @@ _EVERYWHERE: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
 )
 _ASKING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (429, "More questions a second than --rate", _RETRY_AFTER),
-    (503, "The database cannot be asked now, or too many questions wait", _RETRY_AFTER),
+    (503, "The database cannot be queried now, or too many questions wait", _RETRY_AFTER),
 )
 _SENDING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (411, "The body came in chunks; send a Content-Length", {}),

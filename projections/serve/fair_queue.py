@@ -43,7 +43,9 @@ class _Job:
     def refuse(self) -> None:
         if self.future.set_running_or_notify_cancel():
             self.future.set_exception(
-                BusyError("too many questions are waiting, or the service ends; ask again later")
+                BusyError(
+                    "too many questions are waiting, or the service is stopping; ask again later"
+                )
             )
 
 

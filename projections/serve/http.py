@@ -54,7 +54,7 @@ def create_app(
     counted = metrics or ServiceMetrics(answerer, queue)
     app = FastAPI(
         title="mapfold",
-        summary="Where is the robot, and what stands near a pose?",
+        summary="Re-localisation, and the Places and Objects of the map",
         description=_ABOUT,
         docs_url=None,  # FastAPI's pages load scripts from other servers
         redoc_url=None,
@@ -86,7 +86,7 @@ def create_app(
     async def relocalize(
         request: Request,
         top: Annotated[
-            int | None, Query(ge=1, le=MAX_TOP, description="How many Places; 3 if not given.")
+            int | None, Query(ge=1, le=MAX_TOP, description="Most Places; 3 if not given.")
         ] = None,
         method: Annotated[Method | None, Query(description="joint if not given.")] = None,
         session: Annotated[
@@ -132,7 +132,7 @@ def create_app(
 
     @app.get(
         "/metrics",
-        summary="Numbers for Prometheus",
+        summary="Metrics for Prometheus",
         response_class=Response,
         responses=METRICS | refusals(),
     )

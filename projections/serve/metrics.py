@@ -64,7 +64,9 @@ class ServiceMetrics:
         yield MetricValue(
             "mapfold_serve_queue_depth", "Questions that wait for a worker.", len(self._queue)
         )
-        yield MetricValue("mapfold_serve_queue_size", "How many may wait.", self._queue.capacity)
+        yield MetricValue(
+            "mapfold_serve_queue_size", "Most questions that may wait.", self._queue.capacity
+        )
         yield MetricValue(
             "mapfold_serve_sessions", "Robots that are tracked.", self._answerer.session_count
         )

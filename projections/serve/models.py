@@ -59,15 +59,15 @@ class Pose(TypedDict):
 
 
 class Track(TypedDict):
-    """What all questions of a session together say of where the robot is."""
+    """The robot's pose by all questions of a session."""
 
     pose: Pose | None
     confidence: Probability
-    questions: Annotated[int, Field(ge=1, description="How many the session has had.")]
+    questions: Annotated[int, Field(ge=1, description="Questions of the session so far.")]
 
 
 class Answer(TypedDict):
-    """Where a robot is that sees these things."""
+    """Where a robot that sees these things may be."""
 
     places: Annotated[list[RankedPlace], Field(description="The likeliest first.")]
     pose: Pose | None
@@ -77,11 +77,11 @@ class Answer(TypedDict):
     known: Annotated[
         float, Field(ge=0, le=1, description="Probability that the map has one of the things.")
     ]
-    unknown: Annotated[bool, Field(description="Whether it more likely has none of them.")]
+    unknown: Annotated[bool, Field(description="Whether the map likely has none (known < 0.5).")]
     thin: Annotated[
         str | None, Field(description="What the map has too little of; null where it has enough.")
     ]
-    track: NotRequired[Annotated[Track, Field(description="There if a session was given.")]]
+    track: NotRequired[Annotated[Track, Field(description="Present if a session was given.")]]
 
 
 class Place(TypedDict):
@@ -93,7 +93,7 @@ class Place(TypedDict):
     keyframe_count: Annotated[int, Field(ge=0)]
     name: NotRequired[str]
     floor: NotRequired[str]
-    type: NotRequired[Annotated[str, Field(description="What room it is, where that is sure.")]]
+    type: NotRequired[Annotated[str, Field(description="The type of room, absent if unsure.")]]
     type_probability: NotRequired[Probability]
     distance_m: NotRequired[
         Annotated[float, Field(ge=0, description="From the position, where one was given.")]
@@ -111,7 +111,7 @@ class MapObject(TypedDict):
     first_seen: Annotated[float, Field(description="Seconds since 1970.")]
     last_seen: float
     est_x: NotRequired[
-        Annotated[float, Field(description="Where it stands, under fusion by evidence.")]
+        Annotated[float, Field(description="Estimated position, under fusion by evidence.")]
     ]
     est_y: NotRequired[float]
     est_sigma_m: NotRequired[float]
@@ -166,8 +166,8 @@ class Error(TypedDict):
     kind: Annotated[
         Literal["bad_question", "refused", "too_much", "database", "failed"],
         Field(
-            description="bad_question: the request is wrong; refused: it may not ask; too_much: ask"
-            " again later; database: it cannot be asked now; failed: a fault of the service."
+            description="bad_question: the request is wrong; refused: it is not allowed; too_much:"
+            " ask again later; database: it cannot be queried now; failed: a fault of the service."
         ),
     ]
     message: Annotated[str, Field(description="For people: what is wrong, and what to send.")]
@@ -192,8 +192,8 @@ class StateQuery(BaseModel):
         None, description=f"Only with x and y; {DEFAULT_RADIUS_M:g} metres if not given."
     )
     limit: Annotated[int, Field(ge=1, le=MAX_PAGE)] | None = Field(
-        None, description=f"At most so many; without a position {DEFAULT_PAGE} if not given."
+        None, description=f"Most items; without a position {DEFAULT_PAGE} if not given."
     )
     cursor: Annotated[str, Field(pattern=CURSOR)] | None = Field(
-        None, description="`next` of the page before; not with x and y."
+        None, description="`next` of the previous page; not with x and y."
     )

@@ -47,14 +47,14 @@ class Outage:
         return self._until is not None
 
     def begin(self, error: Exception) -> None:
-        """An attempt failed."""
+        """Begin an outage, if none is under way; called after a failed attempt."""
         with self._lock:
             if self._until is None:
                 self._until = self._now() + OUTAGE_TIMEOUT_S
                 self._tell(f"{error}; trying again")
 
     def end(self) -> None:
-        """An attempt succeeded."""
+        """End an outage, if one is under way; called after a successful attempt."""
         with self._lock:
             if self._until is not None:
                 self._until = None
@@ -173,7 +173,7 @@ class Pools:
         except PoolTimeout:
             raise _NoneFreeError(
                 f"{describe_target(url)}: none of the {self._size} connections came free within"
-                f" {FIRST_WAIT_S + LAST_WAIT_S:.0f} s; ask again later, or give --workers more"
+                f" {FIRST_WAIT_S + LAST_WAIT_S:.0f} s; ask again later, or raise --workers"
             ) from None
 
     def close(self) -> None:

@@ -114,5 +114,5 @@ def _limit(options: Mapping[str, str]) -> int | None:
 def _cursor(options: Mapping[str, str]) -> int:
     given = options.get("cursor", "0")
     if not re.fullmatch(CURSOR, given, re.ASCII):
-        raise QuestionError(f"cursor is {describe_value(given)}; give the next of the page before")
+        raise QuestionError(f"cursor is {describe_value(given)}; give next of the previous page")
     return int(given)
