@@ -77,7 +77,7 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
-    floor that the pose is on, None if the envelope tells none."""
+    floor that the pose is on, None if the envelope states none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal

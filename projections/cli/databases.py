@@ -60,8 +60,8 @@ def left_out(
 
     ``logged`` are the settings that the log names.
     """
-    told = "; ".join(_left_out_parts(log, settings, report, logged))
-    return f"left out: {told}" if told else None
+    parts = "; ".join(_left_out_parts(log, settings, report, logged))
+    return f"left out: {parts}" if parts else None
 
 
 def _left_out_parts(
@@ -267,7 +267,7 @@ def tail_command(
             stop=stop,
             progress=progress,
             on_fold=_CatchUpBar(log, end, bar, once).show,
-            on_refold=_RefoldNote().tell,
+            on_refold=_RefoldNote().show,
             on_trouble=lambda what: _report_failure(what, progress),
             note=say,
         )
@@ -321,7 +321,7 @@ class _RefoldNote:
     def __init__(self) -> None:
         self._done = 0
 
-    def tell(self, done: int, total: int) -> None:
+    def show(self, done: int, total: int) -> None:
         """``done`` of ``total`` events are refolded."""
         if self._done == 0 or done < self._done:
             say(

@@ -222,7 +222,7 @@ def serve(
         stop = stack.enter_context(stop_on_signals())
         targets = stack.enter_context(open_targets(db, vector_db))
         pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
-        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, tell=say)
+        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, note=say)
         session = None
         if zenoh:
             session = stack.enter_context(open_session(options, mode=options.mode))

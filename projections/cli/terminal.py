@@ -101,15 +101,15 @@ class _Listeners:
     own_bar: Callable[[int], None] | None = None
 
 
-def on_output(told: Callable[[], None] | None) -> None:
+def on_output(listener: Callable[[], None] | None) -> None:
     """Register a function that is called before data is written to stdout."""
-    _Listeners.output = told
+    _Listeners.output = listener
 
 
-def on_own_bar(told: Callable[[int], None] | None) -> None:
+def on_own_bar(listener: Callable[[int], None] | None) -> None:
     """Register a function that is called with 1 before a command shows a bar of its own, and with
     -1 after it."""
-    _Listeners.own_bar = told
+    _Listeners.own_bar = listener
 
 
 def output_begins() -> None:

@@ -144,7 +144,7 @@ def ui(
         app = create_app(service, watch, editor)
         gate = TokenGate(app, token, everything=not local)
         guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))), HEADERS)
-        bound = stack.enter_context(serving(guarded, listener, tell=say))
+        bound = stack.enter_context(serving(guarded, listener, note=say))
         # Before the server, which waits for its streams and answers to end.
         stack.callback(watch.close)
         stack.callback(service.end)

@@ -106,15 +106,15 @@ def rebuild(
             last = next(reader.read(Offset(total - 1), total), None)
             return FoldedLog(fold, last, inputs)
 
-        def tell(stage: str) -> None:
+        def notify_stage(stage: str) -> None:
             notify(RebuildProgress(stage, total, total))
 
         opened = open_stores(
             targets, inputs.settings, only=only, application="mapfold replay", loader=loader
         )
         with opened as stores, ParsedLog(reader, total, workers) as parsed:
-            swap = swap_in_new_map(stores, reader.log_id, fold_into, tell)
-            index = drop_replaced(stores, tell, hnsw=hnsw)
+            swap = swap_in_new_map(stores, reader.log_id, fold_into, notify_stage)
+            index = drop_replaced(stores, notify_stage, hnsw=hnsw)
             ended = time.monotonic()
             return RebuildReport(
                 total,
@@ -138,7 +138,7 @@ def _fold_into(
     notify: OnProgress,
     advice: Callable[[int], str],
 ) -> None:
-    told = FIRST_OFFSET
+    notified = FIRST_OFFSET
     for stretch in stretches:
         try:
             fold.fold_parsed(stretch)
@@ -146,8 +146,8 @@ def _fold_into(
             reason = f"{failed.reason}; {advice(failed.offset)}"
             raise FoldError(failed.offset, reason) from failed
         done = fold.map.next_offset
-        if done - told >= TICK_EVENTS or done == total:
-            told = done
+        if done - notified >= TICK_EVENTS or done == total:
+            notified = done
             notify(RebuildProgress("folding", done, total))
             stream(fold, writers)
 

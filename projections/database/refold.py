@@ -48,7 +48,7 @@ BEAT_S: Final = 1.0
 
 
 class RefoldProgress:
-    """A context manager around a refold of ``stores``. ``tell`` raises what the thread raised."""
+    """A context manager around a refold of ``stores``. ``update`` raises what the thread raised."""
 
     def __init__(self, stores: Sequence[Store]) -> None:
         self._stores = stores
@@ -77,7 +77,7 @@ class RefoldProgress:
         self._thread.join()
         self._stack.close()
 
-    def tell(self, done: int, total: int) -> None:
+    def update(self, done: int, total: int) -> None:
         """``done`` of ``total`` events are folded. Raises what the thread raised."""
         self._at = (done, total)
         if self._failed is not None:
@@ -96,7 +96,7 @@ class RefoldProgress:
             while not self._ended.wait(BEAT_S):
                 with self._held:
                     self._write()
-        except BaseException as error:  # noqa: BLE001 - raised by `tell`
+        except BaseException as error:  # noqa: BLE001 - raised by `update`
             self._failed = error
 
     def _write(self) -> None:
@@ -173,7 +173,7 @@ class Refold:
                     self._feed(fold, batch)
                     last = batch[-1]
                     stream(fold, writers)
-                    progress.tell(last.offset + 1, end)
+                    progress.update(last.offset + 1, end)
                     self.on_progress(last.offset + 1, end)
                     if time.monotonic() - self._looked_at > LOOK_S:
                         self._look()

@@ -48,19 +48,19 @@ class DemoOptions:
     vector_db: str | None = None
 
 
-Tell = Callable[[str], None]
+PrintLine = Callable[[str], None]
 
 
-def run_demo(options: DemoOptions, tell: Tell) -> dict[str, Any]:
-    """Run the demo, with each line of its report to ``tell``; returns its numbers for JSON."""
+def run_demo(options: DemoOptions, print_line: PrintLine) -> dict[str, Any]:
+    """Run the demo; ``print_line`` gets each line of its report. Returns its numbers for JSON."""
     with fresh_folder(options.out) as folder:
-        return _play(options, folder, tell)
+        return _play(options, folder, print_line)
 
 
-def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any]:
+def _play(options: DemoOptions, folder: DemoFolder, print_line: PrintLine) -> dict[str, Any]:
     explorer, lost_run = simulate_run(options.seed, "a"), simulate_run(options.seed, "b")
     folder.settings.write_text(SETTINGS.model_dump_json(indent=2) + "\n", "utf-8")
-    clock = _Stages(tell)
+    clock = _Stages(print_line)
     house = explorer.house
     detections = sum(len(envelope["detections"]) for envelope in explorer.envelopes)
     rooms = len(house.plan.rooms)
@@ -70,24 +70,24 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
             with LogWriter(folder.log) as writer:
                 writer.append(MAP_KEY, occupancy_map(house).encode())
             recorded, followed = record_run(explorer, options.speed, folder, targets, SETTINGS)
-            clock.tell(report.tell_recording(recorded, followed, detections, rooms, options.speed))
+            clock.show(report.recording_lines(recorded, followed, detections, rooms, options.speed))
         with clock.stage("The databases are thrown away and the log is replayed"):
             before = hash_tables(targets)
             replayed = rebuild(folder.log, targets, SETTINGS)
             same_rows = hash_tables(targets) == before
             folded = fold_with_rooms(folder, SETTINGS, explorer)
-            clock.tell(report.tell_replay(replayed, folded, same_rows))
+            clock.show(report.replay_lines(replayed, folded, same_rows))
         with clock.stage("The map"):
             default_places = places_with(folder, Settings())
-            clock.tell(report.tell_map(folded, Settings(), default_places))
-            clock.tell(report.tell_types(folded.view))
-            clock.tell(report.tell_merges(folded.merges))
+            clock.show(report.map_lines(folded, Settings(), default_places))
+            clock.show(report.type_lines(folded.view))
+            clock.show(report.merge_lines(folded.merges))
         with clock.stage("A person corrects the map"):
             corrected = correct(folder, targets, SETTINGS, explorer, folded)
-            clock.tell(report.tell_corrected(corrected))
+            clock.show(report.correction_lines(corrected))
         with clock.stage("Run B is lost and asks"):
             lost = ask_lost(targets, lost_run, folder)
-            clock.tell(report.tell_lost(lost, place_rooms(corrected.folded.view, explorer)))
+            clock.show(report.question_lines(lost, place_rooms(corrected.folded.view, explorer)))
     with clock.stage("The map is drawn"):
         draw_map(
             corrected.folded.view,
@@ -97,9 +97,9 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
             lost=lost.drawing,
             bridges=bridges_of(corrected.folded.view, corrected.folded.deltas),
         )
-        clock.tell([f"   {folder.map}"])
-    tell(f"{clock.total:.1f} s in all. Go on with it:")
-    clock.tell(_next_commands(folder, most_telling(folded.merges), options.db, options.vector_db))
+        clock.show([f"   {folder.map}"])
+    print_line(f"{clock.total:.1f} s in all. Go on with it:")
+    clock.show(_next_commands(folder, most_telling(folded.merges), options.db, options.vector_db))
     return result_document(
         DemoResult(
             options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, corrected, lost
@@ -110,25 +110,25 @@ def _play(options: DemoOptions, folder: DemoFolder, tell: Tell) -> dict[str, Any
 
 
 class _Stages:
-    def __init__(self, tell: Tell) -> None:
-        self._tell = tell
+    def __init__(self, print_line: PrintLine) -> None:
+        self._print_line = print_line
         self.seconds: dict[str, float] = {}
 
     @property
     def total(self) -> float:
         return sum(self.seconds.values())
 
-    def tell(self, lines: Iterable[str]) -> None:
+    def show(self, lines: Iterable[str]) -> None:
         for line in lines:
-            self._tell(line)
+            self._print_line(line)
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        self._tell(f"{len(self.seconds) + 1}. {name}")
+        self._print_line(f"{len(self.seconds) + 1}. {name}")
         started = time.monotonic()
         yield
         self.seconds[name] = time.monotonic() - started
-        self._tell(f"   [{self.seconds[name]:.1f} s]")
+        self._print_line(f"   [{self.seconds[name]:.1f} s]")
 
 
 @contextlib.contextmanager

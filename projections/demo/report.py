@@ -22,7 +22,7 @@ from .mapping import Folded, Part, RoomMerge, most_telling
 from .recording import Followed, Recorded
 
 
-def tell_recording(
+def recording_lines(
     recorded: Recorded, followed: Followed, detections: int, rooms: int, speed: float
 ) -> Iterator[str]:
     """How run A was recorded, and tailed into the databases."""
@@ -51,7 +51,7 @@ def tell_recording(
     )
 
 
-def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Iterator[str]:
+def replay_lines(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Iterator[str]:
     """Whether a replay gives the same rows and digest."""
     nodes = sum(replayed.rows[label] for label in VERTEX_LABELS)
     edges = sum(replayed.rows[label] for label in EDGE_LABELS)
@@ -65,7 +65,7 @@ def tell_replay(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Ite
     yield f"   {rows} the tail wrote, {digest} a fold without databases: {folded.digest[:16]}…"
 
 
-def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
+def map_lines(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
     """The map's numbers, with which settings, and with the default settings."""
     counts, settings = folded.view.counts(), folded.view.settings
     transitions = sum(count for _, _, count in folded.view.edges())
@@ -85,21 +85,21 @@ def tell_map(folded: Folded, other_settings: Settings, other_places: int) -> Ite
     )
 
 
-def tell_types(view: MapView) -> Iterator[str]:
+def type_lines(view: MapView) -> Iterator[str]:
     """The likely types of the places."""
     kinds = ((place, view.type_of(place.ordinal)) for place in view.places.values())
-    told = [
+    typed = [
         f"{_short(place.place_id)} {kind.type} {kind.probability:.0%}".replace("%", " %")
         for place, kind in kinds
         if kind is not None and kind.type is not None
     ]
-    if told:
-        unsure = len(view.places) - len(told)
-        text = f"by what stands in them ({unsure} unsure): {', '.join(told)}"
+    if typed:
+        unsure = len(view.places) - len(typed)
+        text = f"by what stands in them ({unsure} unsure): {', '.join(typed)}"
         yield from wrap(text, 96, initial_indent="   ", subsequent_indent="   ")
 
 
-def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
+def merge_lines(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
     """The most telling merge of places."""
     merge = most_telling(merges)
     if merge is None:
@@ -119,7 +119,7 @@ def tell_merges(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
     )
 
 
-def tell_corrected(corrected: Corrected) -> Iterator[str]:
+def correction_lines(corrected: Corrected) -> Iterator[str]:
     """The correction, and the map under it."""
     offsets = {recorded.command.kind: recorded.offset for recorded in corrected.commands}
     places = counted(len(corrected.folded.view.places), "place")
@@ -142,7 +142,7 @@ def tell_corrected(corrected: Corrected) -> Iterator[str]:
     )
 
 
-def tell_lost(lost: LostRun, rooms: dict[str, str]) -> Iterator[str]:
+def question_lines(lost: LostRun, rooms: dict[str, str]) -> Iterator[str]:
     """Run B's questions and the answers."""
     yield (
         f"   {lost.run_id}, another day, looks around and does not know where it is (in the "

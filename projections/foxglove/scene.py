@@ -1,7 +1,7 @@
 """A map as one scene of Foxglove's 3D panel.
 
 Every scene is whole: it begins by deleting what was shown. After a seek Foxglove shows the last
-message of each topic, so a scene that only tells a change would leave the rest out.
+message of each topic, so a scene with only the changes would leave the rest out.
 """
 
 from collections.abc import Iterable, Iterator
@@ -83,14 +83,14 @@ def _places(view: MapView) -> Iterator[_Part]:
         colour = _colour(place.ordinal)
         corners = [Point3(x=x, y=y, z=z) for x, y in ring]
         kind = view.type_of(place.ordinal)
-        told = place.name or (kind.type if kind is not None else None)
+        label = place.name or (kind.type if kind is not None else None)
         shapes: _Shapes = {
             "metadata": _metadata(
                 place_id=place.place_id, keyframes=place.keyframe_count, name=place.name
             ),
             "texts": [
                 _text(
-                    place.place_id if told is None else f"{told} ({place.place_id})",
+                    place.place_id if label is None else f"{label} ({place.place_id})",
                     (place.centroid_x, place.centroid_y),
                     z + 0.3,
                     0.35,
@@ -210,7 +210,7 @@ def _merges(view: MapView, merges: Iterable[PlacesMerged]) -> Iterator[_Part]:
         if bridge.pose is None:
             continue
         absorbed = ", ".join(view.all_places[place].place_id for place in merge.absorbed)
-        told = f"{absorbed} → {view.place_id(merge.survivor)}"
+        label = f"{absorbed} → {view.place_id(merge.survivor)}"
         where = bridge.pose.x_m, bridge.pose.y_m
         z = height(view, bridge.floor) + 0.1
         yield (
@@ -224,7 +224,7 @@ def _merges(view: MapView, merges: Iterable[PlacesMerged]) -> Iterator[_Part]:
                         pose=_at(*where, z), size=Vector3(x=0.3, y=0.3, z=0.3), color=_RED
                     )
                 ],
-                "texts": [_text(told, where, z + 0.3, 0.2)],
+                "texts": [_text(label, where, z + 0.3, 0.2)],
             },
         )
 

@@ -127,8 +127,8 @@ class TableWriter:
                 self._document("object_merge", ObjectMerge(cause_of(offset, deltas), delta))
             elif isinstance(delta, MergeRefused):
                 cause = cause_of(offset, deltas)
-                told = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
-                self._document("refusal", told)
+                refusal = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
+                self._document("refusal", refusal)
         for merge in merges:
             self._places_merged(offset, deltas, merge, moves, links)
         if self._end - self._start == STRIPE_EVENTS:

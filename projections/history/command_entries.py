@@ -52,9 +52,9 @@ class EntryMaker:
     def entry(self, recorded: RecordedCommand, text: str, **facts: Any) -> Entry:
         """An entry: ``text`` (what the command did), its kind and id, its author and its reason."""
         command = recorded.command
-        told = {"command": command_document(recorded), **facts}
+        document = {"command": command_document(recorded), **facts}
         by = f"{text} by {command_title(command)}"
-        return Entry(self.cause(recorded), command.kind, by, told)
+        return Entry(self.cause(recorded), command.kind, by, document)
 
 
 def place_commands(

@@ -304,8 +304,8 @@ def _object_entries(
         survivor = history.objects[ended.survivor].object_id
         text = f"fused into {survivor} {_why_fused(ended)}"
         yield Entry(ended.cause, "ended", text, {"object_id": survivor, **_evidence_of(ended)})
-    for offset, what, told, facts in evidence_entries(record):
-        yield Entry(history.cause_at(offset), what, told, facts)
+    for offset, what, text, facts in evidence_entries(record):
+        yield Entry(history.cause_at(offset), what, text, facts)
 
 
 def _why_fused(merge: ObjectMerge) -> str:

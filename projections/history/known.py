@@ -187,8 +187,8 @@ class KnownHistory:
         if thing in history.object_ordinals:
             seen = self.latest.observations.__getitem__
             explained = explain_object(history, seen, find_object(history, thing), last)
-            told = object_commands(self._entries, history, explained.facts["det_ids"])
-            return with_entries(explained, told)
+            commands = object_commands(self._entries, history, explained.facts["det_ids"])
+            return with_entries(explained, commands)
         if thing not in history.place_ordinals and thing.startswith("obj-"):
             raise NoSuchThing("object", thing, history.object_ordinals)
         try:
@@ -196,8 +196,8 @@ class KnownHistory:
         except NoSuchThing:
             self._refuse_keyframe(thing, last)
             raise
-        told = place_commands(self._entries, history, place, last)
-        return with_entries(explain_place(history, place, last), told)
+        commands = place_commands(self._entries, history, place, last)
+        return with_entries(explain_place(history, place, last), commands)
 
     def _refuse_keyframe(self, text: str, end: Offset) -> None:
         """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
@@ -215,8 +215,8 @@ class KnownHistory:
         commands join them or keep them apart."""
         history, last = self.history, self._checked(end)
         a, b = (find_keyframe(history, text) for text in (first, second))
-        told = same_place_commands(self._entries, history, (a, b), last)
-        return with_entries(explain_same_place(history, a, b, last), told)
+        commands = same_place_commands(self._entries, history, (a, b), last)
+        return with_entries(explain_same_place(history, a, b, last), commands)
 
     def facts(self, end: Offset | None = None) -> HistoryFacts:
         """The map after ``end`` events, for evaluating conditions."""

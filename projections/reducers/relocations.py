@@ -9,7 +9,7 @@ evidence is
     `_LEAST_LOOK`;
     less the largest such ratio, if above 0, of one of them and a third Object: of the newcomer and
     another older one, or of the older one and another that was seen since the newcomer's run began.
-    Where things look alike a look tells little;
+    Where things look alike a look is little evidence;
     less the logarithm of the older one's odds, or `_GONE` of it where they are below 1.
 
 The older Object with the largest ratio of looks less the part of its odds is the newcomer, if the

@@ -73,15 +73,15 @@ _MAX_LINES: Final = 100
 
 
 class RepeatFilter:
-    """Passes lines on to ``tell``, each at once and again after ``REPEAT_S`` at the earliest.
+    """Passes lines on to ``note``, each at once and again after ``REPEAT_S`` at the earliest.
 
     Repeats in between are counted. For any thread.
     """
 
     def __init__(
-        self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic
+        self, note: Callable[[str], None], now: Callable[[], float] = time.monotonic
     ) -> None:
-        self._tell, self._now, self._lock = tell, now, threading.Lock()
+        self._note, self._now, self._lock = note, now, threading.Lock()
         self._passed: dict[str, tuple[float, int]] = {}  # when last passed on, and repeats since
 
     def __call__(self, line: str) -> None:
@@ -95,7 +95,7 @@ class RepeatFilter:
             if len(self._passed) >= _MAX_LINES:
                 self._passed.clear()
             self._passed[line] = (now, 0)
-        self._tell(f"{line} (and {count} more like it since)" if count else line)
+        self._note(f"{line} (and {count} more like it since)" if count else line)
 
 
 MAX_TOP: Final = 100
@@ -119,7 +119,7 @@ databases and paths go only to the service's stderr (`Answerer`)."""
 class Answerer:
     """Answers questions from the live databases; safe to use from many threads.
 
-    ``tell`` gets a line for people when a question fails because of the database.
+    ``note`` gets a line for people when a question fails because of the database.
     """
 
     def __init__(
@@ -129,10 +129,10 @@ class Answerer:
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
         camera: Camera | None = None,
-        tell: Callable[[str], None] = lambda _: None,
+        note: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._pools, self._bucket, self._camera = pools, TokenBucket(per_second), camera
-        self._complaints = RepeatFilter(tell)
+        self._note = RepeatFilter(note)
         # One at a time: the JSON parser holds the GIL for up to 30 ms, and the thread that reads
         # from the network must run in between.
         self._parsing = threading.Lock()
@@ -187,7 +187,7 @@ class Answerer:
             yield
         except DatabaseError as error:
             self.database_up = False
-            self._complaints(f"mapfold: {error}")
+            self._note(f"mapfold: {error}")
             raise
         except MapfoldError:
             raise  # not an error of the database

@@ -41,11 +41,11 @@ _MAX_SHOWN: Final = 200
 
 
 class Connections:
-    """The open connections. ``tell`` gets a line for people for each one that is closed early."""
+    """The open connections. ``note`` gets a line for people for each one that is closed early."""
 
-    def __init__(self, tell: Callable[[str], None], most: int) -> None:
+    def __init__(self, note: Callable[[str], None], most: int) -> None:
         self._open: dict[Connection, None] = {}
-        self._tell, self._most = tell, most
+        self._note, self._most = note, most
 
     def admit(self, newcomer: "Connection") -> bool:
         """Add a new connection, if need be in place of another; False when all others are being
@@ -64,7 +64,7 @@ class Connections:
 
     def report(self, reason: str) -> None:
         """Report why a connection is closed."""
-        self._tell(f"http: closed a connection: {reason}")
+        self._note(f"http: closed a connection: {reason}")
 
     def drop(self, connection: "Connection", reason: str) -> None:
         """Close a connection at once, and report why."""

@@ -39,11 +39,11 @@ _ADVICE: Final = "make one with: openssl rand -hex 32"
 
 
 def read_token(
-    file: Path | None, environment: Mapping[str, str], warn: Callable[[str], None]
+    file: Path | None, environment: Mapping[str, str], note: Callable[[str], None]
 ) -> str | None:
     """The token of ``file``, else of the environment, else None.
 
-    Raises MisuseError for one that is empty, short or malformed. ``warn`` gets a line when other
+    Raises MisuseError for one that is empty, short or malformed. ``note`` gets a line when other
     users may read the file.
     """
     if file is None:
@@ -55,7 +55,7 @@ def read_token(
     except OSError as error:
         raise MisuseError(f"--token-file {file}: {error.strerror or error}") from None
     if stat.S_ISREG(status.st_mode) and status.st_mode & (stat.S_IRGRP | stat.S_IROTH):
-        warn(f"--token-file {file}: other users may read it; run chmod 600 {file}")
+        note(f"--token-file {file}: other users may read it; run chmod 600 {file}")
     return _checked(raw[:_MAX_FILE].decode("latin-1"), f"--token-file {file}")
 
 

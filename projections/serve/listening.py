@@ -151,7 +151,7 @@ def serving(
     app: ASGIApp,
     listener: socket.socket,
     tls: ssl.SSLContext | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    note: Callable[[str], None] = lambda _: None,
 ) -> Iterator[int]:
     """Serve in a thread; yields the port. At the end requests under way are answered."""
     config = uvicorn.Config(
@@ -166,7 +166,7 @@ def serving(
         server_header=False,
         timeout_keep_alive=_KEEP_ALIVE_S,
     )
-    server = _Server(config, Connections(RepeatFilter(tell), MAX_CONNECTIONS), tls)
+    server = _Server(config, Connections(RepeatFilter(note), MAX_CONNECTIONS), tls)
     listener.setblocking(False)
     listener.listen(_BACKLOG)  # from now on clients can connect
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")

@@ -34,11 +34,11 @@ OUTAGE_TIMEOUT_S: Final = 10.0
 
 
 class Outage:
-    """An outage begins with the first failure and ends with the first success; ``tell`` gets one
+    """An outage begins with the first failure and ends with the first success; ``note`` gets one
     line at each. For many threads."""
 
-    def __init__(self, tell: Callable[[str], None], now: Callable[[], float] = time.monotonic):
-        self._tell, self._now, self._lock = tell, now, threading.Lock()
+    def __init__(self, note: Callable[[str], None], now: Callable[[], float] = time.monotonic):
+        self._note, self._now, self._lock = note, now, threading.Lock()
         self._until: float | None = None
 
     @property
@@ -51,14 +51,14 @@ class Outage:
         with self._lock:
             if self._until is None:
                 self._until = self._now() + OUTAGE_TIMEOUT_S
-                self._tell(f"{error}; trying again")
+                self._note(f"{error}; trying again")
 
     def end(self) -> None:
         """End an outage, if one is under way; called after a successful attempt."""
         with self._lock:
             if self._until is not None:
                 self._until = None
-                self._tell("the database answers again")
+                self._note("the database answers again")
 
     @property
     def worth_waiting(self) -> bool:
@@ -84,13 +84,13 @@ class _NoneFreeError(DatabaseUnavailable):
 class Pools:
     """One pool when graph and vectors share a database, else two. Use in a ``with`` block.
 
-    ``tell`` gets a line when a database goes away and one when it is back.
+    ``note`` gets a line when a database goes away and one when it is back.
     """
 
     def __init__(
-        self, targets: Targets, size: int, tell: Callable[[str], None] = lambda _: None
+        self, targets: Targets, size: int, note: Callable[[str], None] = lambda _: None
     ) -> None:
-        self._targets, self._size, self._outage = targets, size, Outage(tell)
+        self._targets, self._size, self._outage = targets, size, Outage(note)
         self._memory = ConstantsMemory()
         self.check()  # a clear error at once; a pool would retry without one
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)

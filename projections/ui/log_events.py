@@ -93,13 +93,13 @@ class LogEvents:
 
 def _document(event: Event) -> dict[str, Any]:
     kind = _SYSTEM_KEYS[event.key]
-    told = _command(event) if kind == "correction" else _TELL[kind](event.payload)
+    described = _command(event) if kind == "correction" else _DESCRIBE[kind](event.payload)
     return {
         "offset": event.offset,
         "kind": kind,
         "stamp": event.stamp_ns / 1e9,
-        **told,
-        "text": told["text"][:_MAX_TEXT],
+        **described,
+        "text": described["text"][:_MAX_TEXT],
     }
 
 
@@ -134,7 +134,7 @@ def _rejected(payload: bytes) -> dict[str, Any]:
         return {"text": "a rejected payload that this version cannot read"}
 
 
-_TELL: Final = {"loss": _loss, "rejected": _rejected}
+_DESCRIBE: Final = {"loss": _loss, "rejected": _rejected}
 
 
 def event_columns(

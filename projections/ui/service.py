@@ -189,8 +189,8 @@ class UiService:
             self._document |= {"problems": [visible(str(error))]}
             raise
         except Exception as error:
-            told = f"the page does not follow the log any more: {error!r}; see the program's stderr"
-            self._document |= {"problems": [visible(told)]}
+            text = f"the page does not follow the log any more: {error!r}; see the program's stderr"
+            self._document |= {"problems": [visible(text)]}
             raise
         return changed
 

@@ -207,8 +207,8 @@ def _keyframe_story(moment: Moment, name: str) -> dict[str, Any]:
         where = f"in {history.places[place].place_id}"
     if came.offset >= moment.end:
         where = f"not there yet: it comes at offset {came.offset}"
-    told = moment.command("why", "--same", names[0], names[0])
-    return _document(moment, found, told) | {
+    command = moment.command("why", "--same", names[0], names[0])
+    return _document(moment, found, command) | {
         "kind": "keyframe",
         "subject": names[0],
         "summary": visible(where),

@@ -75,8 +75,8 @@ class TestKilledServer:
 
     @pytest.mark.slow
     def test_the_embedded_server_is_restarted(self, server: EmbeddedServer) -> None:
-        told: list[str] = []
-        with Pools(Targets(server.url, server.url, server), 4, told.append) as pools:
+        notes: list[str] = []
+        with Pools(Targets(server.url, server.url, server), 4, notes.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)
             before = answerer.relocalize(question(), {})
             for _ in range(2):
@@ -85,14 +85,14 @@ class TestKilledServer:
             kill_postgres(server)
             assert answerer.health() == {"status": "ok"}
             assert answerer.relocalize(question(), {}) == before
-        assert [line.endswith("trying again") for line in told[:4]] == [True, False, True, False]
+        assert [line.endswith("trying again") for line in notes[:4]] == [True, False, True, False]
 
     def test_questions_wait_for_another_server_at_first_and_fail_at_once_later(
         self, server: EmbeddedServer, queue: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("projections.serve.pools.OUTAGE_TIMEOUT_S", 0.5)
-        told: list[str] = []
-        with Pools(Targets(server.url, server.url), 4, told.append) as pools:
+        notes: list[str] = []
+        with Pools(Targets(server.url, server.url), 4, notes.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)
             answerer.relocalize(question(), {})
             kill_postgres(server)
@@ -106,11 +106,11 @@ class TestKilledServer:
             with pytest.raises(DatabaseUnavailable, match="start the server"):
                 answerer.relocalize(question(), {})
             assert time.monotonic() - begun < DEADLINE_S
-            assert len(told) == 1
+            assert len(notes) == 1
             server.start()
             assert answerer.relocalize(question(), {})["places"]
             assert answerer.database_up
-        assert told[1:] == ["the database answers again"]
+        assert notes[1:] == ["the database answers again"]
 
 
 def test_a_full_pool_is_not_reported_as_an_outage(
@@ -118,15 +118,15 @@ def test_a_full_pool_is_not_reported_as_an_outage(
 ) -> None:
     for name in ("FIRST_WAIT_S", "LAST_WAIT_S"):
         monkeypatch.setattr(f"projections.serve.pools.{name}", 0.5)
-    told: list[str] = []
-    with Pools(walked_map, 1, told.append) as pools:
+    notes: list[str] = []
+    with Pools(walked_map, 1, notes.append) as pools:
 
         def ask_too(_: Connection) -> None:
             with pytest.raises(DatabaseUnavailable, match="none of the 1 connections came free"):
                 pools.on_graph(lambda _: None)
 
         pools.on_graph(ask_too)
-    assert told == []
+    assert notes == []
 
 
 def test_it_does_not_start_without_a_map(one_database: Targets) -> None:

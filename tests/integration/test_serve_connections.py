@@ -46,12 +46,12 @@ async def application(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 @pytest.fixture
-def told() -> list[str]:
+def notes() -> list[str]:
     return []
 
 
 @pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch, told: list[str]) -> Iterator[START]:
+def start(monkeypatch: pytest.MonkeyPatch, notes: list[str]) -> Iterator[START]:
     """Starts servers with limits that a test can reach; they end with the test."""
     with ExitStack() as servers:
 
@@ -62,7 +62,7 @@ def start(monkeypatch: pytest.MonkeyPatch, told: list[str]) -> Iterator[START]:
             monkeypatch.setattr("projections.serve.listening.MAX_CONNECTIONS", most)
             listener = bind("127.0.0.1", 0)
             return servers.enter_context(
-                serving(application, listener, tell=told.append, **options)
+                serving(application, listener, note=notes.append, **options)
             )
 
         yield start
@@ -82,23 +82,23 @@ def refused(response: bytes) -> tuple[int, str]:
     [b"", b"P", b"POST / HTTP/1.1\r\nHost: x\r\n", request("POST", "/", b"12345")[:-1]],
     ids=["nothing", "a byte", "half a head", "a body without its end"],
 )
-def test_an_incomplete_request_times_out(start: START, told: list[str], sent: bytes) -> None:
+def test_an_incomplete_request_times_out(start: START, notes: list[str], sent: bytes) -> None:
     assert refused(ask(start(), sent)) == (408, "bad_question")
-    assert told == ["http: closed a connection: no complete request within 0.5 s"]
+    assert notes == ["http: closed a connection: no complete request within 0.5 s"]
 
 
-def test_single_bytes_do_not_extend_the_time(start: START, told: list[str]) -> None:
+def test_single_bytes_do_not_extend_the_time(start: START, notes: list[str]) -> None:
     with connect(start()) as dripping:
         dripping.sendall(request("POST", "/", b"x" * 10**6)[: -(10**6)])
         dripping.settimeout(0.02)
         sent = 0
-        while not told:
+        while not notes:
             dripping.send(b"x")
             sent += 1
             with suppress(TimeoutError):
                 dripping.recv(65_536)
         assert sent < 10**6
-    assert told == ["http: closed a connection: no complete request within 0.5 s"]
+    assert notes == ["http: closed a connection: no complete request within 0.5 s"]
 
 
 def test_a_reused_connection_has_the_full_time_again(start: START) -> None:
@@ -109,17 +109,17 @@ def test_a_reused_connection_has_the_full_time_again(start: START) -> None:
             assert answers.read(1) == b"5"
 
 
-def test_an_unread_answer_times_out(start: START, told: list[str]) -> None:
+def test_an_unread_answer_times_out(start: START, notes: list[str]) -> None:
     port = start()
     with connect(port) as deaf:
         deaf.sendall(request("GET", "/long"))
-        while not told:
+        while not notes:
             assert status(ask(port, request("GET", "/"))) == 200
-    assert told == ["http: closed a connection: no answer was read within 0.5 s"]
+    assert notes == ["http: closed a connection: no answer was read within 0.5 s"]
 
 
 def test_unread_answers_are_limited_together(
-    start: START, told: list[str], monkeypatch: pytest.MonkeyPatch
+    start: START, notes: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "MAX_UNREAD", LONG // 8)
     port = start(seconds=DEADLINE_S)
@@ -127,9 +127,9 @@ def test_unread_answers_are_limited_together(
         for _ in range(4):
             deaf = held.enter_context(connect(port))
             deaf.sendall(request("GET", "/long"))
-        while not told:
+        while not notes:
             ask(port, request("GET", "/"))
-    assert told[0] == "http: closed a connection: its answer is long and was not read"
+    assert notes[0] == "http: closed a connection: its answer is long and was not read"
 
 
 class TestFull:

@@ -14,7 +14,7 @@ from projections.demo import report
 from projections.demo.correcting import Corrected
 from projections.demo.mapping import Folded, Part, RoomMerge, most_telling
 from projections.demo.recording import Followed, Recorded
-from projections.demo.report import DemoResult, tell_types
+from projections.demo.report import DemoResult, type_lines
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.envelopes import detection, envelope
@@ -78,33 +78,33 @@ def test_a_merge_across_rooms_is_preferred_to_a_larger_one_within_a_room() -> No
 
 
 def test_no_merges() -> None:
-    assert list(report.tell_merges(())) == ["   no two places became one on this drive"]
+    assert list(report.merge_lines(())) == ["   no two places became one on this drive"]
 
 
 def test_a_merge_is_reported_with_its_numbers() -> None:
-    lines = "\n".join(report.tell_merges((_merge(7, "hall", "study", 12),)))
+    lines = "\n".join(report.merge_lines((_merge(7, "hall", "study", 12),)))
     for wanted in ("p0 (30 keyframes, hall)", "p1 (12 keyframes, study)", "event 7", "5 places"):
         assert wanted in lines
     assert "such moments" not in lines
 
 
 def test_an_incomplete_log_is_reported() -> None:
-    good = "\n".join(report.tell_recording(RECORDED, FOLLOWED, 5, 8, 30.0))
+    good = "\n".join(report.recording_lines(RECORDED, FOLLOWED, 5, 8, 30.0))
     assert "byte for byte" in good
     assert "NOT" not in good
     torn = replace(RECORDED, recorded=9, intact=False, lost=1)
-    lines = "\n".join(report.tell_recording(torn, FOLLOWED, 5, 8, 30.0))
+    lines = "\n".join(report.recording_lines(torn, FOLLOWED, 5, 8, 30.0))
     assert "9 of 10" in lines
     assert "NOT byte for byte; 0 rejected, 1 lost" in lines
 
 
 @pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
 def test_a_replay_with_other_rows_is_reported(same: bool, says: str) -> None:
-    assert says in "\n".join(report.tell_replay(REPLAYED, FOLDED, same))
+    assert says in "\n".join(report.replay_lines(REPLAYED, FOLDED, same))
 
 
 def test_a_replay_with_another_digest_is_reported() -> None:
-    lines = "\n".join(report.tell_replay(replace(REPLAYED, digest="0" * 64), FOLDED, True))
+    lines = "\n".join(report.replay_lines(replace(REPLAYED, digest="0" * 64), FOLDED, True))
     assert "ANOTHER digest" in lines
 
 
@@ -119,33 +119,33 @@ def test_a_demo_is_sound_only_if_everything_agrees() -> None:
 
 
 def test_corrections_are_reported_as_far_as_there_are_any() -> None:
-    lines = "\n".join(report.tell_corrected(CORRECTED))
+    lines = "\n".join(report.correction_lines(CORRECTED))
     assert "p11 (345 keyframes, living room) and p12 (120 keyframes, dining room);" in lines
     assert 'p12 is called "dining room"' in lines
     assert "event 1300 of the log" in lines
     assert "event 1301" in lines
     without = replace(CORRECTED, commands=(), named=None, apart=())
-    assert len(list(report.tell_corrected(without))) == 1
+    assert len(list(report.correction_lines(without))) == 1
     other = replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))
-    assert "ANOTHER digest" in "\n".join(report.tell_corrected(other))
+    assert "ANOTHER digest" in "\n".join(report.correction_lines(other))
 
 
 def test_lines_fit_a_terminal() -> None:
     merges = (_merge(1234, "living room", "dining room", 120), _merge(7, "hall", "hall", 3))
     lines = [
-        *report.tell_recording(RECORDED, FOLLOWED, 12_345, 8, 30.0),
-        *report.tell_replay(REPLAYED, FOLDED, True),
-        *report.tell_map(FOLDED, Settings(), 1),
-        *report.tell_merges(merges),
-        *report.tell_corrected(CORRECTED),
-        *report.tell_corrected(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
+        *report.recording_lines(RECORDED, FOLLOWED, 12_345, 8, 30.0),
+        *report.replay_lines(REPLAYED, FOLDED, True),
+        *report.map_lines(FOLDED, Settings(), 1),
+        *report.merge_lines(merges),
+        *report.correction_lines(CORRECTED),
+        *report.correction_lines(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
     ]
     assert max(map(len, lines)) <= 100
 
 
 def test_singular_forms() -> None:
     at_once = replace(FOLLOWED, batches=1)
-    lines = "\n".join(report.tell_recording(RECORDED, at_once, 1, 1, 30.0))
+    lines = "\n".join(report.recording_lines(RECORDED, at_once, 1, 1, 30.0))
     assert "through 1 room, " in lines
     assert "with 1 detection are in the log" in lines
     assert "in 1 transaction:" in lines
@@ -158,9 +158,9 @@ def test_types_of_places_are_told_in_lines_that_fit() -> None:
         for room in range(7)
         for k in range(4)
     ]
-    lines = list(tell_types(fold(documents).view))
+    lines = list(type_lines(fold(documents).view))
     assert lines[0].startswith("   by what stands in them (1 unsure): p1 bathroom ")
     assert sum(line.count("bathroom") for line in lines) == 6
     assert len(lines) > 1
     assert all(len(line) <= 96 for line in lines)
-    assert list(tell_types(fold(documents[:4]).view)) == []
+    assert list(type_lines(fold(documents[:4]).view)) == []
