@@ -115,7 +115,7 @@ def _number(value: float | str | None) -> str:
 
 
 def hints(calibration: Calibration) -> Iterator[str]:
-    """Obstacles to a better calibration, each with the next step."""
+    """Obstacles to a better calibration, with the next step where there is one."""
     last, camera = calibration.last, calibration.settings.camera
     if not calibration.observations:
         yield "no observation has a pose and an embedding: all constants are priors"
@@ -131,12 +131,12 @@ def hints(calibration: Calibration) -> Iterator[str]:
             " errors, sizes and the likeness of one thing are priors"
         )
     elif calibration.runs == 1:
-        yield "one run: what a thing's likeness loses between runs is a prior"
+        yield "one run: session_shift, the loss of likeness between runs, is a prior"
     pairs = next(each.count for each in last.readings if each.name == "different")
     if pairs < FEWEST_DIFFERENT:
         yield (
             f"{counted(pairs, 'pair')} of different classes in one picture, fewer than"
-            f" {FEWEST_DIFFERENT}: the fold goes on taking `different` from the pictures"
+            f" {FEWEST_DIFFERENT}: `different` stays unset, so the fold measures it on the pictures"
         )
     if calibration.beyond:
         boxes = f"{calibration.beyond:,} box{'' if calibration.beyond == 1 else 'es'}"

@@ -41,21 +41,21 @@ _ROWS = (
     ("room_ceiling", "… if the room was mapped"),
     ("pose_error_m.p50", "pose error p50, m"),
     ("pose_error_m.p90", "pose error p90, m"),
-    ("plain.pose_error_m.p50", "… of the plain recipe, p50"),
-    ("plain.pose_error_m.p90", "… of the plain recipe, p90"),
+    ("plain.pose_error_m.p50", "… of the plain baseline, p50"),
+    ("plain.pose_error_m.p90", "… of the plain baseline, p90"),
     ("yaw_error_rad.p50", "yaw error p50, rad"),
     ("centroid_error_m.p50", "place's centroid p50, m"),
     ("centroid_error_m.p90", "place's centroid p90, m"),
     ("within_1_5_m", "pose within 1.5 m"),
-    ("plain.within_1_5_m", "… of the plain recipe"),
+    ("plain.within_1_5_m", "… of the plain baseline"),
     ("known_called_unknown", "known called unknown"),
     ("unknown_called_unknown", "unknown called unknown"),
     ("auroc", "AUROC known / unknown"),
     ("best_cosine.auroc", "… of the best cosine"),
     ("known_ece", "calib. error of known"),
-    ("known_ece_floor", "… expected if all true"),
+    ("known_ece_floor", "… expected if calibrated"),
     ("ece", "calib. error of confidence"),
-    ("ece_floor", "… expected if all true"),
+    ("ece_floor", "… expected if calibrated"),
     ("latency_ms.p50", "latency p50, ms"),
     ("latency_ms.p99", "latency p99, ms"),
 )
@@ -64,17 +64,17 @@ _OWN_ROWS = (
     ("known", "… of things seen before"),
     ("pose_error_m.p50", "pose error p50, m"),
     ("pose_error_m.p90", "pose error p90, m"),
-    ("plain.pose_error_m.p50", "… of the plain recipe, p50"),
-    ("plain.pose_error_m.p90", "… of the plain recipe, p90"),
+    ("plain.pose_error_m.p50", "… of the plain baseline, p50"),
+    ("plain.pose_error_m.p90", "… of the plain baseline, p90"),
     ("within_1_5_m", "pose within 1.5 m"),
     ("known_called_unknown", "known called unknown"),
     ("taken_out_called_known", "taken out, called known"),
     ("auroc", "AUROC known / unknown"),
     ("best_cosine.auroc", "… of the best cosine"),
     ("known_ece", "calib. error of known"),
-    ("known_ece_floor", "… expected if all true"),
+    ("known_ece_floor", "… expected if calibrated"),
     ("ece", "calib. error of confidence"),
-    ("ece_floor", "… expected if all true"),
+    ("ece_floor", "… expected if calibrated"),
 )
 _LABEL = 30
 
@@ -137,7 +137,7 @@ def evaluate(
     """Score places, objects and re-localisation against ground truth.
 
     Re-localisation is scored with one to five crops a question, and with one to five pictures
-    (views) of up to three crops. Beside them are the scores of the plain recipe (the median
+    (views) of up to three crops. Beside them are the scores of the plain baseline (the median
     position of the ten most similar observations) and of the best cosine alone. With several maps
     each is asked every question, and the worst one is named.
 
@@ -204,7 +204,7 @@ questions its smallest number."""
 
 
 class Judged(NamedTuple):
-    """A map with its errors and the plain recipe's, for questions of ``crops`` crops."""
+    """A map with its errors and the plain baseline's, for questions of ``crops`` crops."""
 
     log: Path
     crops: str
@@ -213,7 +213,7 @@ class Judged(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """The ratio of the median error to the plain recipe's."""
+        """The ratio of the median error to the plain baseline's."""
         return float(self.ours["p50"] / self.plain["p50"])
 
 
@@ -229,7 +229,7 @@ def _document(found: _Scored) -> Mapping[str, Any]:
 
 
 def worst_of(found: _Scored) -> Judged | None:
-    """The map whose median error is greatest relative to the plain recipe's; by the maps' own
+    """The map whose median error is greatest relative to the plain baseline's; by the maps' own
     questions if there are no other questions about known things."""
     return _worst_by("relocalization", found) or _worst_by("self", found)
 
@@ -255,7 +255,7 @@ def worst_text(found: _Scored) -> str:
         return "no map was asked about things that it has\n"
     return (
         f"worst map: {worst.log}, {counted(int(worst.crops), 'crop')}: pose error p50"
-        f" {worst.ours['p50']:.2f} m, the plain recipe's {worst.plain['p50']:.2f} m\n"
+        f" {worst.ours['p50']:.2f} m, the plain baseline's {worst.plain['p50']:.2f} m\n"
     )
 
 

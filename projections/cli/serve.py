@@ -208,7 +208,7 @@ def serve(
     first.
     """
     if http is None and not zenoh:
-        raise MisuseError("neither --zenoh nor --http: there is nothing to serve on")
+        raise MisuseError("nothing to serve on; give --http HOST:PORT, or leave out --no-zenoh")
     camera = camera_from(hfov, image)
     options = dataclasses.replace(
         zenoh_options(connect, listen, zenoh_config),

@@ -39,9 +39,9 @@ class Camera:
     def __post_init__(self) -> None:
         if not (self.width_px > 0 and self.height_px > 0 and 1.0 <= self.hfov_deg <= 170.0):
             raise MisuseError(
-                f"a camera of {self.width_px:g} × {self.height_px:g} pixels and"
-                f" {self.hfov_deg:g}° is none; give positive sizes and a horizontal field of"
-                " view of 1 to 170 degrees"
+                f"no camera has {self.width_px:g} × {self.height_px:g} pixels and"
+                f" {self.hfov_deg:g}°; give positive sizes and a horizontal field of view of 1"
+                " to 170 degrees"
             )
 
     @property

@@ -13,8 +13,8 @@ box         ratio by the bearing of the box's middle, and by its height and edge
 in_front    1 if the landmark is in the field of view and within twice the usual distance
 
 The last term is a heavy tail: a crop that looks like a landmark counts near where that was seen
-even if its box contradicts, as in the plain method. k is below 1, so one unknown or wrong crop does
-not outvote the others.
+even if its box contradicts, as in the plain baseline. k is below 1, so one unknown or wrong crop
+does not outvote the others.
 
 Errors of the landmark's position, of the pose and of the box add up; all are linearised. The
 position's part is computed once for many headings (`Terms`), and for all crops of a group at once.

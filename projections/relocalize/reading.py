@@ -88,7 +88,7 @@ def parse_json(payload: bytes) -> Any:
     except json.JSONDecodeError as error:
         if error.msg == "Extra data":
             raise QuestionError(
-                f"more comes behind the question, in line {error.lineno}; send one JSON document,"
+                f"there is more after the question, in line {error.lineno}; send one JSON document,"
                 " such as one line of a file of envelopes"
             ) from None
         raise QuestionError(f"the question is not JSON: {error}") from None

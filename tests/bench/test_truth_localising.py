@@ -90,7 +90,7 @@ def _scores(p50: float, plain: float) -> Scores:
     return Scores(10, 5, p50, 3.0, plain, 4.0, 5.0, 0.5, 0.4, 0.9, 0.8, *([0.1] * 6), 2.0)
 
 
-def test_the_worst_beside_the_plain_recipe_stands_last_below_the_means() -> None:
+def test_the_worst_beside_the_plain_baseline_stands_last_below_the_means() -> None:
     rows = [
         LocaliseRow("rover one", "page", {"1 crop": _scores(1.0, 2.0)}),
         LocaliseRow("rover two", "page", {"1 crop": _scores(0.9, 1.0)}),

@@ -178,7 +178,7 @@ THIN: dict[str, tuple[list[dict[str, Any]], str]] = {
     "no poses": ([envelope(k, None) for k in range(5)], "all constants are priors"),
     "no revisits": (walk(40, detections=1), "nothing was seen three times from spots 0.8 m apart"),
     "no detections": ([envelope(k, 0.1 * k) for k in range(5)], "all constants are priors"),
-    "one run": (drive(4, "run-a", 60), "one run: what a thing's likeness loses between runs"),
+    "one run": (drive(4, "run-a", 60), "one run: session_shift, the loss of likeness"),
 }
 
 

@@ -53,7 +53,7 @@ def test_the_answer_has_the_least_expected_error(
     assert errors[best] <= min(errors) + 1e-9
 
 
-def test_the_plain_recipe_decides_between_spots_of_about_the_same_weight_only() -> None:
+def test_the_plain_baseline_decides_between_spots_of_about_the_same_weight_only() -> None:
     cells = np.array([(0.0, 0.0), (20.0, 0.0)])
     stood = np.array([(20.0, 0.5)] * 10)
     for share, expected in ((0.5, 1), (0.55, 1), (0.7, 0), (0.95, 0)):

@@ -258,7 +258,7 @@ def test_a_class_is_no_likeness(seed: int, all_classes: bool) -> None:
     ],
 )
 def test_a_hostile_box_leaves_the_answer_near_what_was_seen(box: tuple[float, ...]) -> None:
-    """As the plain recipe, which does not read boxes."""
+    """As the plain baseline, which does not read boxes."""
     scene, at, shown = random_scene(5)
     question, candidates = scene.ask([(at, shown[:1])])
     (view,) = question.views

@@ -1,4 +1,4 @@
-"""The recipes without a ranking that every score stands beside."""
+"""The baselines without a ranking that every score is compared with."""
 
 import statistics
 

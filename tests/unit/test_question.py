@@ -163,7 +163,7 @@ def test_a_movement_since_the_last_question_is_whole(question: Any, said: str) -
     [
         (b"\xff", "not JSON"),
         (b"[" * 10_000, "not JSON"),
-        (b"{}\n{}\n", "more comes behind the question, in line 2; send one JSON document"),
+        (b"{}\n{}\n", "there is more after the question, in line 2; send one JSON document"),
         ({}, "neither an envelope"),
         ("text", "neither an envelope"),
         ([], "the question has no crops with an embedding or a class; send at least one"),

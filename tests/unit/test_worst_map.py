@@ -22,7 +22,7 @@ def test_by_three_crops_where_there_are_such_questions() -> None:
     one = scored("one", c1=(9.0, 1.0), c2=(9.0, 1.0), c3=(0.5, 2.0))
     other = scored("other", c1=(0.1, 1.0), c2=(0.1, 1.0), c3=(0.6, 2.0))
     assert worst_text([one, other]) == (
-        "worst map: other, 3 crops: pose error p50 0.60 m, the plain recipe's 2.00 m\n"
+        "worst map: other, 3 crops: pose error p50 0.60 m, the plain baseline's 2.00 m\n"
     )
 
 

@@ -32,7 +32,7 @@ _NAME = 26
 
 def localise_table(rows: Sequence[LocaliseRow], *, lines: bool = True) -> str:
     """For each map and kind of question a line for each building, then means by robot and of all,
-    and last the building that is worst beside the plain recipe. Without ``lines`` means only."""
+    and last the building that is worst beside the plain baseline. Without ``lines`` means only."""
     parts = []
     for rule in dict.fromkeys(row.map for row in rows):
         own = [row for row in rows if row.map == rule]
