@@ -236,7 +236,8 @@ def _add_error_handlers(app: FastAPI) -> None:
     async def refuse_parameter(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         found = "missing" if first["type"] == "missing" else describe_value(first["input"])
-        message = f"{first['loc'][-1]} is {found}; {first['msg'].lower()}"
+        name = "the end of the path" if first["loc"][0] == "path" else first["loc"][-1]
+        message = f"{name} is {found}; {first['msg'].lower()}"
         status, document = refusal(QuestionError(message))
         return JSONResponse(document, status)
 

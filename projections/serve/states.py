@@ -65,7 +65,9 @@ def state_read(what: str, options: Mapping[str, str]) -> Callable[[Connection], 
     if "x" in options or "y" in options:
         return _near(what, reads, options)
     if "radius" in options:
-        raise QuestionError("radius is given without x and y; give all three, or none for all")
+        raise QuestionError(
+            "radius is given without x and y; give them too, or leave it out to list all"
+        )
     most, after = _limit(options) or DEFAULT_PAGE, _cursor(options)
 
     def read(connection: Connection) -> dict[str, Any]:

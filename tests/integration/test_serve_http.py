@@ -108,6 +108,7 @@ def test_its_description_names_what_a_path_and_an_option_may_be(http: str) -> No
         assert list(fetch(f"{http}/state/{name}?x=0&y=0")[1]) == [name]
     status, refused = fetch(f"{http}/state/rooms?x=0&y=0")
     assert (status, refused["error"]["kind"]) == (400, "bad_question")
+    assert refused["error"]["message"].startswith("the end of the path is 'rooms'; ")
 
 
 @pytest.mark.parametrize(
