@@ -25,7 +25,7 @@ def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
                 m.object_id,
                 m.object_place,
                 m.keyframe_place,
-                m.object_stand,
+                m.object_estimate,
             )
             for m in sorted(row, key=lambda m: m.observation)
         ]

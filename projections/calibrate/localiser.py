@@ -83,8 +83,8 @@ def correction(answers: Sequence[OwnAnswer]) -> LocalizerConstants:
     """The constants that calibrate the map's probabilities; the defaults without answers."""
     said, is_known = [_stepped(a.answer.known) for a in answers], [a.known for a in answers]
     sure, is_right = [_stepped(a.answer.confidence) for a in answers], [a.correct for a in answers]
-    known = _beyond(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
-    confidence = _beyond(
+    known = _correction_of(fit_line(said, is_known, KNOWN_USUAL, KNOWN_FIRMNESS), KNOWN_USUAL)
+    confidence = _correction_of(
         fit_line(sure, is_right, CONFIDENCE_USUAL, CONFIDENCE_FIRMNESS), CONFIDENCE_USUAL
     )
     return LocalizerConstants(
@@ -124,7 +124,7 @@ def fit_line(logits: Sequence[float], right: Sequence[bool], usual: Line, firmne
     return Line(scale, shift)
 
 
-def _beyond(line: Line, usual: Line) -> Line:
+def _correction_of(line: Line, usual: Line) -> Line:
     """The correction, bounded: the line that turns a logit of this map into one that the usual line
     fits."""
     least, most = _BOUNDS

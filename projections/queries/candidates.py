@@ -30,7 +30,14 @@ from projections.database.map_table import read_with_key
 from projections.database.statements import statements, tables
 from projections.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
-from projections.relocalize import NEIGHBOURS, CandidatePlace, Candidates, Crop, Match, Stand
+from projections.relocalize import (
+    NEIGHBOURS,
+    CandidatePlace,
+    Candidates,
+    Crop,
+    Match,
+    ObjectEstimate,
+)
 from projections.relocalize.candidates import (
     OBSERVATIONS_OF_EACH,
     check_space,
@@ -88,20 +95,20 @@ class CandidateSearch:
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: _Rows = []
-        along = _NOTHING
+        linked = _NOTHING
         if looked or not named:
-            near, along = self._nearest([crops[number] for number in looked], neighbours)
+            near, linked = self._nearest([crops[number] for number in looked], neighbours)
             if named:
                 near = [(looked[crop], *row) for crop, *row in near]
         if named:
             of_classes, more = self._of_classes(crops, named)
-            near, along = near + of_classes, along.and_more(more)
+            near, linked = near + of_classes, linked.union(more)
         self._memory.known = self._known
-        found = _assemble(len(crops), near, along, self._known)
+        found = _assemble(len(crops), near, linked, self._known)
         refuse_unknown_classes(crops, found.matches, self._class_names)
         return found
 
-    def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Along]":
+    def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Linked]":
         """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
         Places."""
         one = self._vectors is self._graph
@@ -118,9 +125,9 @@ class CandidateSearch:
         if not one:
             return near, self._follow([row[2] for row in near], origin)
         of_graph = next((row[_NEAR:] for row in rows if row[_NEAR] is not None), None)
-        return near, _NOTHING if of_graph is None else self._along(of_graph, origin)
+        return near, _NOTHING if of_graph is None else self._linked(of_graph, origin)
 
-    def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Along]":
+    def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Linked]":
         """As `_nearest`, for crops of which only the class is known; ``named`` are their
         indices."""
         names = sorted({crops[number].class_name or "" for number in named})
@@ -137,7 +144,7 @@ class CandidateSearch:
             rows = self._vectors.execute(_statement("described"), values, binary=True).fetchall()
         found, origin = self._near(rows)
         described = {row[2]: row[1:] for row in found}
-        along = self._follow(det_pks, origin)
+        linked = self._follow(det_pks, origin)
         by_class: dict[str, list[int]] = {}
         for place, det_pk in picked:
             by_class.setdefault(names[place - 1], []).append(det_pk)
@@ -147,7 +154,7 @@ class CandidateSearch:
             for det_pk in by_class.get(crops[number].class_name or "", ())
             if det_pk in described
         ]
-        return near, along
+        return near, linked
 
     def _near(self, rows: _Rows) -> tuple[_Rows, str | None]:
         """Store the cosines; returns the rows that have an observation, from the column ``crop``
@@ -156,15 +163,15 @@ class CandidateSearch:
         self._known = self._known.with_cosines(cosines)
         return [row[1:_NEAR] for row in rows if row[3] is not None], origin
 
-    def _follow(self, det_pks: Iterable[int], origin: str | None) -> "_Along":
+    def _follow(self, det_pks: Iterable[int], origin: str | None) -> "_Linked":
         """Object and Places of observations; ``origin`` is that of the vectors."""
         values = {"det_pks": sorted(set(det_pks)), "observation": LABEL_IDS["Observation"]}
         with _query_errors(self._targets.graph_url):
             values |= self._known.parameters
             rows = self._graph.execute(_statement("graph"), values, binary=True).fetchall()
-            return self._along(rows[0], origin)
+            return self._linked(rows[0], origin)
 
-    def _along(self, row: tuple[Any, ...], origin: str | None) -> "_Along":
+    def _linked(self, row: tuple[Any, ...], origin: str | None) -> "_Linked":
         """Store the settings and check the origin; ``row`` has the columns of ``of_graph``."""
         settings, graph, maps, things, places = row[0]
         if graph != origin or settings is not None:
@@ -173,7 +180,7 @@ class CandidateSearch:
             self._known = self._known.with_settings(settings, place)
         if maps is not None:
             self._known = self._with_maps(maps[0])
-        return _Along.of(row[1:], things or {}, places or {})
+        return _Linked.of(row[1:], things or {}, places or {})
 
     def _with_maps(self, key: str | None) -> KnownConstants:
         if key is None:
@@ -220,7 +227,7 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
 class _Thing(NamedTuple):
     object_id: str
     class_name: str
-    stand: Stand | None
+    estimate: ObjectEstimate | None
 
 
 _NONE: Final = 0
@@ -228,7 +235,7 @@ _NONE: Final = 0
 _NO_EDGES: Final = (_NONE, _NONE, _NONE)
 
 
-class _Along(NamedTuple):
+class _Linked(NamedTuple):
     """Ids of Object, its Place and the keyframe's Place by det_pk; and the Objects and Places with
     these ids."""
 
@@ -239,7 +246,7 @@ class _Along(NamedTuple):
     @classmethod
     def of(
         cls, edges: Sequence[list[int]], things: dict[str, str], places: dict[str, str]
-    ) -> "_Along":
+    ) -> "_Linked":
         """Made from the edges in the statement ``graph`` and the properties of Objects and
         Places."""
         observes, located, has, in_place = (
@@ -263,21 +270,21 @@ class _Along(NamedTuple):
             },
         )
 
-    def and_more(self, more: "_Along") -> "_Along":
+    def union(self, more: "_Linked") -> "_Linked":
         """The union with ``more``."""
-        return _Along(self.ids | more.ids, self.things | more.things, self.places | more.places)
+        return _Linked(self.ids | more.ids, self.things | more.things, self.places | more.places)
 
 
-_NOTHING: Final = _Along({}, {}, {})
+_NOTHING: Final = _Linked({}, {}, {})
 
 
-def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> Candidates:
+def _assemble(crops: int, near: _Rows, linked: _Linked, known: KnownConstants) -> Candidates:
     ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
     matches: list[list[Match]] = [[] for _ in range(crops)]
-    ordinals = {place: ordinal for place, (ordinal, _) in along.places.items()}
+    ordinals = {place: ordinal for place, (ordinal, _) in linked.places.items()}
     for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in ordered:
-        thing_id, its, there = along.ids.get(det_pk, _NO_EDGES)
-        thing = along.things.get(thing_id)
+        thing_id, its, there = linked.ids.get(det_pk, _NO_EDGES)
+        thing = linked.things.get(thing_id)
         matches[crop].append(
             Match(
                 ObservationOrdinal(det_pk - 1),
@@ -290,11 +297,11 @@ def _assemble(crops: int, near: _Rows, along: _Along, known: KnownConstants) -> 
                 None if thing is None else thing.object_id,
                 ordinals.get(its),
                 ordinals.get(there),
-                None if thing is None else thing.stand,
+                None if thing is None else thing.estimate,
             )
         )
     rows = tuple(map(tuple, matches))
-    return Candidates(rows, dict(along.places.values()), known.constants, known.walls)
+    return Candidates(rows, dict(linked.places.values()), known.constants, known.walls)
 
 
 def _box(array: str) -> Box:
@@ -305,13 +312,15 @@ def _box(array: str) -> Box:
 
 
 def _thing(properties: str) -> _Thing:
-    """An Object; without a stand under ``fusion = "page"`` and in a map of an older version, which
-    has no covariance."""
+    """An Object; without an estimate under ``fusion = "page"`` and in a map of an older version,
+    which has no covariance."""
     found = json.loads(properties)
-    stand = None
+    estimate = None
     if "est_xx" in found:
-        stand = Stand(*(found[f"est_{name}"] for name in ("x", "y", "xx", "xy", "yy", "spots")))
-    return _Thing(found["object_id"], found["class_name"], stand)
+        estimate = ObjectEstimate(
+            *(found[f"est_{name}"] for name in ("x", "y", "xx", "xy", "yy", "spots"))
+        )
+    return _Thing(found["object_id"], found["class_name"], estimate)
 
 
 def _place(properties: str) -> CandidatePlace:

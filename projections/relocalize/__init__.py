@@ -11,7 +11,7 @@ from .candidates import (
     Candidates,
     ExactIndex,
     Match,
-    Stand,
+    ObjectEstimate,
 )
 from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
@@ -50,10 +50,10 @@ __all__ = [
     "MapConstants",
     "Match",
     "Method",
+    "ObjectEstimate",
     "PoseHypothesis",
     "Question",
     "RankedPlace",
-    "Stand",
     "Track",
     "Tracked",
     "View",

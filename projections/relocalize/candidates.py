@@ -45,7 +45,7 @@ Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Stand:
+class ObjectEstimate:
     """The estimated position of an Object under fusion by evidence, in metres, with its covariance
     in m²; the Object was seen from ``spots`` positions of robots."""
 
@@ -63,7 +63,7 @@ class Match(NamedTuple):
     ``pose`` is that of its keyframe in metres and radians, None if the robot had none.
     ``object_place`` is where its Object is located and ``keyframe_place`` where the robot was:
     ordinals of Places, None for noise. ``class_name`` is the Object's if there is one.
-    ``object_stand`` is the estimated position of the Object, None under the default fusion.
+    ``object_estimate`` is the estimated position of the Object, None under the default fusion.
 
     A tuple, because a question makes hundreds, each of which would take 4 µs as a frozen dataclass.
     """
@@ -78,7 +78,7 @@ class Match(NamedTuple):
     object_id: str | None = None
     object_place: PlaceOrdinal | None = None
     keyframe_place: PlaceOrdinal | None = None
-    object_stand: Stand | None = None
+    object_estimate: ObjectEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,14 +226,14 @@ class ExactIndex:
             None if found is None else found.object_id,
             None if found is None else found.place,
             keyframe.place,
-            None if found is None else _stand(found.estimate),
+            None if found is None else _in_metres(found.estimate),
         )
 
 
-def _stand(estimate: Estimate | None) -> Stand | None:
+def _in_metres(estimate: Estimate | None) -> ObjectEstimate | None:
     if estimate is None:
         return None
-    return Stand(
+    return ObjectEstimate(
         estimate.est_x,
         estimate.est_y,
         *estimate.covariance_m2,

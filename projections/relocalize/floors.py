@@ -15,7 +15,7 @@ import numpy as np
 from projections.deltas import PlaceOrdinal
 
 from .camera import Floats
-from .candidates import CandidatePlace, Candidates, Match, Stand
+from .candidates import CandidatePlace, Candidates, Match, ObjectEstimate
 from .pose import Posterior
 from .walls import Flags, WallMap, Walls
 
@@ -133,12 +133,12 @@ class Layout:
         number = len(self.numbers) if place is None else self.numbers[places[place].floor]
         if not number:
             return match
-        dx, pose, stand = number * STEP_M, match.pose, match.object_stand
+        dx, pose, estimate = number * STEP_M, match.pose, match.object_estimate
         return match._replace(
             pose=None if pose is None else (pose[0] + dx, pose[1], pose[2]),
-            object_stand=None if stand is None else _stand(stand, dx),
+            object_estimate=None if estimate is None else _moved_estimate(estimate, dx),
         )
 
 
-def _stand(stand: Stand, dx: float) -> Stand:
-    return replace(stand, x=stand.x + dx)
+def _moved_estimate(estimate: ObjectEstimate, dx: float) -> ObjectEstimate:
+    return replace(estimate, x=estimate.x + dx)

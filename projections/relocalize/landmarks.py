@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .appearance import DIRECTIONS, appearance_tables, relative
 from .camera import Camera, Floats, Sights, box_rows, sights, views
-from .candidates import Match, Stand
+from .candidates import Match, ObjectEstimate
 from .constants import MapConstants
 from .cues import Cue, cues, with_class_sizes
 from .model import Model
@@ -232,13 +232,13 @@ def _things(
     found: list[list[_Thing]] = []
     others: list[list[int]] = []
     for begin, each in zip(begins.tolist(), seen, strict=True):
-        by_object: dict[str, tuple[Stand, list[int]]] = {}
+        by_object: dict[str, tuple[ObjectEstimate, list[int]]] = {}
         rest: list[int] = []
         for index, match in enumerate(each.matches, begin):
-            if match.object_stand is None or match.object_id is None:
+            if match.object_estimate is None or match.object_id is None:
                 rest.append(index)
             else:
-                by_object.setdefault(match.object_id, (match.object_stand, []))[1].append(index)
+                by_object.setdefault(match.object_id, (match.object_estimate, []))[1].append(index)
         found.append(
             [
                 _Thing(np.array(members, dtype=np.intp), at.x, at.y, (at.xx, at.xy, at.yy))

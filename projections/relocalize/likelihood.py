@@ -81,7 +81,7 @@ class Terms:
         slot = self.slot[:, :1] // self.positions * len(index) + np.arange(len(index))
         return self._at(lambda values: values.take(index, axis=1), slot, len(index))
 
-    def that_count(self) -> "Terms":
+    def relevant(self) -> "Terms":
         """The terms without pairs that do not change the mixture; all of them if there are few."""
         if self.looks.size < _MANY:
             return self

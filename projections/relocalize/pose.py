@@ -197,7 +197,7 @@ def _weigh(
     scene: Scene,
 ) -> Posterior:
     yaw, density = _hypotheses(sighted, behind, terms, scene)
-    terms = [[each.that_count() for each in of_view] for of_view in terms]
+    terms = [[each.relevant() for each in of_view] for of_view in terms]
     poses = np.empty((yaw.size, 3))
     poses[:, :2] = np.tile(cells, (len(yaw), 1))
     poses[:, 2] = yaw.ravel()

@@ -213,7 +213,7 @@ def test_landmarks_that_are_left_out_as_too_far_away_change_nothing(
     some, every = (terms_at(group, places, error, scene, every=all_) for all_ in (False, True))
     assert every.looks.shape == (56, 120)
     assert 0 < some.looks.size < 0.2 * every.looks.size
-    thinned = every.that_count()
+    thinned = every.relevant()
     assert thinned.looks.size < 0.2 * every.looks.size
     for terms in (some, thinned):
         pairs = [

@@ -17,8 +17,8 @@ from projections.relocalize import (
     Crop,
     MapConstants,
     Match,
+    ObjectEstimate,
     Question,
-    Stand,
     View,
 )
 from projections.relocalize.question import Box
@@ -83,11 +83,13 @@ class Scene:
         box = box_of(thing, pose, self.camera)
         if box is None:
             return None
-        stand = Stand(thing.x, thing.y, 0.02, 0.0, 0.02, 3) if self.has_estimates else None
+        estimate = (
+            ObjectEstimate(thing.x, thing.y, 0.02, 0.0, 0.02, 3) if self.has_estimates else None
+        )
         similarity = cosine(self.constants, likeness)
         return Match(
             number, f"d{number}", "mapped", similarity, pose, box, thing.name, f"o{index}",
-            object_stand=stand,
+            object_estimate=estimate,
         )  # fmt: skip
 
     def row(

@@ -95,23 +95,25 @@ def test_without_pairs_they_are_a_guess() -> None:
     assert alone.different_spread > 0.05
 
 
-def test_an_object_stands_where_it_is_estimated() -> None:
+def test_an_objects_estimate_is_that_of_the_fold() -> None:
     view = view_of(60, fusion="evidence")
     crops = [o for o in view.observations if o.embedding is not None][:1]
-    stands = {m.object_id: m.object_stand for m in matches(view, crops[0]) if m.object_id}
+    estimates = {m.object_id: m.object_estimate for m in matches(view, crops[0]) if m.object_id}
     estimated = 0
     for found in view.objects.values():
         at = found.estimate
-        if found.object_id not in stands or at is None:
+        if found.object_id not in estimates or at is None:
             continue
-        stand = stands[found.object_id]
-        assert stand is not None
-        assert (stand.x, stand.y, stand.spots) == (at.est_x, at.est_y, at.spots)
-        largest = float(np.linalg.eigvalsh([[stand.xx, stand.xy], [stand.xy, stand.yy]])[1])
+        estimate = estimates[found.object_id]
+        assert estimate is not None
+        assert (estimate.x, estimate.y, estimate.spots) == (at.est_x, at.est_y, at.spots)
+        largest = float(
+            np.linalg.eigvalsh([[estimate.xx, estimate.xy], [estimate.xy, estimate.yy]])[1]
+        )
         assert largest**0.5 == pytest.approx(at.est_sigma_m, rel=1e-6)
         estimated += 1
     assert estimated > 3
-    assert all(m.object_stand is None for m in matches(view_of(60), crops[0]))
+    assert all(m.object_estimate is None for m in matches(view_of(60), crops[0]))
 
 
 def matches(view: MapView, like: Any) -> Any:
