@@ -78,14 +78,14 @@ def against_floor(server: EmbeddedServer, folder: Path, quick: bool) -> None:
     least, default = (_least(timed) for timed in zip(*pairs, strict=True))
     reading = min(_read(log) for _ in range(REPEATS))
     folding = min(_fold(log) for _ in range(REPEATS))
-    _tell(size, wholes, least, default.copying, reading, folding)
+    _print(size, wholes, least, default.copying, reading, folding)
 
 
 def _least(timed: Sequence[Seconds]) -> Seconds:
     return Seconds(*(min(getattr(t, field.name) for t in timed) for field in fields(Seconds)))
 
 
-def _tell(
+def _print(
     size: int,
     wholes: dict[int, float],
     least: Seconds,

@@ -56,12 +56,12 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
     """Call ``act`` once when a rebuild is at ``stage``."""
     done: list[str] = []
 
-    def tell(at: RebuildProgress) -> None:
+    def on_progress(at: RebuildProgress) -> None:
         if at.stage == stage and at.done > 0 and not done:
             done.append(stage)
             act()
 
-    return tell
+    return on_progress
 
 
 @pytest.mark.parametrize("kind", ["two_databases", "one_database"][: rounds(2, 1)])

@@ -26,8 +26,8 @@ from projections.queries.relocalize import prepare_graph
 from projections.settings import Settings
 from tests.integration.test_projections import parsed
 from tests.rows import all_rows, expected_graph
+from tests.synthetic_objects import SyntheticDeltas, expected_rows, random_steps, without_sigma
 from tests.thorough import mostly_slow
-from tests.told_objects import Story, random_steps, told_rows, without_sigma
 
 EVIDENCE = Settings(fusion="evidence")
 PAGE = Path(__file__).parents[2] / "docs" / "projections.md"
@@ -94,7 +94,7 @@ def rebuild(
 def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
     seed: int, size: int, loader: LoaderName, one_database: Targets
 ) -> None:
-    events = Story.of(random_steps(seed, 70)).events
+    events = SyntheticDeltas.of(random_steps(seed, 70)).events
     with session(one_database) as connection:
         view = follow(connection, events, size, loader)
         assert len(view.objects) < len(view.all_objects)
@@ -103,12 +103,12 @@ def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
         assert all_rows(one_database) == live
     graph = parsed(dict(live[0]))
     assert graph == expected_graph(view)
-    told = told_rows(events)
+    by_label = expected_rows(events)
     assert {label: graph[label] for label in ("OBSERVES", "LOCATED_IN")} == {
-        label: told[label] for label in ("OBSERVES", "LOCATED_IN")
+        label: by_label[label] for label in ("OBSERVES", "LOCATED_IN")
     }
     found, sigmas = without_sigma(graph["Object"])
-    expected, expected_sigmas = without_sigma(told["Object"])
+    expected, expected_sigmas = without_sigma(by_label["Object"])
     assert found == expected
     assert sigmas == pytest.approx(expected_sigmas, rel=1e-12)
     memory, tracker = MemoryTables(), ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
@@ -126,7 +126,7 @@ def test_the_example_of_the_page_finds_objects_by_where_they_stand(
 ) -> None:
     (query,) = re.findall(r"    SELECT[^;]*o\.est_sigma_m < 0\.5[^;]*;", PAGE.read_text())
     with session(one_database) as connection:
-        view = follow(connection, Story.of(random_steps(10, 30)).events, 10, "copy")
+        view = follow(connection, SyntheticDeltas.of(random_steps(10, 30)).events, 10, "copy")
     rows = pg.execute(query.encode()).fetchall()
     near = [
         o for o in view.objects.values()
@@ -141,7 +141,7 @@ def test_the_example_of_the_page_finds_objects_by_where_they_stand(
 
 
 def test_questions_use_where_objects_stand(one_database: Targets) -> None:
-    events = Story.of(random_steps(6, 70)).events
+    events = SyntheticDeltas.of(random_steps(6, 70)).events
     # One has no estimate: its mean position counts.
     events = [
         [e for e in deltas if not (isinstance(e, d.ObjectEstimated) and e.object == 0)]

@@ -75,12 +75,12 @@ def test_a_rebuild_waits_for_a_drop_only_before_its_swap(log: Path, one_database
     assert try_drop_lock(dropping, "vectors")
     seen: list[str] = []
 
-    def tell(at: RebuildProgress) -> None:
+    def on_progress(at: RebuildProgress) -> None:
         seen.append(at.stage)
         if at.stage == "swapping":
             dropping.close()
 
-    rebuild(log, one_database, SETTINGS, progress=tell)
+    rebuild(log, one_database, SETTINGS, progress=on_progress)
     assert "tidying" in seen
     assert dropping.closed
 

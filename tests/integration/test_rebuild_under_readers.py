@@ -260,12 +260,12 @@ def test_a_transaction_that_reads_both_is_never_ended_by_a_deadlock(
     rebuild(log, one_database, SETTINGS, until=30)
     swapping = threading.Event()
 
-    def tell(at: RebuildProgress) -> None:
+    def on_progress(at: RebuildProgress) -> None:
         if at.stage == "swapping":
             swapping.set()
 
     rebuilding = threading.Thread(
-        target=rebuild, args=(log, one_database, SETTINGS), kwargs={"progress": tell}
+        target=rebuild, args=(log, one_database, SETTINGS), kwargs={"progress": on_progress}
     )
     with connect_for_cypher(one_database.graph_url) as reader:
         expected = single_answer(reader, first), single_answer(reader, second)
@@ -290,12 +290,12 @@ def test_readers_of_one_database_do_not_wait_for_those_of_the_other(
     rebuild(log, two_databases, SETTINGS, until=30)
     swapping = threading.Event()
 
-    def tell(at: RebuildProgress) -> None:
+    def on_progress(at: RebuildProgress) -> None:
         if at.stage == "swapping":
             swapping.set()
 
     rebuilding = threading.Thread(
-        target=rebuild, args=(log, two_databases, SETTINGS), kwargs={"progress": tell}
+        target=rebuild, args=(log, two_databases, SETTINGS), kwargs={"progress": on_progress}
     )
     with (
         connect_for_cypher(two_databases.graph_url) as graph,

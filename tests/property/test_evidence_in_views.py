@@ -25,7 +25,7 @@ from projections.model.view import MapView
 from projections.settings import Settings
 from tests.memory_history import MemoryHistory
 from tests.past_view import view_at
-from tests.told_objects import STEPS, Step, Story, random_steps
+from tests.synthetic_objects import STEPS, Step, SyntheticDeltas, random_steps
 
 EVIDENCE = Settings(fusion="evidence")
 SLOW = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -48,7 +48,7 @@ def history_of(events: Sequence[Sequence[d.Delta]]) -> MemoryHistory:
 @SLOW
 @given(STEPS)
 def test_a_map_at_any_offset_is_that_of_the_deltas_before_it(steps: list[Step]) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     history, latest = history_of(events), view_of(events)
     for end in range(len(events) + 1):
         past, expected = view_at(history, latest, Offset(end)), view_of(events[:end])
@@ -60,7 +60,7 @@ def test_a_map_at_any_offset_is_that_of_the_deltas_before_it(steps: list[Step]) 
 @SLOW
 @given(STEPS)
 def test_a_delta_applied_twice_does_no_harm(steps: list[Step]) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     assert map_digest(
         view_of([[delta for delta in deltas for _ in (1, 2)] for deltas in events])
     ) == map_digest(view_of(events))
@@ -71,7 +71,7 @@ def test_a_delta_applied_twice_does_no_harm(steps: list[Step]) -> None:
 def test_a_view_out_of_a_snapshot_goes_on_as_the_one_put_in(
     steps: list[Step], data: st.DataObject
 ) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     at = data.draw(st.integers(0, len(events)))
     loaded = MapView(EVIDENCE, keep_embeddings=False)
     load_view(loaded, unpack(pack(dump_view(view_of(events[:at])))))
@@ -86,7 +86,7 @@ def test_a_view_out_of_a_snapshot_goes_on_as_the_one_put_in(
 def test_the_difference_of_two_maps_turns_one_into_the_other(
     steps: list[Step], data: st.DataObject
 ) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     first, second = sorted(data.draw(st.integers(0, len(events))) for _ in "ab")
     before, after = view_of(events[:first]), view_of(events[:second])
     difference = difference_of(before, after, {}, ())
@@ -99,7 +99,7 @@ def test_the_difference_of_two_maps_turns_one_into_the_other(
 def test_objects_of_a_class_are_counted_as_they_are_called_at_each_offset(
     steps: list[Step],
 ) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     history = history_of(events)
     index = CountIndex(history)
     counts = []
@@ -141,7 +141,7 @@ def test_the_digest_of_fusion_by_evidence_covers_each_value(
 ) -> None:
     digests = []
     for changed in (False, True):
-        view = view_of(Story.of([Step(sees=(0,)), Step(sees=(0,))]).events)
+        view = view_of(SyntheticDeltas.of([Step(sees=(0,)), Step(sees=(0,))]).events)
         found = view.objects[d.ObjectOrdinal(0)]
         found.estimate = ESTIMATE
         if changed:
@@ -151,7 +151,7 @@ def test_the_digest_of_fusion_by_evidence_covers_each_value(
 
 
 def test_the_digest_of_the_page_s_rule_has_no_section_for_evidence() -> None:
-    events = Story.of([Step(sees=(0, 1)), Step(sees=(0,), place=1)]).events
+    events = SyntheticDeltas.of([Step(sees=(0, 1)), Step(sees=(0,), place=1)]).events
     plain = [[x for x in each if not isinstance(x, d.ObjectEstimated)] for each in events]
     assert map_digest(view_of(events, Settings())) == map_digest(view_of(plain, Settings()))
     assert map_digest(view_of(events)) != map_digest(view_of(plain))
@@ -160,7 +160,7 @@ def test_the_digest_of_the_page_s_rule_has_no_section_for_evidence() -> None:
 
 
 def test_state_says_where_things_stand() -> None:
-    view = view_of(Story.of(random_steps(3, 120)).events)
+    view = view_of(SyntheticDeltas.of(random_steps(3, 120)).events)
     document = state_document(view, "d")
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert any(row["missing"] for row in document["objects"])

@@ -18,8 +18,15 @@ from projections.model.records import Estimate
 from projections.model.view import MapView
 from projections.settings import Settings
 from tests.rows import memory_rows
+from tests.synthetic_objects import (
+    STEPS,
+    Step,
+    SyntheticDeltas,
+    expected_rows,
+    random_steps,
+    without_sigma,
+)
 from tests.thorough import examples, stride
-from tests.told_objects import STEPS, Step, Story, random_steps, told_rows, without_sigma
 
 EVIDENCE = Settings(fusion="evidence")
 Events = Sequence[Sequence[d.Delta]]
@@ -65,11 +72,11 @@ def rebuilt(
 
 
 def check_rows(tables: MemoryTables, events: Events) -> None:
-    told, rows = told_rows(events), memory_rows(tables)
+    by_label, rows = expected_rows(events), memory_rows(tables)
     for label in ("OBSERVES", "LOCATED_IN"):
-        assert rows[label] == told[label]
+        assert rows[label] == by_label[label]
     found, sigmas = without_sigma(rows["Object"])
-    expected, expected_sigmas = without_sigma(told["Object"])
+    expected, expected_sigmas = without_sigma(by_label["Object"])
     assert found == expected
     assert sigmas == pytest.approx(expected_sigmas, rel=1e-12)
 
@@ -79,7 +86,7 @@ def check_rows(tables: MemoryTables, events: Events) -> None:
 def test_batches_of_any_size_and_a_rebuild_give_what_the_deltas_say(
     steps: list[Step], size: int, rebuild_size: int
 ) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     live = MemoryTables()
     followed(events, size, live)
     check_rows(live, events)
@@ -95,16 +102,18 @@ def test_batches_of_any_size_and_a_rebuild_give_what_the_deltas_say(
 
 @pytest.mark.parametrize("size", [1, 7, 1_000])
 @pytest.mark.parametrize("seed", range(0, 5, stride(4)))
-def test_longer_stories(seed: int, size: int) -> None:
-    events, live = Story.of(random_steps(seed, 80)).events, MemoryTables()
+def test_longer_sequences_of_steps(seed: int, size: int) -> None:
+    events, live = SyntheticDeltas.of(random_steps(seed, 80)).events, MemoryTables()
     followed(events, size, live)
     check_rows(live, events)
     assert live.graph == rebuilt(events, 10)[1].graph
 
 
-def test_the_stories_have_every_kind_of_delta() -> None:
+def test_random_steps_give_every_kind_of_delta() -> None:
     """Else the tests here would say less than their names do."""
-    kinds = {type(delta) for event in Story.of(random_steps(1, 60)).events for delta in event}
+    kinds = {
+        type(delta) for event in SyntheticDeltas.of(random_steps(1, 60)).events for delta in event
+    }
     assert {
         d.ObjectsMerged, d.ObjectEstimated, d.ObjectClassified, d.ObjectMissing, d.ObjectRelocated
     } <= kinds  # fmt: skip
@@ -113,7 +122,7 @@ def test_the_stories_have_every_kind_of_delta() -> None:
 @settings(max_examples=examples(500))
 @given(STEPS)
 def test_rows_after_each_event_are_those_of_the_events_so_far(steps: list[Step]) -> None:
-    events, tables = Story.of(steps).events, MemoryTables()
+    events, tables = SyntheticDeltas.of(steps).events, MemoryTables()
     tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
     for offset, deltas in enumerate(events):
         tracker.apply_event(d.Offset(offset), deltas, offset)
@@ -123,7 +132,7 @@ def test_rows_after_each_event_are_those_of_the_events_so_far(steps: list[Step])
 
 @given(STEPS)
 def test_the_rows_of_the_page_have_none_of_it(steps: list[Step]) -> None:
-    events = Story.of(steps).events
+    events = SyntheticDeltas.of(steps).events
     view = MapView(Settings())
     for offset, deltas in enumerate(events):
         view.apply_event(d.Offset(offset), deltas)
@@ -136,7 +145,7 @@ def test_the_rows_of_the_page_have_none_of_it(steps: list[Step]) -> None:
 @given(STEPS)
 def test_applying_events_twice_changes_no_object(steps: list[Step]) -> None:
     once, twice = MapView(EVIDENCE), MapView(EVIDENCE)
-    for offset, deltas in enumerate(Story.of(steps).events):
+    for offset, deltas in enumerate(SyntheticDeltas.of(steps).events):
         once.apply_event(d.Offset(offset), deltas)
         twice.apply_event(d.Offset(offset), deltas)
         twice.apply_event(d.Offset(offset), deltas)
@@ -168,7 +177,7 @@ def test_sigma_is_that_of_the_least_sure_direction(
 
 def test_an_object_without_an_estimate_has_no_position() -> None:
     view = MapView(EVIDENCE)
-    for offset, deltas in enumerate(Story.of([Step(sees=(0,))]).events):
+    for offset, deltas in enumerate(SyntheticDeltas.of([Step(sees=(0,))]).events):
         view.apply_event(
             d.Offset(offset), [e for e in deltas if not isinstance(e, d.ObjectEstimated)]
         )

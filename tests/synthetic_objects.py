@@ -1,9 +1,9 @@
 """Deltas as fusion by evidence gives them, made by hand, and the rows that they must give.
 
-`Story` makes events whose deltas keep to the order and the promises of `projections.deltas`, also
-of kinds that a real fold gives rarely: merges, missing and relocated Objects. `told_rows` works out
-from all deltas at once what the tables must hold; it shares nothing with the view or the sinks but
-the label numbering that docs/projections.md promises.
+`SyntheticDeltas` makes events whose deltas keep to the order and the promises of
+`projections.deltas`, also of kinds that a real fold gives rarely: merges, missing and relocated
+Objects. `expected_rows` computes from all deltas at once what the tables must hold; it shares
+nothing with the view or the sinks but the label numbering that docs/projections.md promises.
 """
 
 from collections.abc import Iterable, Sequence
@@ -90,8 +90,8 @@ class _Sums:
 
 
 @dataclass
-class Story:
-    """Events in their order; `tell` adds one."""
+class SyntheticDeltas:
+    """Events in their order; `add` adds one."""
 
     events: list[list[d.Delta]] = field(default_factory=list)
     _live: dict[int, _Sums] = field(default_factory=dict)
@@ -100,14 +100,14 @@ class Story:
     _observations: int = 0
 
     @classmethod
-    def of(cls, steps: Iterable[Step]) -> "Story":
+    def of(cls, steps: Iterable[Step]) -> "SyntheticDeltas":
         """All steps."""
-        story = cls()
+        made = cls()
         for step in steps:
-            story.tell(step)
-        return story
+            made.add(step)
+        return made
 
-    def tell(self, step: Step) -> None:
+    def add(self, step: Step) -> None:
         """Add the event of a step."""
         n = len(self.events)
         x, y, time = n * 130_000 - 700_000, n * n * 1_000, 100.0 + 0.5 * n
@@ -202,7 +202,7 @@ class Story:
         return {survivor}
 
 
-def told_rows(events: Iterable[Sequence[d.Delta]]) -> dict[str, list[tuple[Any, ...]]]:
+def expected_rows(events: Iterable[Sequence[d.Delta]]) -> dict[str, list[tuple[Any, ...]]]:
     """The rows of Object, OBSERVES and LOCATED_IN after these events, by id, properties parsed."""
     deltas = [delta for event in events for delta in event]
     into = {m.absorbed: m.survivor for m in deltas if isinstance(m, d.ObjectsMerged)}
