@@ -67,7 +67,7 @@ class RoomsConstants(BaseModel):
     def _is_few_cells(cls, drive_m: float, info: ValidationInfo) -> float:
         cell_m = info.data.get("cell_m")
         if cell_m is not None and drive_m > _MOST_CELLS * cell_m:
-            raise ValueError(f"is more than {_MOST_CELLS} times cell_m, which is {cell_m:g}")
+            raise ValueError(f"should be at most {_MOST_CELLS} times cell_m, which is {cell_m:g}")
         return drive_m
 
 

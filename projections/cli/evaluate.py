@@ -25,6 +25,7 @@ from .options import (
     camera_from,
     check_picture,
     settings_of,
+    writing,
 )
 from .relocalize import method_from
 from .terminal import display, emit, say
@@ -169,11 +170,16 @@ def evaluate(
         if asked:
             warn_of_no_truth(map_log, result.scores)
         found.append((map_log, result.scores))
-        if picture is not None:
-            draw_failures(result.view, result.trials[3], picture)
     if json_:
         emit(_document(found))
-        return
+    else:
+        _print_scores(found, asked=asked)
+    if picture is not None:  # last: the scores are printed if it cannot be written
+        with writing(picture):
+            draw_failures(result.view, result.trials[3], picture)
+
+
+def _print_scores(found: "_Scored", *, asked: bool) -> None:
     for map_log, scores in found:
         title = f"{map_log}\n" if len(found) > 1 else ""
         display(title + (scores_text(scores) if asked else "") + own_text(scores))

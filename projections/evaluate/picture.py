@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from eventsrc.errors import MisuseError
 from projections.model.view import MapView
 
 from .trials import Trial
@@ -12,7 +11,7 @@ _GOOD, _BAD, _UNKNOWN, _DRIVE = "#2a7f62", "#c0392b", "#8e8e8e", "#d9d9d9"
 
 
 def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
-    """Draw to ``out`` (.png, .svg or .pdf). Raises MisuseError when it cannot be written."""
+    """Draw to ``out`` (.png, .svg or .pdf). Raises OSError when it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,10 +31,7 @@ def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
         "green: within 1.5 m   red: not, with a line to the answer   grey: answered 'unknown'"
     )
     axes.set_aspect("equal")
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise MisuseError(f"--picture {out}: {error}; give a .png, .svg or .pdf") from None
+    figure.savefig(out)
 
 
 def _draw(axes: object, trial: Trial) -> None:

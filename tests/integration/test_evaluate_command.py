@@ -130,6 +130,15 @@ def test_without_truth_no_perfect_scores_are_printed(mapfold: Commands, runs: li
     assert re.fullmatch(r"objects: number \d+, not scored", objects)
 
 
+def test_a_picture_that_cannot_be_written_does_not_cost_the_scores(
+    mapfold: Commands, runs: list[str]
+) -> None:
+    picture = Path(runs[3]) / "fails.png"  # in a file
+    said = mapfold("evaluate", *runs[:2], "--picture", picture, code=2)
+    assert said.out.startswith("places: number ")
+    assert f"mapfold: {picture}: cannot be written: File exists; choose another\n" in said.err
+
+
 def test_the_map_is_asked_about_itself_without_truth(mapfold: Commands, runs: list[str]) -> None:
     found = mapfold("evaluate", *runs[:2], "--self", "--json").json
     own = found["self"]["3"]

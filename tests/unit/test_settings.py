@@ -138,8 +138,11 @@ def test_dotted_names_change_one_value_of_a_group() -> None:
         ("evidence.reach=1", ", evidence.sizes_m.CLASS"),
         ("places=magic", "--set places=magic: input should be 'page' or 'rooms'"),
         ("rooms=1", "give one of them, such as rooms.cell_m=0.5"),
-        ("rooms.drive_m=20", "rooms.drive_m=20: is more than 20 times cell_m, which is 0.75"),
-        ("rooms.cell_m=0.01", "rooms.drive_m=4.0: is more than 20 times cell_m, which is 0.01"),
+        ("rooms.drive_m=20", "rooms.drive_m=20: should be at most 20 times cell_m, which is 0.75"),
+        (
+            "rooms.cell_m=0.01",
+            "rooms.drive_m=4.0: should be at most 20 times cell_m, which is 0.01",
+        ),
         ("eps_m.x=1", "no setting 'eps_m.x'; there are embedding_dim, embedding_model, eps_m"),
         ("where=1", "min_samples, places, camera.NAME, evidence.NAME, localizer.NAME, rooms.NAME"),
         ("eps_m.neighbourhood=x", "no setting 'eps_m.neighbourhood'"),
