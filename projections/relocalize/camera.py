@@ -104,7 +104,7 @@ class Sights:
     ``bearing`` is radians to the left of the robot's heading, 0 without a box; ``log_height`` the
     logarithm of the box's height at a distance of 1 m; ``rise`` (2, n) how steeply the lines to the
     upper and lower edge rise, and ``whole`` (2, n) which of these the picture's border does not
-    cut. ``cut`` says which boxes it cuts at a side, ``known`` is False where there is no box.
+    cut. ``cut`` marks boxes that it cuts at a side, ``known`` is False where there is no box.
     """
 
     bearing: Floats

@@ -22,7 +22,7 @@ PLAIN_NEAREST: Final = 10
 
 
 def stood_at(views: Sequence[View], matches: Sequence[Sequence[Match]]) -> Floats:
-    """Positions (n, 2) of robots at the observations most similar to each crop that has a look;
+    """Positions (n, 2) of robots at the observations most similar to each crop with an embedding;
     ``matches`` run parallel to the crops of all views."""
     crops = [crop for view in views for crop in view.crops]
     found = [

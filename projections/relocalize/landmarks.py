@@ -71,14 +71,14 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CropGroup:
-    """Crops of one view that all have a box, or all have none, and their landmarks: those of one
-    crop after the other from ``first`` (c,) on. ``has_look`` (c,) is False where only the class is
-    known."""
+    """Crops of one view that all have a box, or all have none, and their landmarks, grouped by
+    crop; ``first`` (c,) has the index of each crop's first. ``has_embedding`` (c,) is False where
+    only the class is known."""
 
     landmarks: Landmarks
     first: Indices
     sight: Sights
-    has_look: tuple[bool, ...]
+    has_embedding: tuple[bool, ...]
     owner: Indices = field(init=False)
     """The index of each landmark's crop."""
     edges: Cue = field(init=False)

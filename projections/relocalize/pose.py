@@ -289,9 +289,9 @@ def _choose(
     x, y = _refine(x, y, float(poses[int(np.argmax(close)), 2]), sighted, behind, been, scene)
     likeliest = int(np.argmax(weights))
     squared = (cells[:, 0] - x) ** 2 + (cells[:, 1] - y) ** 2
-    looks = [has_look for view in sighted for group in view.groups for has_look in group.has_look]
+    embedded = [flag for view in sighted for group in view.groups for flag in group.has_embedding]
     found = features_of(
-        list(itertools.compress(marks, looks)),
+        list(itertools.compress(marks, embedded)),
         each[:, likeliest],
         asked,
         float(of_cell[squared < 1.5**2].sum()),

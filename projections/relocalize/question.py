@@ -1,6 +1,6 @@
 """Questions: the object crops a lost robot sees, in one picture or in several.
 
-The crops of a view come from one picture: their boxes say in which direction each lies.
+The crops of a view come from one picture: their boxes give the direction of each.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ STILL: Final[Movement] = (0.0, 0.0, 0.0)
 class Crop:
     """One crop: a unit vector, float32 of shape (dim,), and what else is known about it.
 
-    ``vector`` is None when only the class is known; ``is_text`` says that it is the embedding of a
+    ``vector`` is None when only the class is known; ``is_text`` is whether it is the embedding of a
     text. ``bbox`` is x_min, y_min, x_max, y_max in pixels of the whole picture, None when unknown.
     """
 

@@ -5,7 +5,7 @@ A question is an envelope, a JSON list of detections, ``{"crops": [...]}``, or s
 the view before, in metres ahead and to the left and radians to the left; that of the first view is
 read only where questions are tracked. A crop has an ``embedding``, base64 of little-endian float32
 as in an envelope, or a JSON list of numbers; or else a ``class``, and then things of that class are
-meant. ``"text": true`` says that the embedding is one of a text. ``class``, ``bbox``, ``det_id``
+meant. ``"text": true`` marks the embedding of a text. ``class``, ``bbox``, ``det_id``
 and ``embedding_model`` are optional, and so is the question's ``camera``, as in an envelope. Crops
 with neither embedding nor class are left out, because nothing can be searched with them. The pose
 in an envelope is *not* read: it is the answer that is sought.
@@ -237,7 +237,7 @@ def _validated(items: list[Any], name: str) -> list[CropModel]:
         return _CROPS.validate_python(items)
     except ValidationError as error:
         errors = error.errors(include_url=False)
-        # Of the two forms of an embedding the list is named last, and says more.
+        # The error of an embedding as a list comes after that as a text, and has more details.
         first = next((e for e in errors if e["loc"][-1] != "str"), errors[0])
         place = ".".join(str(p) for p in first["loc"] if not str(p).startswith("list["))
         what = (
