@@ -1,6 +1,7 @@
 """Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
 
 import gc
+import signal
 from collections.abc import Generator
 from pathlib import Path
 
@@ -13,6 +14,11 @@ from tests.thorough import examples
 # How long an example takes says how busy the machine is; benchmarks measure speed.
 settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
 settings.load_profile("mapfold")
+
+# A shell that starts the tests in the background has them ignore Ctrl-C, and every program that
+# they start; many tests interrupt such programs.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MANY_FILES = 300
 
