@@ -4,6 +4,7 @@ The only importer of ``distributed``. Each site is one task. When a worker is ki
 gives its tasks to others; a task whose workers were killed is submitted again `RETRIES` times.
 """
 
+import asyncio
 import logging
 import queue
 import time
@@ -17,6 +18,7 @@ from eventsrc.text import counted
 from .engine import RETRIES, Ended, Progress, Task
 
 _CONNECT_S: Final = 10.0
+_ANSWER_S: Final = 12.0
 _POLL_S: Final = 0.25
 _GONE_S: Final = 20.0
 """Longest time without a connection to the scheduler; it has no results meanwhile."""
@@ -28,7 +30,7 @@ class ClusterError(MapfoldError):
 
 class DaskCluster:
     """A client of the scheduler at ``address``, HOST:PORT. Raises MisuseError without the package
-    ``distributed``, and ClusterError when nothing answers."""
+    ``distributed``, and ClusterError when no scheduler answers."""
 
     def __init__(self, address: str) -> None:
         try:
@@ -37,18 +39,19 @@ class DaskCluster:
             raise MisuseError(
                 "--engine dask:// needs the package distributed: pip install 'mapfold[cluster]'"
             ) from None
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are reported here
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # errors are raised
         self.address = address
         client: Any = distributed.Client
         try:
+            asyncio.run(_check_scheduler(f"tcp://{address}"))
             self._client: Any = client(
                 f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False, name="mapfold"
             )
-        except (OSError, ValueError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        except Exception as error:  # noqa: BLE001 - Dask's decoders fail in many ways
             raise ClusterError(
-                f"--engine dask://{address}: no scheduler answers there: {reason}; start one with"
-                " `dask scheduler`, and workers with `dask worker tcp://HOST:PORT --nthreads 1`"
+                f"--engine dask://{address}: no scheduler answers there: {_reason(error)}; start"
+                " one with `dask scheduler` (port 8786; 8787 is its dashboard), and workers with"
+                " `dask worker tcp://HOST:PORT --nthreads 1`"
             ) from None
 
     def wait_for_workers(self, number: int, seconds: float) -> None:
@@ -123,6 +126,34 @@ class DaskCluster:
     def __exit__(self, kind: object, *_: object) -> None:
         """Cancel tasks that have not started; running ones finish on their workers."""
         self._client.close(timeout=2.0 if kind is None else 0.5)
+
+
+async def _check_scheduler(address: str) -> None:
+    """Raise an error unless the server at ``address`` says that it is a scheduler.
+
+    A `Client` that meets another server, such as the dashboard, can wait without end, and cannot be
+    closed.
+    """
+    import distributed.core
+
+    connect: Any = distributed.core.rpc
+    async with asyncio.timeout(_ANSWER_S):
+        server = connect(address, timeout=_CONNECT_S)
+        try:
+            kind = (await server.identity())["type"]
+        finally:
+            await server.close_rpc()
+    if kind != "Scheduler":
+        raise ValueError(f"it is a Dask {kind}")
+
+
+def _reason(error: Exception) -> str:
+    if type(error) is TimeoutError:
+        return f"no answer within {_ANSWER_S:g} s"
+    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+    if isinstance(error, OSError) or type(error) is ValueError:  # the address is wrong, or away
+        return text
+    return f"the answer is not Dask's ({text[:100]})"
 
 
 def _call(task: Task, request: Any) -> Any:

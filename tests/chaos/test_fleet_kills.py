@@ -52,9 +52,3 @@ def test_a_scheduler_that_goes_is_an_error_after_a_while(tmp_path: Path) -> None
 
         with pytest.raises(ClusterError, match="the scheduler has ended; of 2 of 2 sites"):
             list(engine.run(wait, requests, kill_scheduler))
-
-
-@pytest.mark.slow
-def test_no_scheduler_is_an_error_that_says_how_to_start_one() -> None:
-    with pytest.raises(ClusterError, match="no scheduler answers there"):
-        DaskCluster("127.0.0.1:1")
