@@ -190,8 +190,11 @@ class ExactIndex:
             products[dropped] = -np.inf
             neighbours = min(neighbours, len(dropped) - int(dropped.sum()))
         order = np.argsort(-products, kind="stable")[:neighbours]
+        # Rounded vectors may be a little longer than 1, so that a cosine would be above 1.
         return tuple(
-            self._match(ObservationOrdinal(int(self._ordinals[i])), float(products[i]) / Q40)
+            self._match(
+                ObservationOrdinal(int(self._ordinals[i])), min(float(products[i]) / Q40, 1.0)
+            )
             for i in order
         )
 
