@@ -6,6 +6,7 @@ key that the fold cannot read. The caller writes a rejected payload, with its by
 """
 
 import binascii
+import codecs
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -45,6 +46,7 @@ _EMPTY_LIST: Final = (
     "an empty list: of the older form without an envelope, a picture with no detections, which "
     "names no run, keyframe, time or pose"
 )
+_BYTE_ORDER_MARKS: Final = (codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _MAX_SHOWN: Final = 80
 """Characters of a value that a reason shows."""
 
@@ -223,6 +225,8 @@ def _error_reason(error: ValidationError, payload: bytes) -> str:
     details = error.errors(include_url=False, include_context=False, include_input=False)
     first = details[0]
     if first["type"] == "json_invalid":
+        if payload.startswith(_BYTE_ORDER_MARKS):
+            return "not JSON: begins with a byte order mark; send UTF-8 without one"
         return f"not JSON: {first['msg'].removeprefix('Invalid JSON: ')}"
     if first["type"] == "model_type" and not first["loc"]:
         if from_json(payload) == []:

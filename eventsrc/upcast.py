@@ -103,7 +103,18 @@ def _converted(event: VersionedEvent, max_bytes: int) -> Accepted | Rejected:
         payload = json.dumps(document).encode()
     except (ValueError, RecursionError) as error:
         return Rejected(f"not an envelope of version {event.version}: {error}")
-    return ingest(payload, max_bytes=2 * max_bytes)
+    read = ingest(payload, max_bytes=2 * max_bytes)
+    if isinstance(read, Rejected) and _lists_envelopes(event):
+        return Rejected("a list of envelopes; each must be a message, or a line, of its own")
+    return read
+
+
+def _lists_envelopes(event: VersionedEvent) -> bool:
+    """Whether a payload taken for a bare list is one of envelopes."""
+    if event.version != BARE_LIST_VERSION:
+        return False
+    first = json.loads(event.payload)[0]
+    return "run_id" in first and "detections" in first
 
 
 def read_envelopes(

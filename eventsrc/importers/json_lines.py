@@ -16,6 +16,7 @@ spaces and escapes reach the log unchanged.
 """
 
 import binascii
+import codecs
 import gzip
 import json
 import zlib
@@ -148,7 +149,8 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 class JsonLines:
-    """One message a line; blank lines are skipped. Gzip is recognised by its first bytes."""
+    """One message a line; blank lines are skipped, and so is a byte order mark at the start.
+    Gzip is recognised by its first bytes."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None, start: bytes) -> None:
         self.name = name
@@ -175,6 +177,8 @@ class JsonLines:
                 number += 1
                 self._read += len(line)
                 self._check_length(number, line)
+                if number == 1:
+                    line = line.removeprefix(codecs.BOM_UTF8)
                 if line := line.strip(b" \t\r\n"):
                     self.at = number
                     yield read_line(line)

@@ -9,7 +9,7 @@ from projections.fleet.looking import SiteStatus
 from projections.fleet.sites import Site
 from projections.fleet.which_site import WhichSite
 
-from .log import iso_time
+from .event_text import iso_time
 
 _HEADS: Final = (
     "site", "state", "events", "MB", "keys", "last keyframe", "rejected", "lost", "graph", "vectors"

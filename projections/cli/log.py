@@ -1,20 +1,15 @@
 """The commands of `mapfold log`, except for `spaces`."""
 
-import base64
 import contextlib
-import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from eventsrc.crops import CROP_SCHEMA, InvalidCrop, decode_crop
-from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
-from eventsrc.envelope import ENVELOPE_VERSION, FIRST_OFFSET, Offset
+from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogError, MisuseError
 from eventsrc.log import (
     Event,
@@ -22,7 +17,6 @@ from eventsrc.log import (
     LogReader,
     SegmentRecovery,
     Unreadable,
-    VerbatimEvent,
     Verification,
     cache_sizes,
     recover_log,
@@ -32,99 +26,12 @@ from eventsrc.log.reader import OnGap
 from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.log_info import LogInfo, SegmentInfo, log_info
-from eventsrc.occupancy_map import InvalidMap, read_map_head
-from eventsrc.system_events import EMBEDDINGS_KEY, MAP_KEY, OccupancyMapEvent
 from eventsrc.text import counted, visible
 
+from .event_text import event_document, event_line, iso_time
 from .options import JsonOption, LogArgument
 from .spaces import spaces
 from .terminal import display, emit, emit_lines, finish, say
-
-_SUMMARY_CHARS = 100
-
-
-def iso_time(time_ns: int) -> str:
-    """UTC to the microsecond; the number itself outside the calendar's years 1 to 9999."""
-    try:
-        time = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
-    except (OverflowError, ValueError):
-        return f"{time_ns} ns"
-    return f"{time:%Y-%m-%dT%H:%M:%S}.{time_ns // 1000 % 1_000_000:06d}Z"
-
-
-def event_document(event: Event) -> dict[str, Any]:
-    """``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``. The payload is its JSON value, or
-    its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null.
-    So does a verbatim message, with its ``encoding`` and ``schema``. An envelope of an older form
-    has its ``version``."""
-    document: dict[str, Any] = {
-        "offset": event.offset,
-        "logged_ns": event.logged_ns,
-        "stamp_ns": event.stamp_ns,
-        "key": event.key,
-    }
-    if event.is_envelope and event.version != ENVELOPE_VERSION:
-        document["version"] = event.version
-    if isinstance(event, VerbatimEvent):
-        document |= {"encoding": event.format.encoding, "schema": event.format.schema}
-    else:
-        with contextlib.suppress(UnicodeDecodeError):
-            return {**document, "payload": _value(event.payload.decode())}
-    encoded = base64.b64encode(event.payload).decode()
-    return {**document, "payload": None, "payload_base64": encoded}
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text, parse_constant=_reject_constant)
-    except (ValueError, RecursionError):
-        return text
-
-
-def _reject_constant(name: str) -> None:
-    raise ValueError(f"{name} is no JSON")
-
-
-def event_line(event: Event) -> str:
-    """Offset, time, key and a summary of the payload."""
-    text = f"{event.offset:>8}  {iso_time(event.stamp_ns)}  {event.key}  {_summary(event)}"
-    return visible(text)
-
-
-def _summary(event: Event) -> str:
-    if isinstance(event, VerbatimEvent):
-        form = event.format
-        if form.schema == CROP_SCHEMA:
-            with contextlib.suppress(InvalidCrop):  # another picture
-                crop = decode_crop(event.payload)
-                return f"crop of {crop.det_id}, {len(crop.jpeg):,} bytes"
-        return f"{form.encoding} {form.schema}".rstrip() + f", {len(event.payload):,} bytes"
-    if event.key == MAP_KEY:
-        with contextlib.suppress(InvalidMap):  # `log verify` names it
-            return _map_text(read_map_head(event.payload))
-    if event.key == EMBEDDINGS_KEY:
-        with contextlib.suppress(InvalidEmbeddings):  # `log verify` names it
-            made = decode_embeddings(event.payload)
-            count, dim = made.vectors.shape
-            return f"{counted(count, 'vector')} of {made.space}, dimension {dim:,}"
-    value = _value(event.payload.decode(errors="replace"))
-    if isinstance(value, dict) and isinstance(value.get("detections"), list):
-        classes = [str(d.get("class", "?")) for d in value["detections"] if isinstance(d, dict)]
-        seen = ", ".join(classes) or "nothing"
-        return f"{value.get('run_id')}:{value.get('keyframe_id')} saw {seen}"
-    text = event.payload.decode(errors="replace").replace("\n", " ")
-    return text if len(text) <= _SUMMARY_CHARS else text[: _SUMMARY_CHARS - 1] + "…"
-
-
-def _map_text(head: OccupancyMapEvent) -> str:
-    name = "" if head.map_id is None else f" {head.map_id}"
-    x, y, yaw = head.origin
-    turned = f", turned by {yaw:g} rad" if yaw else ""
-    floor = "" if head.floor is None else f", of floor {head.floor}"
-    return (
-        f"map{name} of {head.width:,} × {head.height:,} cells of {head.resolution:g} m from "
-        f"({x:g}, {y:g}){turned}{floor}, from {head.source}"
-    )
 
 
 class RangeNotes:

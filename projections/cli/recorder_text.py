@@ -12,9 +12,11 @@ from typing import Any, Self
 from rich.live import Live
 from rich.text import Text
 
+from eventsrc.advised import advised
 from eventsrc.errors import LogError
 from eventsrc.log import LogWriter
 from eventsrc.recorder import Recorder, RecorderReport
+from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.text import counted, visible
 
 from .terminal import emit, finish, people, say
@@ -57,12 +59,12 @@ class RecorderStatus:
             lines.append(
                 f"LOST {counted(lost - self._lost, 'message')} (in all {report.queue_full:,} in a "
                 f"full queue, {report.too_large:,} too large, {report.transport_missed:,} on the "
-                f"way); see mapfold/loss in {self._log}"
+                f"way); {_shown_by(self._log, LOSS_KEY)}"
             )
         if report.rejected > self._rejected:
             lines.append(
                 f"rejected {counted(report.rejected - self._rejected, 'payload')}; "
-                f"see mapfold/rejected in {self._log}"
+                f"{_shown_by(self._log, REJECTED_KEY)}"
             )
         lines += [
             f"SEGMENT GIVEN UP: {fault}; recording goes on in a new segment"
@@ -74,6 +76,10 @@ class RecorderStatus:
         self._faults = len(report.faults)
         self._sealing_error = report.sealing_error
         return lines
+
+
+def _shown_by(log: Path, key: str) -> str:
+    return f"`{advised('log', 'cat', log, '--key', key)}` shows them"
 
 
 def _messages(report: RecorderReport) -> str:

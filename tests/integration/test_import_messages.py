@@ -1,5 +1,6 @@
 """Messages of `mapfold import`: rejections with their place, progress of an interrupted import."""
 
+import codecs
 import signal
 import subprocess
 from pathlib import Path
@@ -35,6 +36,23 @@ def test_rejections_are_printed_with_file_line_and_reason_and_the_rest_counted(
     said = mapfold("import", "again", "-", stdin=b"\njunk", code=3).err.splitlines()
     assert said[0].startswith("standard input: line 2: rejected: not JSON")
     assert len(said) == 2
+
+
+def test_a_byte_order_mark_at_the_start_of_a_file_is_passed_over(mapfold: Commands) -> None:
+    lines = b"\n".join(_lines(0, 2))
+    (mapfold.folder / "a.jsonl").write_bytes(codecs.BOM_UTF8 + lines)
+    mapfold("import", "L", "a.jsonl")
+    assert [event.payload for event in read_log(mapfold.folder / "L")] == _lines(0, 2)
+
+
+def test_log_cat_shows_the_whole_reason_of_a_rejection(mapfold: Commands) -> None:
+    broken = payload(envelope(0, timestamp="k" * 90))
+    (mapfold.folder / "a.jsonl").write_bytes(broken)
+    said = mapfold("import", "L", "a.jsonl", code=3).err
+    reason = said.splitlines()[0].partition("line 1: rejected: ")[2]
+    assert len(reason) > 100
+    shown = mapfold("log", "cat", "L", "--key", "mapfold/rejected").out.rstrip("\n")
+    assert shown.endswith(f"  tb/detections, {len(broken)} bytes: {reason}")
 
 
 def test_ctrl_c_prints_what_is_kept_and_its_last_place(mapfold: Commands) -> None:

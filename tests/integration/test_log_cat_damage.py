@@ -7,7 +7,7 @@ import pytest
 
 from eventsrc.errors import LogError
 from eventsrc.log import LogReader, LogWriter
-from projections.cli.log import iso_time
+from projections.cli.event_text import iso_time
 from tests.commands import Commands
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip
 

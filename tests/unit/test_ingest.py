@@ -158,6 +158,12 @@ def test_numbers_must_be_finite(field: str, number: str) -> None:
     assert refusal(raw).startswith(f"{field}: ")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_is_named(encoding: str) -> None:
+    reason = refusal(json.dumps(envelope()).encode(encoding))
+    assert reason == "not JSON: begins with a byte order mark; send UTF-8 without one"
+
+
 @pytest.mark.parametrize(
     ("fields", "says"),
     [

@@ -49,7 +49,8 @@ def test_a_loss_is_warned_of_once() -> None:
 
 def test_rejections_are_warned_of() -> None:
     (line,) = _line(0.0).warnings(dataclasses.replace(NOTHING, rejected=3))
-    assert line == "rejected 3 payloads; see mapfold/rejected in logs/run-7"
+    shown = "`mapfold log cat logs/run-7 --key mapfold/rejected` shows them"
+    assert line == f"rejected 3 payloads; {shown}"
 
 
 def test_sealing_is_mentioned_only_when_it_is_behind_or_fails() -> None:

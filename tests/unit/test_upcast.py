@@ -48,6 +48,14 @@ def test_what_is_no_bare_list_is_refused_with_a_reason(payload: bytes) -> None:
     assert read.reason
 
 
+def test_a_list_of_envelopes_is_refused_as_such() -> None:
+    payload = b"[" + envelope(1) + b"," + envelope(2) + b"]"
+    assert detect_version(payload) == 1
+    read = read_envelope(event(payload, 1))
+    assert isinstance(read, Rejected)
+    assert read.reason.startswith("a list of envelopes; each must be a message")
+
+
 def test_an_unknown_version_is_named() -> None:
     read = read_envelope(event(envelope(1), ENVELOPE_VERSION + 1))
     assert isinstance(read, Rejected)
