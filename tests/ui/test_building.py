@@ -206,20 +206,20 @@ def test_the_type_of_each_place_is_that_of_state(
 ) -> None:
     """In the list, in the panel of a place with its probability, and in the label."""
     page = visit(sample, "#panel=why")
-    told = set()
+    types_seen = set()
     for at in (445, 150, 60):
         go(page, at)
         for place in places_of(mapfold, SAMPLE, at, *WIDE):
             name = page.get_by_role("button", name=_short(place), exact=True)
             row = page.locator("ol.places li").filter(has=name)
             kind, share = place.get("type"), place.get("type_probability")
-            told.add((kind is None, share is None))
+            types_seen.add((kind is None, share is None))
             count = f"{place['keyframe_count']} keyframe"
             expect(row).to_contain_text(count if kind is None else f"{kind}, {count}")
             row.get_by_role("button").click()
             fact = page.locator(".facts-list div").filter(has_text=re.compile("^type"))
             if share is None:
-                expect(fact).to_contain_text("nothing tells")
+                expect(fact).to_contain_text("unknown")
             elif kind is None:
                 first = place["type_candidates"][0]
                 share_of_first = f"{_percent(first['probability'])} %"
@@ -228,7 +228,7 @@ def test_the_type_of_each_place_is_that_of_state(
                 expect(fact).to_contain_text(f"{kind} {_percent(share)} %")
             page.keyboard.press("Escape")
         assert moment(page) == at
-    assert {(False, False), (True, False)} <= told
+    assert {(False, False), (True, False)} <= types_seen
     go(page, 445)
     expect(page.locator("ol.places")).to_contain_text("kitchen")
     assert any(text.endswith("· kitchen") for text in labels(picture(page)))

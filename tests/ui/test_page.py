@@ -65,7 +65,7 @@ def test_hostile_names_are_text_everywhere(hostile: UiServer, visit: Visit, pict
     expect(page.get_by_role("option").first).to_contain_text("<script>")
     page.get_by_role("option").first.click()
     expect(page.locator(".thing")).to_contain_text("<script>")
-    expect(page.locator(".told")).to_be_visible()
+    expect(page.locator(".answer")).to_be_visible()
     for panel in ("Compare", "Find", "Correct"):
         page.get_by_role("tab", name=panel).click()
     expect(page.locator(".corrections")).to_contain_text("<img src=x")

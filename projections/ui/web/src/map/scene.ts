@@ -37,7 +37,7 @@ export interface Scene {
   height: number;
   layers: Record<LayerName, boolean>;
   walls: readonly Segment[];
-  /** By id of a place; empty until the server has told them for this W. */
+  /** By id of a place; empty until the server has sent them for this W. */
   types: ReadonlyMap<string, PlaceType>;
   selection: Thing | null;
   hovered: Thing | null;

@@ -12,7 +12,7 @@ import { keyframeId } from "../model/names";
 import { gridOf, regionsOf } from "../model/regions";
 import { walls } from "../state/walls";
 import * as store from "../state/store";
-import { ThingLink } from "./Told";
+import { ThingLink } from "./AnswerParts";
 
 export interface MergeStory {
   number: number;

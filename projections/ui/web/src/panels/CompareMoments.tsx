@@ -6,7 +6,7 @@ import { goTo } from "../state/actions";
 import { useAnswer } from "../state/answers";
 import { difference } from "../state/overlays";
 import * as store from "../state/store";
-import { CommandLine, ThingLink, Told } from "./Told";
+import { Answer, CommandLine, ThingLink } from "./AnswerParts";
 
 interface DiffAnswer {
   same: boolean;
@@ -54,14 +54,14 @@ export function CompareMoments() {
             </button>
           </div>
           <DifferenceCounts />
-          <Told asked={asked}>
+          <Answer asked={asked}>
             {(answer) => (
               <>
                 {answer.same ? <p class="summary">The two maps are the same.</p> : <pre class="lines" tabIndex={0} aria-label="Difference as text">{answer.lines.join("\n")}</pre>}
                 <CommandLine command={answer.command} />
               </>
             )}
-          </Told>
+          </Answer>
         </>
       )}
     </>

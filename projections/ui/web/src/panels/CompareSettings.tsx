@@ -7,7 +7,7 @@ import { decodeHistory } from "../history/decode";
 import { useAnswer } from "../state/answers";
 import { sentence } from "../state/loading";
 import * as store from "../state/store";
-import { CommandLine, Moment, Told } from "./Told";
+import { Answer, CommandLine, Moment } from "./AnswerParts";
 
 const FOLD_AFTER_MS = 220;
 
@@ -97,7 +97,7 @@ export function CompareSettings() {
         </p>
       )}
       {failed !== null && <p class="error" role="alert">{failed}</p>}
-      <Told asked={asked}>{(answer) => <Scores answer={answer} />}</Told>
+      <Answer asked={asked}>{(answer) => <Scores answer={answer} />}</Answer>
     </>
   );
 }

@@ -6,10 +6,10 @@ import { hasToken, postJson } from "../api/client";
 import { label } from "../model/names";
 import { useAnswer } from "../state/answers";
 import { grow, sentence } from "../state/loading";
-import { tell } from "../state/pointer";
+import { showNotice } from "../state/pointer";
 import * as store from "../state/store";
 import { type Parameter, KINDS, proposal, propose } from "./proposals";
-import { CommandLine, Moment, Told } from "./Told";
+import { Answer, CommandLine, Moment } from "./AnswerParts";
 
 interface Correction {
   offset: number;
@@ -43,7 +43,7 @@ export function Correct() {
       {allowed && !hasToken && <p class="error" role="alert">This page was opened without the token of the printed link, so it cannot record corrections. Open the link that mapfold ui printed.</p>}
       {allowed ? <Form /> : <p class="note">This page only looks. To record corrections start it with <code>mapfold ui LOG --allow-edits</code>.</p>}
       <h2>Corrections in this log</h2>
-      <Told asked={asked}>
+      <Answer asked={asked}>
         {({ corrections, command }) => (
           <>
             {corrections.length === 0 && <p class="dim">None.</p>}
@@ -72,7 +72,7 @@ export function Correct() {
             <CommandLine command={command} />
           </>
         )}
-      </Told>
+      </Answer>
     </section>
   );
 }
@@ -107,7 +107,7 @@ function Form() {
       });
       if (dry) setPreview(outcome);
       else {
-        tell(`Recorded at offset ${outcome.offset}. It changes ${outcome.effect_text ?? "the map"}.`);
+        showNotice(`Recorded at offset ${outcome.offset}. It changes ${outcome.effect_text ?? "the map"}.`);
         proposal.value = null;
         setReason("");
         setPreview(null);

@@ -8,7 +8,7 @@ import { showEvent } from "../state/actions";
 import { sentence } from "../state/loading";
 import * as store from "../state/store";
 import { type Completion, type ConditionFunction, completions, quoted } from "./completion";
-import { CommandLine, Moment } from "./Told";
+import { CommandLine, Moment } from "./AnswerParts";
 
 interface Turn {
   offset: number;
@@ -194,7 +194,7 @@ function turnsOf({ found, turns }: Search): Turn[] {
 function Found({ found }: { found: Search }) {
   const turns = turnsOf(found);
   return (
-    <div class="told">
+    <div class="answer">
       <p class="summary">
         {found.found !== null ? (
           <>

@@ -1,4 +1,4 @@
-/** Follows a log that grows: server-sent events tell when there is more. A page that is hidden does
+/** Follows a log that grows: server-sent events say when there is more. A page that is hidden does
  * not listen: browsers open at most six connections to a server, and each page would hold one. */
 
 import { signal } from "@preact/signals";
@@ -39,7 +39,7 @@ export function keepLive() {
       try {
         for await (const heard of liveEvents("/api/live", stop.signal)) hear(heard as LiveNews);
       } catch (error) {
-        // That the server does not answer is told by the banner.
+        // The banner reports that the server does not answer.
         const refused = error instanceof ApiError && error.kind !== LOST;
         if (refused) store.refused.value = `The page does not follow the log: ${error.message}`;
       }

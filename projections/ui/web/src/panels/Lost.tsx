@@ -9,7 +9,7 @@ import { sentence } from "../state/loading";
 import { lostOverlay } from "../state/overlays";
 import * as store from "../state/store";
 import { type LostAnswer, type Truth, overlayOf } from "./lost_answer";
-import { CommandLine, ThingLink } from "./Told";
+import { CommandLine, ThingLink } from "./AnswerParts";
 
 /** As the server takes. */
 const MOST_BYTES = 1_000_000;
@@ -146,7 +146,7 @@ function Answer({ answer: found }: { answer: LostAnswer }) {
   if (history === null) return null;
   const { pose, places, confidence, unknown } = found;
   return (
-    <div class="told">
+    <div class="answer">
       <p class="summary">
         {places.length === 0
           ? "Nothing in the map looks like these crops."

@@ -5,7 +5,7 @@ import { floorName, floorOfPlace, floorsOf } from "../model/floors";
 import { counted, isolated, label, placeTitle, shortPlace } from "../model/names";
 import { keyframeId } from "../model/names";
 import * as store from "../state/store";
-import { Moment, ThingLink } from "./Told";
+import { Moment, ThingLink } from "./AnswerParts";
 
 const MOST = 300;
 

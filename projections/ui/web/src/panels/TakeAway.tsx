@@ -6,12 +6,12 @@ import { currentScene } from "../map/current_scene";
 import { paint } from "../map/paint";
 import { SvgSurface } from "../map/surface";
 import { stateDocument } from "../model/document";
-import { tell } from "../state/pointer";
+import { showNotice } from "../state/pointer";
 import { writtenAddress } from "../state/url";
 import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 import { moveInMenu } from "../ui/menu_keys";
-import { copy } from "./Told";
+import { copy } from "./AnswerParts";
 
 const open = signal(false);
 
@@ -71,14 +71,14 @@ function save(blob: Blob, suffix: string) {
   link.download = fileName(suffix);
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-  tell(`Saved ${link.download}.`);
+  showNotice(`Saved ${link.download}.`);
 }
 
 function savePng(): Promise<void> {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
   return new Promise((resolve) => {
     canvas?.toBlob((blob) => {
-      if (blob === null) tell("The browser makes no picture of a map of this size; make the window smaller, or take the SVG.");
+      if (blob === null) showNotice("The browser makes no picture of a map of this size; make the window smaller, or take the SVG.");
       else save(blob, "png");
       resolve();
     }, "image/png");
@@ -112,7 +112,7 @@ export function copyCommand(): Promise<void> {
   const shown = store.stateCommand.value;
   const state = shown?.at === store.at.value ? shown.command : null;
   if (answer === undefined && state === null) {
-    tell("The server has not yet told the command of this moment; try again.");
+    showNotice("The server has not sent the command of this moment yet; try again.");
     return Promise.resolve();
   }
   return copy(answer ?? state ?? "", "the command line");

@@ -15,7 +15,7 @@ import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 import { type MergeStory, BridgeView, bridgeOf } from "./BridgeView";
 import { Overview } from "./Overview";
-import { CommandLine, Lines, Steps, ThingLink, Told } from "./Told";
+import { Answer, CommandLine, Lines, Steps, ThingLink } from "./AnswerParts";
 
 interface WhyAnswer {
   kind: string;
@@ -60,7 +60,7 @@ function Story({ thing, history }: { thing: store.Thing; history: History }) {
     <section class="story">
       <Heading thing={thing} history={history} />
       <Facts thing={thing} history={history} />
-      <Told asked={asked}>
+      <Answer asked={asked}>
         {(answer) => (
           <>
             <p class="summary">{answer.summary}</p>
@@ -69,7 +69,7 @@ function Story({ thing, history }: { thing: store.Thing; history: History }) {
             <CommandLine command={answer.command} />
           </>
         )}
-      </Told>
+      </Answer>
     </section>
   );
 }
@@ -150,7 +150,7 @@ function placeFacts(thing: store.Thing, history: History, map: MapState): Fact[]
 
 /** What kind of room it is; the likeliest ones where that is unsure. */
 function typeText(found: PlaceType | undefined): string {
-  if (found === undefined) return store.toldNow.value === null ? "…" : "nothing tells";
+  if (found === undefined) return store.mapFactsNow.value === null ? "…" : "unknown";
   const percent = (share: number) => `${Math.round(share * 100)} %`;
   if (found.type !== null) return `${found.type} ${percent(found.probability)}`;
   return `unsure: ${found.candidates.map(([type, share]) => `${type} ${percent(share)}`).join(", ")}`;

@@ -23,8 +23,8 @@ export function useAnswer<T>(path: string | null, again: unknown = null): Asked<
       (value) => setAsked({ value, error: null, loading: false }),
       (error: unknown) => {
         if (error instanceof DOMException && error.name === "AbortError") return;
-        const told = error instanceof ApiError ? error : new ApiError("failed", String(error));
-        setAsked({ value: null, error: told, loading: false });
+        const failure = error instanceof ApiError ? error : new ApiError("failed", String(error));
+        setAsked({ value: null, error: failure, loading: false });
       },
     );
     return () => abort.abort();

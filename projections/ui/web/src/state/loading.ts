@@ -5,7 +5,7 @@ import { ApiError, LOST, address, getBinary, getJson, watchServer } from "../api
 import type { LogInfo } from "../api/types";
 import { decodeHistory } from "../history/decode";
 import type { History } from "../history/types";
-import { tell } from "./pointer";
+import { showNotice } from "./pointer";
 import * as store from "./store";
 import { applyAddress } from "./url";
 
@@ -49,7 +49,7 @@ function watchFold(): () => void {
       const { loading } = info;
       progress.value = loading === undefined || loading.done ? null : loading;
     } catch {
-      // `load` itself tells it.
+      // `load` itself reports it.
     }
     setTimeout(() => void look(), 400);
   };
@@ -124,7 +124,7 @@ export function keepKnown() {
     else {
       getBinary(address("/api/history", { known_at: wanted })).then(
         (answer) => show(decodeHistory(answer)),
-        (error: unknown) => tell(sentence(error)),
+        (error: unknown) => showNotice(sentence(error)),
       );
     }
   });

@@ -1,4 +1,4 @@
-/** Moves W while playing, and tells when W has rested. */
+/** Moves W while playing, and sets `restedAt` when W has rested. */
 
 import { effect } from "@preact/signals";
 import { playedTo } from "../model/moments";

@@ -15,11 +15,11 @@ export interface Tip {
 export const tip = signal<Tip | null>(null);
 export const markTip = signal<{ x: number; y: number; lines: string[] } | null>(null);
 export const menu = signal<{ x: number; y: number; thing: Thing | null } | null>(null);
-/** A line that tells what just happened, such as "copied". */
+/** A line about what just happened, such as "Copied the link."; gone after a while. */
 export const notice = signal<string | null>(null);
 
 let timer = 0;
-export function tell(text: string) {
+export function showNotice(text: string) {
   notice.value = text;
   clearTimeout(timer);
   timer = window.setTimeout(() => {

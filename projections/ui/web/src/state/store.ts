@@ -49,15 +49,15 @@ export function knownAt(asked: number): number | null {
   return known.value === "then" && asked === at.value ? null : (history.value?.knownAt ?? null);
 }
 
-/** What the server last told of one W: the types of places by id, and the digest. */
-export const told = signal<{ at: number; known_at: number; digest: string; types: PlaceType[] } | null>(null);
-/** What it told, if it was of the map that is shown. */
-export const toldNow = computed(() => {
+/** The digest and the types of places at one W, as the server last sent them. */
+export const mapFacts = signal<{ at: number; known_at: number; digest: string; types: PlaceType[] } | null>(null);
+/** The same if they belong to the map that is shown, otherwise null. */
+export const mapFactsNow = computed(() => {
   const now = known.value === "then" ? at.value : history.value?.knownAt;
-  const fits = told.value?.at === at.value && told.value.known_at === now && wantedKnownAt.value === shownKnownAt.value;
-  return fits ? told.value : null;
+  const fits = mapFacts.value?.at === at.value && mapFacts.value.known_at === now && wantedKnownAt.value === shownKnownAt.value;
+  return fits ? mapFacts.value : null;
 });
-export const types = computed<ReadonlyMap<string, PlaceType>>(() => new Map(toldNow.value?.types.map((each) => [each.place_id, each])));
+export const types = computed<ReadonlyMap<string, PlaceType>>(() => new Map(mapFactsNow.value?.types.map((each) => [each.place_id, each])));
 /** The command line that gives the map last asked about, and its W. */
 export const stateCommand = signal<{ at: number; command: string } | null>(null);
 /** W when dragging and playing have rested: what the server is asked about. */

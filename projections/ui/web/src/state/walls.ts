@@ -33,7 +33,7 @@ export function keepWalls() {
     if (wanted < 0 || store.log.value?.maps?.length === 1 || asked.value.has(wanted)) return;
     getJson<{ walls: Segment[] }>(address("/api/walls", { number: wanted })).then(
       (answer) => (asked.value = new Map(asked.value).set(wanted, answer.walls)),
-      () => {}, // a lost server is told elsewhere
+      () => {}, // the banner reports a lost server
     );
   });
 }

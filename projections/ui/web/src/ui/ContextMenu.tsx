@@ -2,7 +2,7 @@
 
 import { useEffect, useRef } from "preact/hooks";
 import { correctionsFor, propose } from "../panels/proposals";
-import { copy } from "../panels/Told";
+import { copy } from "../panels/AnswerParts";
 import { openPanel, select } from "../state/actions";
 import { menu } from "../state/pointer";
 import * as store from "../state/store";

@@ -12,13 +12,13 @@ export function Digest() {
   const [map, history] = [store.map.value, store.history.value];
   const at = store.restedAt.value;
   const path = history === null || at > history.through ? null : address("/api/digest", { at, known_at: store.knownAt(at) });
-  const asked = useAnswer<NonNullable<typeof store.told.value> & { command: string }>(path);
+  const asked = useAnswer<NonNullable<typeof store.mapFacts.value> & { command: string }>(path);
   useEffect(() => {
-    const found = (store.told.value = asked.value);
+    const found = (store.mapFacts.value = asked.value);
     store.stateCommand.value = found === null ? null : { at: found.at, command: found.command.replace(/ --digest\b/, "") };
   }, [asked.value]);
   if (map === null || history === null) return null;
-  const digest = store.toldNow.value?.digest ?? "";
+  const digest = store.mapFactsNow.value?.digest ?? "";
   return (
     <div class="facts">
       <p>

@@ -126,6 +126,6 @@ async function askServer(value: string) {
     }));
     hits.value = [...hits.value, ...more].slice(0, 12);
   } catch {
-    // The hits that the page found itself stay; a lost server is told elsewhere.
+    // The hits that the page found itself stay; the banner reports a lost server.
   }
 }

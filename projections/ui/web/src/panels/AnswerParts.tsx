@@ -6,17 +6,17 @@ import { bringIntoView } from "../map/MapCanvas";
 import { isolated, label } from "../model/names";
 import { positionOf, select, showEvent } from "../state/actions";
 import type { Asked } from "../state/answers";
-import { tell } from "../state/pointer";
+import { showNotice } from "../state/pointer";
 import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 
 const KINDS: readonly string[] = ["place", "object", "keyframe", "merge"];
 
 /** The answer, or a sentence about why there is none. */
-export function Told<T>({ asked, children }: { asked: Asked<T>; children: (value: T) => ComponentChildren }) {
-  if (asked.error !== null) return <p class="told error" role="alert">{asked.error.message}</p>;
-  if (asked.value === null) return asked.loading ? <p class="told dim" role="status">Asking …</p> : null;
-  return <div class={asked.loading ? "told stale" : "told"} aria-busy={asked.loading}>{children(asked.value)}</div>;
+export function Answer<T>({ asked, children }: { asked: Asked<T>; children: (value: T) => ComponentChildren }) {
+  if (asked.error !== null) return <p class="answer error" role="alert">{asked.error.message}</p>;
+  if (asked.value === null) return asked.loading ? <p class="answer dim" role="status">Asking …</p> : null;
+  return <div class={asked.loading ? "answer stale" : "answer"} aria-busy={asked.loading}>{children(asked.value)}</div>;
 }
 
 /** A thing that can be clicked: it is selected, and brought into view. */
@@ -125,9 +125,9 @@ export function CommandLine({ command }: { command: string | null | undefined })
 export async function copy(text: string, what: string) {
   try {
     await navigator.clipboard.writeText(text);
-    tell(`Copied ${what}.`);
+    showNotice(`Copied ${what}.`);
   } catch {
-    tell(`The browser does not let this page copy. Here it is: ${text}`);
+    showNotice(`The browser does not let this page copy. Here it is: ${text}`);
   }
 }
 
