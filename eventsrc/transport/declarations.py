@@ -24,6 +24,7 @@ _MAX_BATCH_BYTES: Final = 4 * 1024 * 1024
 _PAUSE_FROM: Final = 8
 _PAUSE_S: Final = 0.002
 """Pause after a batch of at least `_PAUSE_FROM` messages; at 20,000 a second 40 come meanwhile."""
+_JSON: Final = zenoh.Encoding.APPLICATION_JSON
 _HEARTBEATS: Final = "@adv/pub/"
 """In a heartbeat's key: between the publisher's key and its session and entity id."""
 _HEARTBEAT_BYTES: Final = 4
@@ -84,12 +85,13 @@ class Query:
         return self._query.payload.to_bytes() if self._query.payload is not None else b""
 
     def reply(self, key: str, payload: bytes) -> None:
-        """Reply under ``key``."""
-        self._end(lambda: self._query.reply(key, payload))
+        """Reply under ``key``. The payload is JSON, and Zenoh's encoding says so: other clients,
+        such as the REST plugin of a router, show it by its encoding."""
+        self._end(lambda: self._query.reply(key, payload, encoding=_JSON))
 
     def reply_error(self, payload: bytes) -> None:
-        """Reply with an error."""
-        self._end(lambda: self._query.reply_err(payload))
+        """Reply with an error, which is JSON."""
+        self._end(lambda: self._query.reply_err(payload, encoding=_JSON))
 
     def _end(self, send: Callable[[], None]) -> None:
         with ignore_transport_errors():  # the peer that asked may be gone

@@ -102,6 +102,15 @@ def test_a_bad_question_gets_an_error_as_reply(connected: Callable[[], Session])
 
 
 @pytest.mark.usefixtures("service")
+@pytest.mark.parametrize("selector", ["mapfold/state/places", "mapfold/state/secrets"])
+def test_replies_have_the_encoding_of_json(connected: Callable[[], Session], selector: str) -> None:
+    (reply,) = connected().raw.get(selector, timeout=DEADLINE_S)
+    answer = reply.ok or reply.err
+    assert answer is not None
+    assert str(answer.encoding) == "application/json"
+
+
+@pytest.mark.usefixtures("service")
 def test_parameters_of_zenoh_are_passed_over(connected: Callable[[], Session]) -> None:
     session = connected()
     assert ask(session, "mapfold/state/places?_time=[..]") == ask(session, "mapfold/state/places")
