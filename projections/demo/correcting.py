@@ -61,8 +61,8 @@ class Corrected:
 def correct(
     folder: DemoFolder, targets: Targets, settings: Settings, run: SimulatedRun, folded: Folded
 ) -> Corrected:
-    """Undo the merge chosen by `mapping`, name the absorbed place after its room (the largest place
-    if none merged), and fold again."""
+    """Undo the merge that `most_telling` returns, name the absorbed place after its room (the
+    largest place if none merged), and fold again."""
     started = time.monotonic()
     commands = tuple(_record_all(folder, settings, run, folded))
     again = fold_with_rooms(folder, settings, run)

@@ -133,7 +133,7 @@ _WAIT_S: Final = 600
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The numbers of published, recorded and lost envelopes.
+    """The numbers of published, recorded, rejected and lost envelopes.
 
     ``intact`` says that the log holds every payload, in order, byte for byte.
     """

@@ -60,7 +60,7 @@ class CurrentMap:
 
     @property
     def known_at(self) -> Offset:
-        """The offset behind the last command."""
+        """The offset after the last command; 0 without commands."""
         return Offset(self.commands[-1].offset + 1) if self.commands else FIRST_OFFSET
 
     def command_events(self) -> Iterator[Event]:

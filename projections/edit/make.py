@@ -133,7 +133,7 @@ def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe,
     if pair[0] == pair[1]:
         raise EditRefused(
             f"{first} and {second} are the same place; name two, or two keyframes of it "
-            f"(`{advised('merges')}` lists what became one)"
+            f"(`{advised('merges')}` lists which places merged)"
         )
     return pair
 

@@ -2,7 +2,7 @@
 
 By keyframe id a keyframe takes the pose with its id. By stamp it takes the pose at its timestamp:
 x and y linearly between the two poses around it, yaw the shorter way round. Nothing is
-extrapolated: a keyframe before the first or behind the last pose takes that one if it is within
+extrapolated: a keyframe before the first or after the last pose takes that one if it is within
 ``slack_s`` of it, and otherwise stays as it is.
 """
 

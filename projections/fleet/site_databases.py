@@ -99,14 +99,14 @@ def template_of(option: str | None, name: str, variable: str) -> Template | None
     )
     if with_mark != ["dbname"]:
         raise MisuseError(
-            f"{given_as}: {PLACEHOLDER} stands in the database's name alone (not in"
+            f"{given_as}: {PLACEHOLDER} may be only in the database's name (not in"
             f" {', '.join(n for n in with_mark if n != 'dbname')}): {_EXAMPLE}; where"
             " sites have servers of their own, run the command once for each server, with a list"
         )
     rest = filled.replace(_MARK, "")
     if "{" in rest or "}" in rest:
         raise MisuseError(
-            f"{given_as}: of braces it may have {PLACEHOLDER} alone: {_EXAMPLE}; write %7B for {{"
+            f"{given_as}: braces other than those of {PLACEHOLDER}: {_EXAMPLE}; write %7B for {{"
             " and %7D for }"
         )
     return url, given_as

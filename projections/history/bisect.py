@@ -77,7 +77,7 @@ def _sorted(offsets: Iterable[int]) -> "array[int]":
 
 
 class HistoryFacts:
-    """The map after the events below ``end``, which may be set: `Facts` read from a history."""
+    """`Facts` of the map after ``end`` events, read from a history; ``end`` may be assigned."""
 
     def __init__(self, history: History, index: CountIndex, end: Offset) -> None:
         self._history = history

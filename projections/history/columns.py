@@ -125,7 +125,7 @@ class Stripe:
     """The rows that the events from ``start`` to before ``end`` add.
 
     ``rows`` is the number of rows of each table that has any, ``arrays`` the columns by
-    ``TABLE.COLUMN``. ``release`` drops arrays that were read from a file from memory.
+    ``TABLE.COLUMN``. ``release`` drops from memory the arrays that were read from a file.
     """
 
     def __init__(

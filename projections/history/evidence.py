@@ -22,8 +22,8 @@ _NATS = 1000
 
 
 def evidence_text(evidence: MergeEvidence | None) -> str:
-    """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; the first two are
-    log-likelihood ratios in nats. None stands for a merge by a command."""
+    """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; looks and
+    positions are log-likelihood ratios in nats. None stands for a merge by a command."""
     if evidence is None:
         return "a command"
     return (

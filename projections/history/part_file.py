@@ -104,7 +104,7 @@ class Part:
         return self.stripes[0].start, self.stripes[-1].end
 
     def release(self) -> None:
-        """Drop the pages that were read from this process's memory; access reads them again."""
+        """Drop the file's pages from this process's memory; access reads them again."""
         _release(self._map, 0, len(self._map))
 
     def _manifest(self) -> dict[str, Any]:

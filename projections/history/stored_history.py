@@ -91,7 +91,7 @@ class StoredHistory(History):
         return {run_id: _as_ints(of) for run_id, of in found.items() if len(of)}
 
     def cause_at(self, offset: Offset) -> Cause:
-        """The cause of what the event at ``offset`` did."""
+        """The event at ``offset`` as a cause."""
         (cause,) = self.causes_at([offset])
         return cause
 

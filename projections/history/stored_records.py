@@ -39,7 +39,7 @@ class StoredPlace(PlaceRecord):
     _made: list[KeyframeOrdinal] | None
 
     def read_from(self, moment: Moment) -> None:
-        """Make them from here when they are asked for."""
+        """Use ``moment`` as the source of the members."""
         self._moment, self._made = moment, None
 
     @property
@@ -78,7 +78,7 @@ class StoredObject(ObjectRecord):
     _made: list[ObservationOrdinal] | None
 
     def read_from(self, moment: Moment) -> None:
-        """Make them from here when they are asked for."""
+        """Use ``moment`` as the source of the observations."""
         self._moment, self._made = moment, None
 
     @property

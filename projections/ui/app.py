@@ -188,9 +188,11 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         "known_at",
         *_SETTINGS,
     )
-    answers("conditions", "The functions of a condition, its fault", conditions_answer, "text")
+    answers(
+        "conditions", "The functions of conditions, and the error in one", conditions_answer, "text"
+    )
     answers("corrections", "The commands of the log, and what is undone", corrections_answer)
-    answers("search", "Things that are called so", search_answer, "q", "kind", *_AT_W)
+    answers("search", "Things whose name matches a text", search_answer, "q", "kind", *_AT_W)
     answers(
         "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W
     )

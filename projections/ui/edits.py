@@ -78,7 +78,7 @@ def _drop_detections(*det_ids: str) -> MakeCommand:
 
 def _undo_merge(offset: str) -> MakeCommand:
     if not (offset.isascii() and offset.isdecimal() and len(offset) <= 18):
-        raise QuestionError(f"undo-merge is of offset {offset[:40]!r}; give a whole number")
+        raise QuestionError(f"undo-merge takes the offset of a merge, not {offset[:40]!r}")
     return lambda current, stamp: make.undo_merge(current, stamp, int(offset))
 
 
@@ -173,7 +173,9 @@ class Editor:
 
         def checked(current: CurrentMap, stamp: Stamp) -> Command:
             if current.reader.log_id != self._log_id:
-                raise LogError(f"there is another log at {self._opened.log} now")
+                raise LogError(
+                    f"there is another log at {self._opened.log} now; start mapfold ui again"
+                )
             return make_(current, stamp)
 
         return checked

@@ -32,7 +32,7 @@ class PrefixReader(LogReader):
 
     @property
     def is_limited(self) -> bool:
-        """Whether the log has events behind the limit."""
+        """Whether the log has events beyond the limit."""
         return self._last.next_offset > self.limit
 
     def refresh(self) -> Offset:
@@ -42,7 +42,7 @@ class PrefixReader(LogReader):
         return self.next_offset
 
     def check_end(self) -> None:
-        """Like that of a `LogReader`; segments behind the limit are none that is missing."""
+        """As that of a `LogReader`, but segments beyond the limit may be missing."""
         if not self.is_limited:
             super().check_end()
 

@@ -28,7 +28,7 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int], ...]] = (
 
 
 def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
-    """The HTTP status and the JSON form of an error; for a condition with the wrong ``column``."""
+    """The HTTP status and the JSON form of an error; that of a condition has its ``column``."""
     for kind, name, status in _KINDS:
         if isinstance(error, kind):
             more = {"column": error.column} if isinstance(error, ExpressionError) else {}

@@ -212,7 +212,7 @@ class UiService:
         found = LogMap(self.opened, sets, progress=lambda *_: self._others.go_on(), histories=1)
         if found.log_id != self.log_id:
             found.reader.close()
-            raise LogError(f"there is another log at {self.opened.log} now")
+            raise LogError(f"there is another log at {self.opened.log} now; start mapfold ui again")
         return found
 
     def _check_there(self) -> None:

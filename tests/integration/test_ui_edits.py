@@ -109,7 +109,10 @@ def test_nonsense(server: UiServer) -> None:
         ({"kind": "undo", "arguments": ["a", "b"]}, "undo has 2 arguments"),
         ({"kind": "undo", "arguments": [1]}, "arguments.0"),
         ({"kind": "undo", "arguments": "a"}, "arguments"),
-        ({"kind": "undo-merge", "arguments": ["x"]}, "undo-merge is of offset 'x'"),
+        (
+            {"kind": "undo-merge", "arguments": ["x"]},
+            "undo-merge takes the offset of a merge, not 'x'",
+        ),
         (far, "'x' is no number"),
         ({"kind": "undo", "more": 1}, "more"),
     ):

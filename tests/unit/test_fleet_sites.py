@@ -142,10 +142,10 @@ def test_the_vectors_have_a_template_of_their_own() -> None:
     ("template", "wrong"),
     [
         ("postgresql://h/maps", "no {site} in it"),
-        ("postgresql://h/maps?options=-csearch_path%3D{site}", "in the database's name alone"),
+        ("postgresql://h/maps?options=-csearch_path%3D{site}", "only in the database's name"),
         ("postgresql://{site}.local/maps", "not in host"),
         ("postgresql://{site}:x@h/{site}", "not in user"),
-        ("postgresql://h/{site}_{robot}", "of braces it may have {site} alone"),
+        ("postgresql://h/{site}_{robot}", "braces other than those of {site}"),
         ("mysql://h/{site}", "not a PostgreSQL URL"),
         ("postgresql://u:s/ecret@h/{site}", "not a PostgreSQL URL"),
     ],
