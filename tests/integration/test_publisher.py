@@ -60,6 +60,21 @@ def test_what_is_acknowledged_is_in_the_log(
     assert stored_payloads(tmp_path / "log") == sent
 
 
+def test_robot_and_recorder_may_share_a_namespace(
+    start: Start, endpoint: str, tmp_path: Path
+) -> None:
+    config = tmp_path / "zenoh.json5"
+    config.write_text('{namespace: "building-1"}')
+    log = tmp_path / "log"
+    recorder = start("record", str(log), "--connect", endpoint, "--zenoh-config", str(config))
+    recorder.wait_for("recording")
+    options = ZenohOptions(connect=(endpoint,), config_file=config)
+    with EnvelopePublisher(options, tmp_path / "spool.sqlite") as robot:
+        robot.publish(envelope(1))
+        assert robot.flush(DEADLINE_S)
+    assert stored_payloads(log) == [payload(envelope(1))]
+
+
 def test_a_dictionary_is_published_as_json(
     robot: EnvelopePublisher, recorder: Callable[[], Program], tmp_path: Path
 ) -> None:
