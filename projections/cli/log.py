@@ -249,7 +249,8 @@ def finding_text(finding: Finding) -> str:
     """A finding in one line."""
     where = [finding.segment] if finding.segment else []
     if finding.first_offset is not None:
-        where.append(f"offsets {finding.first_offset} to {finding.last_offset}")
+        first, last = finding.first_offset, finding.last_offset
+        where.append(f"offset {first}" if first == last else f"offsets {first} to {last}")
     return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")
 
 
