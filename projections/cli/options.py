@@ -325,4 +325,5 @@ def writing(path: Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
     except OSError as error:
-        raise MisuseError(f"{path}: cannot be written: {error.strerror}; choose another") from None
+        reason = error.strerror or error  # errors of Foxglove and Rerun have no strerror
+        raise MisuseError(f"{path}: cannot be written: {reason}; choose another") from None

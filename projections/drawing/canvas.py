@@ -73,7 +73,7 @@ class Canvas:
                 self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
         except OSError as error:
             raise MisuseError(
-                f"{out}: cannot be written: {error.strerror}; choose another"
+                f"{out}: cannot be written: {error.strerror or error}; choose another"
             ) from None
 
     def png(self) -> bytes:

@@ -1,4 +1,4 @@
-"""Search by name: places, objects, classes, detections, keyframes and runs."""
+"""Search by name: places, objects (also by class), detections, keyframes and runs."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
@@ -104,7 +104,9 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     moment = Moment.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")
-    sources = _SOURCES.values() if kind is None else [s for k, s in _SOURCES.items() if k == kind]
+    if kind is not None and kind not in _SOURCES:
+        raise QuestionError(f"kind is {kind[:40]!r}; give one of {', '.join(_SOURCES)}")
+    sources = _SOURCES.values() if kind is None else [_SOURCES[kind]]
     named = chain.from_iterable(source(moment, wanted) for source in sources) if wanted else ()
     found: list[_Found] = []
     for number, each in enumerate(named):
@@ -120,8 +122,7 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 
 def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """A keyframe, by its row of ``kf_`` (``number``) or by ``run`` and ``id``, with its
-    detections."""
+    """A keyframe with its detections; `keyframe_of` reads which."""
     moment = Moment.of(shown, query)
     history = moment.known.history
     ordinal = keyframe_of(history, query)
@@ -184,5 +185,5 @@ def keyframe_of(history: History, query: QueryParams) -> KeyframeOrdinal:
     if not (number.isascii() and number.isdecimal() and len(number) < 18):
         raise QuestionError(f"number is {number[:40]!r}; give the row of a keyframe")
     if int(number) >= len(history.keyframes):
-        raise NoSuchThing("keyframe number", number, [])
+        raise NoSuchThing("keyframe number", number, map(str, range(len(history.keyframes))))
     return KeyframeOrdinal(int(number))
