@@ -180,7 +180,7 @@ class _Import:
         self._passed_over: Counter[tuple[str, str]] = Counter()
         self._times = LogTimes()
         self.begins = False
-        """Whether the next message is the first of a source. If log times go back there, a new
+        """Whether no message of the source had a time yet. If log times go back there, a new
         segment is begun."""
         self._logged_ns: int | None = None
         self._first = writer.next_offset
@@ -233,7 +233,9 @@ class _Import:
             logged_ns = self._writer.now_ns()
         if self.begins and self._logged_ns is not None and logged_ns < self._logged_ns:
             self._writer.begin_segment()
-        self.begins, self._logged_ns = False, logged_ns
+        if message.logged_ns is not None or keyframe is not None:
+            self.begins = False
+        self._logged_ns = logged_ns
         self.append_given_map(logged_ns)
         return logged_ns
 

@@ -147,3 +147,16 @@ def test_many_runs_cost_no_more_than_few() -> None:
     for run, stamp in [*stamps, *stamps]:
         times.add_stamped(run, stamp)  # type: ignore[arg-type]
     assert times.last_ns == 120 * S
+
+
+def test_rejected_lines_before_the_first_time_of_a_file_do_not_turn_the_log_times_back(
+    tmp_path: Path,
+) -> None:
+    run = Commands.in_folder(tmp_path)
+    drive(tmp_path, "late.jsonl", "late", 90_000.0, 4)
+    drive(tmp_path, "early.jsonl", "early", 1_000.0, 4)
+    for name in ("late.jsonl", "early.jsonl"):  # the first line of a CSV file, say
+        (tmp_path / name).write_bytes(b"time,x,y\n[\n" + (tmp_path / name).read_bytes())
+    run("import", "L", "late.jsonl", "early.jsonl", code=3)
+    assert len(read_log(tmp_path / "L")) == 14
+    assert not verify_log(tmp_path / "L").findings
