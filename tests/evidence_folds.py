@@ -23,7 +23,7 @@ SLOW = settings(
 
 
 def recounted_votes(view: MapView, deltas: list[d.Delta]) -> list[int | None]:
-    """The place of each Object, from the keyframes that saw it since it stands where it does."""
+    """The place of each Object, from the keyframes that saw it since its last relocation."""
     votes: dict[int, list[int]] = {}
     for delta, following in zip(deltas, [*deltas, None][1:], strict=True):
         if isinstance(delta, d.ObjectSeen):
@@ -42,7 +42,7 @@ def recounted_votes(view: MapView, deltas: list[d.Delta]) -> list[int | None]:
 
 
 def check_recounts(folded: Folded, same: bool = False) -> None:
-    """All that can be counted again from the observations of each Object."""
+    """Check the numbers of each Object against a recount from its observations."""
     view, deltas = folded.view, [delta for each in folded.deltas for delta in each]
     seen_beside = {  # what a few pictures showed as two may still be one
         view.object_survivors.find(delta.survivor)

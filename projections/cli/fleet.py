@@ -307,7 +307,7 @@ def url(
     if site not in {each.name for each in sites}:
         names = ", ".join(visible(each.name) for each in sites[:_NAMED])
         more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
-        raise MisuseError(f"{place}: no site {visible(site)!r}; there are {names}{more}")
+        raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
     with sigterm_unwinds(), site_databases(sites, db, None) as databases:
         display(databases[site].graph_url)
 

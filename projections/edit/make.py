@@ -122,9 +122,7 @@ def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
 def _check_floor(what: str, one: str | None, other: str | None) -> None:
     """Raise EditRefused for things on two floors, which can never be one."""
     if one != other:
-        names = " and ".join(
-            "none" if name is None else repr(visible(name)) for name in (one, other)
-        )
+        names = " and ".join("none" if name is None else repr(name) for name in (one, other))
         raise EditRefused(f"{what} are on two floors, {names}; nothing on two floors is ever one")
 
 

@@ -148,4 +148,4 @@ def check_name(name: str, where: str) -> None:
 
 def _excerpt(name: str) -> str:
     """``name``, or the beginning of a long one, such as a line of a file that is no list."""
-    return visible(name if len(name) <= _SHOWN_OF_NAME else f"{name[:_SHOWN_OF_NAME]}…")
+    return name if len(name) <= _SHOWN_OF_NAME else f"{name[:_SHOWN_OF_NAME]}…"

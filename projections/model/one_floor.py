@@ -19,7 +19,7 @@ def view_of_floor(view: MapView, floor: str) -> MapView:
     if all(k.floor != name for k in posed):
         unnamed = [UNNAMED] if any(k.floor is None for k in posed) else []
         known = ", ".join(map(visible, [*view.floors, *unnamed])) or "no floor"
-        raise MisuseError(f"no floor {visible(floor)!r} in this map; it has {known}")
+        raise MisuseError(f"no floor {floor!r} in this map; it has {known}")
     found = MapView(view.settings, keep_embeddings=False, corrections=view.corrections)
     found.advance(view.next_offset)
     found.runs, found.observations = view.runs, view.observations

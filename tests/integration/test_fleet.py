@@ -79,9 +79,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, pg_server: EmbeddedServer) -
 def in_process(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> InProcess:
-    """Runs commands in this process, and so do these with the tasks of sites.
+    """Runs commands, and the tasks of sites that they start, in this process.
 
-    Under scripts/test_slow workers of `LocalPool` run them.
+    Under scripts/test_slow workers of `LocalPool` run the tasks.
     """
     if not THOROUGH:
         monkeypatch.setattr("projections.cli.fleet_options.LocalPool", lambda _: OneProcess())

@@ -74,7 +74,7 @@ def test_a_list_has_names_and_paths_relative_to_it(tmp_path: Path) -> None:
         (b"a x\na y\n", "lines 1 and 2 both name the site 'a'"),
         (b"x/a\ny/a\n", "lines 1 and 2 both name the site 'a'"),
         (b"a/b x\n", "line 1: 'a/b' cannot be a site's name"),
-        (b"a\x1b[31m x\n", "cannot be a site's name"),
+        (b"a\x1b[31m x\n", r"line 1: 'a\x1b[31m' cannot be a site's name"),
         ("a\u202eb x\n".encode(), "cannot be a site's name"),
         (b".. x\n", "line 1: '..' cannot be a site's name"),
         (b"/\n", "line 1: '' cannot be a site's name"),
