@@ -264,7 +264,7 @@ def _add_error_handlers(app: FastAPI) -> None:
 
 
 async def read_body(request: Request, most: int) -> bytes:
-    """The body, at most ``most`` bytes. Raises QuestionError for a longer one.
+    """The body, at most ``most`` bytes. Raises QuestionError for a longer or a compressed one.
 
     Some of a longer one is still read: a client that is cut off while sending sees a broken
     connection instead of the reason.
@@ -277,4 +277,9 @@ async def read_body(request: Request, most: int) -> bytes:
             break
     if length > most:
         raise QuestionError(f"the question has more than {most} bytes; send less")
+    encoding = request.headers.get("content-encoding", "identity")
+    if encoding.lower() != "identity":
+        raise QuestionError(
+            f"Content-Encoding is {describe_value(encoding)}; send the body uncompressed"
+        )
     return bytes(body)

@@ -1,5 +1,7 @@
 """Questions to `mapfold serve` over HTTP: the ASGI app behind a server on a free port."""
 
+import gzip
+import json
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -87,6 +89,19 @@ def test_a_bad_question_is_400_and_says_why(http: str) -> None:
 def test_a_misspelt_parameter_is_named_with_those_there_are(http: str) -> None:
     said = fetch(f"{http}/relocalize?tpo=3", question())[1]["error"]["message"]
     assert said == "no parameter called 'tpo'; there are top, method, session"
+
+
+def test_a_compressed_body_is_refused_and_an_identical_one_answered(http: str) -> None:
+    address = urllib.parse.urlsplit(http).netloc
+    answers = []
+    for encoding, body in [("gzip", gzip.compress(question())), ("identity", question())]:
+        with closing(HTTPConnection(address, timeout=DEADLINE_S)) as connection:
+            connection.request("POST", "/relocalize", body, {"Content-Encoding": encoding})
+            answer = connection.getresponse()
+            answers.append((answer.status, json.loads(answer.read())))
+    assert [status for status, _ in answers] == [400, 200]
+    said = answers[0][1]["error"]["message"]
+    assert said == "Content-Encoding is 'gzip'; send the body uncompressed"
 
 
 def test_an_unknown_path_is_refused_in_the_same_form(http: str) -> None:
