@@ -151,8 +151,8 @@ def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> S
     is_voted = current.settings.fusion == "evidence"  # then classes of one object may differ
     if one.class_name != other.class_name and not is_voted:
         raise EditRefused(
-            f"{first} is a {one.class_name!r} and {second} a {other.class_name!r}; only objects of "
-            "one class can be one"
+            f"{first} is of class {one.class_name!r}, {second} of {other.class_name!r}; only"
+            " objects of one class can be one"
         )
     return build(SameObject, stamp, det_ids=(one.det_id, other.det_id))
 

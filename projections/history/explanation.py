@@ -269,7 +269,7 @@ def _object_summary(
     least = min(seen.similarity_q40 for seen in sightings) / Q40
     similar = f" (similarity at least {least:.2f})" if last.obs_count > 1 else ""
     return (
-        f"a {record.class_name(end)}{_votes(record, votes)}, "
+        f"{record.class_name(end)}{_votes(record, votes)}, "
         f"seen {counted(last.obs_count, 'time')}{similar}, "
         f"on average from ({x:.2f}, {y:.2f}); in {place_title(history, record.place(end), end)}"
         f"{standing_text(history, record, end)}"

@@ -121,7 +121,7 @@ def test_why_tells_the_story_of_an_object() -> None:
         "seen where it was missing",
     ]
     assert text.splitlines()[0].startswith(
-        "object obj-a: a stool (stool ×4, chair ×1), seen 5 times (similarity at least 0.50), "
+        "object obj-a: stool (stool ×4, chair ×1), seen 5 times (similarity at least 0.50), "
     )
     assert text.splitlines()[0].endswith("; stands at (4.20, 2.00) ± 0.25 m, seen from 2 spots")
 

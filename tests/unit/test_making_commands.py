@@ -126,7 +126,7 @@ def test_it_names_things_of_the_log(
         (by.same_object, ("cup-9", CUP_LEFT), "no observation 'cup-9' in this log; near it: cup-3"),
         (by.same_object, (CUP_LEFT, "bare"), "observation 'bare' is of no object"),
         (by.same_object, ("cup-1", "cup-2"), "are one object already"),
-        (by.same_object, (CUP_LEFT, LAMP), "a 'cup' and obj-36156c6b0fcc3c5d a 'lamp'"),
+        (by.same_object, (CUP_LEFT, LAMP), "class 'cup', obj-36156c6b0fcc3c5d of 'lamp'"),
         (by.different_objects, (CUP_LEFT, "cup-1"), "are the same observation"),
         (by.drop_object, ("cup-1",), "no observation 'cup-1'"),
         (by.drop_detection, (["cup-1", "cup-7"],), "no observation 'cup-7'"),

@@ -113,7 +113,7 @@ def test_why_of_an_object(corridor: Timeline) -> None:
     (cup,) = corridor.at().objects.values()
     story = corridor.why(cup.object_id)
     assert story.summary == (
-        "a cup, seen 2 times (similarity at least 1.00), on average from (5.00, 0.00); in run-a_p0"
+        "cup, seen 2 times (similarity at least 1.00), on average from (5.00, 0.00); in run-a_p0"
     )
     assert [(e.cause.offset, e.text) for e in story.entries] == [
         (4, "new object: the-cup, seen from (5.00, 0.00), matched no cup nearby"),
