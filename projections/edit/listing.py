@@ -107,7 +107,7 @@ def edits_text(found: Found, times: Mapping[Offset, int]) -> str:
     header = ("offset", "time", "by", "command", "changed", "command id", "undone", "reason")
     text = table(header, rows, right={"offset"})
     if any(effect is None for _, effect in found):
-        text += "--effects computes what these commands changed\n"
+        text += "--effects computes the missing ones\n"
     return text
 
 
