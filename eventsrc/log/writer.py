@@ -347,7 +347,8 @@ def _check_format(log: Path, topic: str, form: MessageFormat) -> None:
             f"more than {MAX_SCHEMA_BYTES:,}"
         )
     if not (topic and form.encoding):
-        raise LogError(f"{log}: a message without topic or encoding, on {visible(topic[:80])!r}")
+        name = visible(repr(topic[:80]))
+        raise LogError(f"{log}: a message without topic or encoding, on {name}")
     if form.schema_text and not (form.schema and form.schema_encoding):
         raise LogError(
             f"{log}: a schema without a name or an encoding, of messages on {visible(topic[:80])}"

@@ -39,13 +39,13 @@ def topic_of(namespace: str, topic: str, option: str) -> str:
     name = topic.removeprefix("/")
     if not _is_name(name):
         raise MisuseError(
-            f"{option} {visible(topic[:80])!r} is no name of a ROS 2 topic; examples: "
+            f"{option} {visible(repr(topic[:80]))} is no name of a ROS 2 topic; examples: "
             "/detections, /camera/detections"
         )
     bare = namespace.strip("/")
     if bare and not _is_name(bare):
         raise MisuseError(
-            f"--namespace {visible(namespace[:80])!r} is no ROS 2 namespace; example: /bot1"
+            f"--namespace {visible(repr(namespace[:80]))} is no ROS 2 namespace; example: /bot1"
         )
     return f"/{bare}/{name}" if bare else f"/{name}"
 

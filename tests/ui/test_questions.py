@@ -94,7 +94,7 @@ def test_comparing_two_settings_shows_two_maps_with_one_view(
     expect(page.locator("canvas.map")).to_have_count(2)
     expect(page.locator(".panel")).to_contain_text("Folded in")
     expect(page.locator(".pane-title").nth(1)).to_contain_text("10 places, ε 0.75 m, min_samples 8")
-    expect(page.locator(".panel")).to_contain_text("The places part ways at event 31")
+    expect(page.locator(".panel")).to_contain_text("The places differ from event 31 on")
     assert "places differ from offset 31 on" in run_shown(page, mapfold)
     before = pixels(page), pixels(page, "other")
     assert before[0] != before[1]

@@ -127,7 +127,7 @@ function Scores({ answer }: { answer: WhatIfAnswer }) {
   return (
     <>
       <p class="summary">
-        {other.same ? "The map at the end is the same." : parts === null ? "The places are the same, the objects are not." : <>The places part ways at event <Moment offset={parts} />.</>}
+        {other.same ? "The map at the end is the same." : parts === null ? "The places are the same, the objects are not." : <>The places differ from event <Moment offset={parts} /> on.</>}
       </p>
       <table>
         <thead>

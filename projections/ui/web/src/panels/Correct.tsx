@@ -41,7 +41,7 @@ export function Correct() {
   return (
     <section class="story">
       {allowed && !hasToken && <p class="error" role="alert">This page was opened without the token of the printed link, so it cannot record corrections. Open the link that mapfold ui printed.</p>}
-      {allowed ? <Form /> : <p class="note">This page only looks. To record corrections start it with <code>mapfold ui LOG --allow-edits</code>.</p>}
+      {allowed ? <Form /> : <p class="note">This page is read-only. To record corrections, start it with <code>mapfold ui LOG --allow-edits</code>.</p>}
       <h2>Corrections in this log</h2>
       <Answer asked={asked}>
         {({ corrections, command }) => (

@@ -256,7 +256,7 @@ function Examples({ functions }: { functions: readonly ConditionFunction[] }) {
           </li>
         ))}
       </ul>
-      <h2>What a condition may ask</h2>
+      <h2>Functions of conditions</h2>
       <dl class="functions">
         {functions.map(({ name, signature, says }) => (
           <div key={name}>

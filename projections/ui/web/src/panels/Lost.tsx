@@ -136,12 +136,12 @@ export function Lost() {
         {question.value !== null && <bdi class="dim">{label(question.value.name, 60)}</bdi>}
       </label>
       {failed.value !== null && <p class="error" role="alert">{failed.value}</p>}
-      {answer.value !== null && <Answer answer={answer.value} />}
+      {answer.value !== null && <LikelyPlaces answer={answer.value} />}
     </section>
   );
 }
 
-function Answer({ answer: found }: { answer: LostAnswer }) {
+function LikelyPlaces({ answer: found }: { answer: LostAnswer }) {
   const history = store.history.value;
   if (history === null) return null;
   const { pose, places, confidence, unknown } = found;

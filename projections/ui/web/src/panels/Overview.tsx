@@ -19,7 +19,7 @@ export function Overview({ history }: { history: History }) {
     <section class="story">
       <h2>{offset.length === 0 ? "No merges" : counted(offset.length, "merge")}</h2>
       {offset.length === 0 ? (
-        <p class="dim">No two places of this log became one. Select a thing on the map to see what happened to it.</p>
+        <p class="dim">No places of this log merged. Select a thing on the map to see what happened to it.</p>
       ) : (
         <ol class="merges">
           {Array.from(offset.slice(0, MOST), (at, row) => (

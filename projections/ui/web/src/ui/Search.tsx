@@ -94,7 +94,7 @@ export function Search() {
             <bdi class="more">{hit.more}</bdi>
           </li>
         ))}
-        {hits.value.length === 0 && <li class="none" role="option" aria-selected={false}>Nothing in this log is called so.</li>}
+        {hits.value.length === 0 && <li class="none" role="option" aria-selected={false}>Nothing in this log has such a name.</li>}
       </ul>
     </div>
   );
