@@ -15,10 +15,14 @@ from tests.thorough import examples
 settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
 settings.load_profile("mapfold")
 
-# A shell that starts the tests in the background has them ignore Ctrl-C, and every program that
-# they start; many tests interrupt such programs.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Tests that a shell or `nohup` starts in the background ignore these signals, and so does every
+# program that they start; many tests send them to such programs.
+for number, handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 MANY_FILES = 300
 
