@@ -67,8 +67,6 @@ def check_picture(data: bytes) -> None:
     if len(data) > MAX_PICTURE_BYTES:
         raise PictureError(f"it has {len(data):,} bytes, more than {MAX_PICTURE_BYTES:,}")
     extent = _extent(data)
-    if not extent.width or not extent.height:
-        raise PictureError("its head gives no size")
     if extent.width * extent.height > MAX_PICTURE_PIXELS:
         raise PictureError(
             f"it has {extent.width:,} × {extent.height:,} pixels, more than {MAX_PICTURE_PIXELS:,}"
@@ -143,10 +141,14 @@ def _read_to_an_end(buffer: bytearray, read: Callable[[int], bytes]) -> bool:
 
 def _extent(data: bytes | bytearray) -> _Extent:
     if data.startswith(JPEG_START[: len(data)]):
-        return _jpeg_extent(data)
-    if data.startswith(PNG_START[: len(data)]):
-        return _png_extent(data)
-    raise PictureError(f"it is neither JPEG nor PNG: it begins with {data[:4].hex(' ')}")
+        extent = _jpeg_extent(data)
+    elif data.startswith(PNG_START[: len(data)]):
+        extent = _png_extent(data)
+    else:
+        raise PictureError(f"it is neither JPEG nor PNG: it begins with {data[:4].hex(' ')}")
+    if not extent.width or not extent.height:
+        raise PictureError("its head gives no size")
+    return extent
 
 
 def _jpeg_extent(data: bytes | bytearray) -> _Extent:

@@ -47,6 +47,10 @@ def test_a_stream_is_split_the_same_however_it_arrives(
             check_picture(part)
 
 
+def test_a_picture_behind_bytes_that_look_like_a_head_without_size_comes_out() -> None:
+    assert _split(b"\xff\xd8\xff\x02\x00" + JPEG, [1 << 20]) == [None, JPEG]
+
+
 @given(st.lists(st.sampled_from([JPEG, PNG]), max_size=6), st.integers(1, 500))
 def test_whole_pictures_come_out_whole(pieces: list[bytes], size: int) -> None:
     assert _split(b"".join(pieces), [size]) == pieces
