@@ -9,6 +9,7 @@ import logging
 import queue
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, Self
 from uuid import uuid4
 
@@ -43,7 +44,8 @@ class DaskCluster:
         self.address = address
         client: Any = distributed.Client
         try:
-            asyncio.run(_check_scheduler(f"tcp://{address}"))
+            with ThreadPoolExecutor(1) as thread:  # the caller's may run an event loop
+                thread.submit(_check_scheduler, f"tcp://{address}").result()
             self._client: Any = client(
                 f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False, name="mapfold"
             )
@@ -128,23 +130,27 @@ class DaskCluster:
         self._client.close(timeout=2.0 if kind is None else 0.5)
 
 
-async def _check_scheduler(address: str) -> None:
+def _check_scheduler(address: str) -> None:
     """Raise an error unless the server at ``address`` says that it is a scheduler.
 
     A `Client` that meets another server, such as the dashboard, can wait without end, and cannot be
     closed.
     """
+    kind = asyncio.run(_kind_of_server(address))
+    if kind != "Scheduler":
+        raise ValueError(f"it is a Dask {kind}")
+
+
+async def _kind_of_server(address: str) -> str:
     import distributed.core
 
     connect: Any = distributed.core.rpc
     async with asyncio.timeout(_ANSWER_S):
         server = connect(address, timeout=_CONNECT_S)
         try:
-            kind = (await server.identity())["type"]
+            return str((await server.identity())["type"])
         finally:
             await server.close_rpc()
-    if kind != "Scheduler":
-        raise ValueError(f"it is a Dask {kind}")
 
 
 def _reason(error: Exception) -> str:

@@ -1,5 +1,6 @@
 """Addresses of ``--engine dask://`` at which no scheduler answers, or another server does."""
 
+import asyncio
 import logging
 import socket
 import threading
@@ -78,6 +79,15 @@ def test_a_port_that_nobody_listens_at_is_an_error(monkeypatch: pytest.MonkeyPat
         bound.bind(("127.0.0.1", 0))
         with pytest.raises(ClusterError, match=r"no scheduler answers there: Timed out trying to"):
             DaskCluster(f"127.0.0.1:{bound.getsockname()[1]}")
+
+
+def test_a_caller_that_runs_an_event_loop_gets_the_same_error() -> None:
+    async def ask(address: str) -> None:
+        with pytest.raises(ClusterError, match="the answer is not Dask's"):
+            DaskCluster(address)
+
+    with answering(bytes(64)) as address:
+        asyncio.run(ask(address))
 
 
 @pytest.mark.parametrize(
