@@ -70,6 +70,42 @@ QUESTION: Final = {
 }
 """The body of a question, for ``openapi_extra``."""
 
+_STATE_FORMS: Final[tuple[tuple[str, tuple[str, ...], list[str]], ...]] = (
+    ("Near a position", ("x", "y", "radius", "limit"), ["x", "y"]),
+    ("All, by pages", ("limit", "cursor"), []),
+)
+"""Title, properties and required properties of each."""
+
+
+def state_parameter(parameters: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One parameter for the query ``parameters`` of ``/state``: an object whose properties are
+    sent as query parameters of their own. Separate ones could not say which go together."""
+    schemas = {each["name"]: each["schema"] for each in parameters}
+    return {
+        "name": "selection",
+        "in": "query",
+        "style": "form",
+        "explode": True,
+        "description": "Each property is a query parameter: `?x=3.4&y=5.2`.",
+        "schema": {
+            "anyOf": [
+                {
+                    "title": title,
+                    "type": "object",
+                    "properties": {name: schemas[name] for name in names},
+                    "required": required,
+                    "additionalProperties": False,
+                }
+                for title, names, required in _STATE_FORMS
+            ]
+        },
+        "examples": {
+            "near": {"summary": "near a position", "value": {"x": 3.4, "y": 5.2, "radius": 5}},
+            "page": {"summary": "the first page", "value": {"limit": 100, "cursor": "0"}},
+        },
+    }
+
+
 _PLACE: Final = {
     "place_id": "sim-7-a_p0",
     "centroid_x": 6.77,

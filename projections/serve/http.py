@@ -8,6 +8,7 @@ threads of the `FairQueue` answer them, because database access is synchronous.
 
 import asyncio
 from collections.abc import Callable, Collection, Sequence
+from functools import cache
 from typing import Annotated, Any, Final
 
 from fastapi import Depends, FastAPI, Path, Query, Request, Security
@@ -25,7 +26,7 @@ from projections.relocalize import Method, describe_value
 
 from .answering import MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
-from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals
+from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
 from .fair_queue import FairQueue
 from .metrics import ServiceMetrics
 from .models import Answer, Health, Objects, Places, StateQuery
@@ -94,7 +95,7 @@ def create_app(
             Query(
                 min_length=1,
                 max_length=MAX_NAME,
-                description="Track the questions of this name; with the method joint only.",
+                description="Track the questions of this name, by the method joint.",
             ),
         ] = None,
     ) -> Response:
@@ -171,9 +172,10 @@ def add_openapi(app: FastAPI, parameters: Any) -> None:
 
 def _complete_description(app: FastAPI) -> None:
     """Correct FastAPI's description: refusals have status 400 instead of 422, query parameters
-    cannot be null, and examples keep their nulls."""
+    cannot be null, those of ``/state`` depend on each other, and examples keep their nulls."""
     described = app.openapi
 
+    @cache  # FastAPI keeps the document, too, and it must be corrected once
     def openapi() -> dict[str, Any]:
         document = described()
         for path in document["paths"].values():
@@ -181,6 +183,9 @@ def _complete_description(app: FastAPI) -> None:
                 operation["responses"].pop("422", None)
                 for parameter in operation.get("parameters", ()):
                     _drop_null(parameter["schema"])
+        state = document["paths"]["/state/{what}"]["get"]
+        what, *query = state["parameters"]
+        state["parameters"] = [what, state_parameter(query)]
         for name in ("HTTPValidationError", "ValidationError"):
             document["components"]["schemas"].pop(name, None)
         for path, method, shown in EXAMPLES:

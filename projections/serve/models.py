@@ -183,17 +183,17 @@ class StateQuery(BaseModel):
     """Parameters of a question about the state."""
 
     x: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
-        None, description="Metres in the map's frame; only with y."
+        None, description="Metres in the map's frame."
     )
     y: Annotated[float, Field(ge=-MAX_METRES, le=MAX_METRES)] | None = Field(
-        None, description="Metres in the map's frame; only with x."
+        None, description="Metres in the map's frame."
     )
     radius: Annotated[float, Field(ge=0, le=MAX_METRES)] | None = Field(
-        None, description=f"Only with x and y; {DEFAULT_RADIUS_M:g} metres if not given."
+        None, description=f"{DEFAULT_RADIUS_M:g} metres if not given."
     )
     limit: Annotated[int, Field(ge=1, le=MAX_PAGE)] | None = Field(
         None, description=f"Most items; without a position {DEFAULT_PAGE} if not given."
     )
     cursor: Annotated[str, Field(pattern=CURSOR)] | None = Field(
-        None, description="`next` of the previous page; not with x and y."
+        None, description="`next` of the previous page."
     )

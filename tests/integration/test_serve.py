@@ -15,7 +15,7 @@ from projections.database.connection import Connection, Targets, connect
 from projections.database.embedded import EmbeddedServer
 from projections.errors import DatabaseUnavailable, ProjectionMissing
 from projections.serve import Answerer, FairQueue, Pools
-from projections.serve.answering import TokenBucket, TooMuchError
+from projections.serve.answering import HEALTH_S, TokenBucket, TooMuchError
 from projections.settings import Settings
 from tests.commands import Commands
 from tests.logs import walk, write_log
@@ -132,6 +132,41 @@ def test_a_full_pool_is_not_reported_as_an_outage(
 def test_it_does_not_start_without_a_map(one_database: Targets) -> None:
     with pytest.raises(ProjectionMissing, match="run `mapfold replay"):
         Pools(one_database, 1)
+
+
+def test_health_is_at_most_a_second_old_and_fresh_after_a_question_that_failed(
+    one_database: Targets, tmp_path: Path
+) -> None:
+    log = write_log(tmp_path / "log", walk(60, seed=3))
+    rebuild(log, one_database, Settings())
+    now = [0.0]
+    with (
+        connect(one_database.graph_url, autocommit=True) as owner,
+        Pools(one_database, 2) as pools,
+    ):
+        answerer = Answerer(pools, per_second=10_000.0, now=lambda: now[0])
+
+        def healthy() -> bool:
+            try:
+                return answerer.health() == {"status": "ok"}
+            except ProjectionMissing:
+                return False
+
+        assert healthy()
+        owner.execute("DELETE FROM mapfold.checkpoint")
+        now[0] += HEALTH_S / 2
+        assert healthy()
+        now[0] += HEALTH_S / 2
+        assert not healthy()
+        rebuild(log, one_database, Settings())
+        assert not healthy()
+        now[0] += HEALTH_S
+        assert healthy()
+        owner.execute("DELETE FROM mapfold.checkpoint")
+        owner.execute("ALTER TABLE detection_embeddings RENAME TO elsewhere")
+        with pytest.raises(ProjectionMissing):
+            answerer.relocalize(question(), {})
+        assert not healthy()
 
 
 @pytest.mark.slow

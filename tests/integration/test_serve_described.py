@@ -1,11 +1,13 @@
 """What `mapfold serve` sends over HTTP is what /openapi.json describes."""
 
+import itertools
 import json
 import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_type_hints
+from urllib.parse import urlencode
 
 import pytest
 from pydantic import TypeAdapter
@@ -103,6 +105,45 @@ def test_the_examples_work(service: Service, described: Any) -> None:
         (operation,) = described["paths"][path].values()
         shown = operation["responses"]["200"]["content"]["application/json"]["example"]
         TypeAdapter(model).validate_python(shown, strict=True, extra="forbid")
+
+
+def test_the_description_says_which_parameters_of_the_state_go_together(
+    service: Service, described: Any
+) -> None:
+    _, selection = described["paths"]["/state/{what}"]["get"]["parameters"]
+    assert (selection["style"], selection["explode"]) == ("form", True)
+    forms = [
+        (set(form["required"]), set(form["properties"])) for form in selection["schema"]["anyOf"]
+    ]
+    names = sorted(set().union(*(known for _, known in forms)))
+    outcomes = set()
+    for chosen in itertools.product([False, True], repeat=len(names)):
+        given = {name for name, taken in zip(names, chosen, strict=True) if taken}
+        code, _, content = service.get(f"/state/places?{'&'.join(f'{n}=1' for n in sorted(given))}")
+        allowed = any(required <= given <= known for required, known in forms)
+        assert code == (200 if allowed else 400), (given, content)
+        outcomes.add(code)
+    assert outcomes == {200, 400}
+    for shown in selection["examples"].values():
+        service.document(f"/state/objects?{urlencode(shown['value'])}")
+
+
+def test_every_option_goes_with_every_other_in_the_query_and_in_the_body(
+    service: Service, described: Any
+) -> None:
+    parameters = described["paths"]["/relocalize"]["post"]["parameters"]
+    values = {"top": 2, "method": "plain", "session": "together"}
+    assert {parameter["name"] for parameter in parameters} == set(values)
+    question = {"crops": CROPS}
+    plain = service.document("/relocalize?method=plain&top=2", question)
+    for number, chosen in enumerate(itertools.product([False, True], repeat=len(values))):
+        in_query = {n: v for (n, v), taken in zip(values.items(), chosen, strict=True) if taken}
+        in_body = {n: v for n, v in values.items() if n not in in_query}
+        answer = service.document(f"/relocalize?{urlencode(in_query)}", {**question, **in_body})
+        track = answer.pop("track")
+        assert answer == plain
+        assert track["questions"] == number + 1
+        assert track["pose"] is not None
 
 
 @pytest.mark.parametrize("what", ["places", "objects"])

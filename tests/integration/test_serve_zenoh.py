@@ -81,7 +81,6 @@ def test_a_bad_question_gets_an_error_as_reply(connected: Callable[[], Session])
         ("mapfold/relocalize", b"nonsense"),
         ("mapfold/relocalize", None),
         ("mapfold/relocalize?top=0", question()),
-        ("mapfold/relocalize?session=a;method=plain", question()),
         ("mapfold/relocalize", b'{"session": 7, "crops": [{"class": "a"}]}'),
         ("mapfold/relocalize?session=a", one_of_nan),
         ("mapfold/relocalize", b"[" * 2_000_000),

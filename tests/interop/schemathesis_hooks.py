@@ -1,5 +1,4 @@
-"""What `schemathesis` cannot read from the description: what fits the map that is served, and what
-the texts of parameters say of two of them together.
+"""What `schemathesis` cannot read from the description: what fits the map that is served.
 
 Only cases that should be accepted are changed. Those that should be refused are sent as they are.
 """
@@ -25,18 +24,8 @@ def before_call(
     """Fit a case that should be accepted to the map."""
     if case.meta is None or not case.meta.generation.mode.is_positive:
         return
-    query = case.query or {}
-    if "x" not in query or "y" not in query:
-        for name in ("x", "y", "radius"):
-            query.pop(name, None)
-    else:
-        query.pop("cursor", None)
     if case.operation.path == "/relocalize":
         _fit(case.body)
-        body = case.body if isinstance(case.body, dict) else {}
-        if query.get("session", body.get("session")) is not None:
-            query.pop("method", None)
-            body.pop("method", None)
 
 
 def _fit(question: Any) -> None:
