@@ -20,7 +20,7 @@ from .grid_messages import is_grid_message, read_grid_message
 from .ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected, abbreviate
 from .log import LogWriter, NewEvent
 from .occupancy_map import InvalidMap
-from .system_events import MAP_KEY, REJECTED_KEY, RejectedPayload
+from .system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
 from .upcast import PendingEvent, check_envelopes, detect_version
 
 
@@ -133,7 +133,7 @@ def map_event(event: bytes, logged_ns: int) -> NewEvent:
     return NewEvent(MAP_KEY, event, logged_ns, logged_ns)
 
 
-def rejected_event(key: str, payload: bytes, reason: str, logged_ns: int) -> NewEvent:
+def rejected_event(key: str, payload: bytes | Excerpt, reason: str, logged_ns: int) -> NewEvent:
     """The ``mapfold/rejected`` event of a refused payload."""
     escaped = key.encode(errors="backslashreplace").decode()  # a lone surrogate is not UTF-8
     record = RejectedPayload.encode(escaped, reason, payload)

@@ -12,8 +12,10 @@
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """
 
+import hashlib
 import json
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Final, Literal, NamedTuple
 
 import pybase64
 from pydantic import BaseModel, ConfigDict, Field
@@ -34,6 +36,40 @@ def is_system_key(key: str) -> bool:
     return key.startswith(RESERVED_PREFIX)
 
 
+MAX_KEPT_BYTES: Final = 64 * 1024 * 1024
+"""Refused payloads up to this size are kept whole; in base64 one still fits into an event."""
+EXCERPT_BYTES: Final = 4_096
+"""First bytes that are kept of a larger one."""
+
+
+class Excerpt(NamedTuple):
+    """What is kept of a refused payload of more than `MAX_KEPT_BYTES`: its first bytes, and size
+    and SHA-256 (hex digits) of the whole."""
+
+    start: bytes
+    size: int
+    sha256: str
+
+    @classmethod
+    def of(cls, pieces: Iterable[bytes]) -> "Excerpt":
+        """The excerpt of the payload that ``pieces`` make up, of which one is held at a time."""
+        sha, start, size = hashlib.sha256(), b"", 0
+        for piece in pieces:
+            if len(start) < EXCERPT_BYTES:
+                start += piece[: EXCERPT_BYTES - len(start)]
+            sha.update(piece)
+            size += len(piece)
+        return cls(start, size, sha.hexdigest())
+
+    @property
+    def reason(self) -> str:
+        """The reason for which the payload was refused."""
+        return (
+            f"payload of {self.size:,} bytes, more than the {MAX_KEPT_BYTES:,} that are read; its "
+            f"first {len(self.start):,} bytes and the SHA-256 of all are kept"
+        )
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -44,19 +80,26 @@ class RejectedPayload(_Model):
     key: str
     reason: str
     payload: str
+    size: int | None = None
+    """With ``sha256``, of the whole payload if ``payload`` is an excerpt of it."""
+    sha256: str | None = None
 
     @staticmethod
-    def encode(key: str, reason: str, raw: bytes) -> bytes:
+    def encode(key: str, reason: str, raw: bytes | Excerpt) -> bytes:
         """The event's JSON, for ``raw`` that came under ``key`` and was refused for ``reason``.
 
         Built from bytes: ``raw`` may be large, and each conversion to text would copy it.
         """
-        head = json.dumps({"key": key, "reason": reason}, separators=(",", ":"))
+        fields: dict[str, str | int] = {"key": key, "reason": reason}
+        if isinstance(raw, Excerpt):
+            fields |= {"size": raw.size, "sha256": raw.sha256}
+            raw = raw.start
+        head = json.dumps(fields, separators=(",", ":"))
         return b"".join((head[:-1].encode(), b',"payload":"', pybase64.b64encode(raw), b'"}'))
 
     @property
     def raw(self) -> bytes:
-        """The refused bytes."""
+        """The refused bytes, as far as they are kept."""
         return pybase64.b64decode(self.payload)
 
 

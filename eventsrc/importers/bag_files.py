@@ -19,12 +19,12 @@ import zstandard
 from eventsrc.errors import MapfoldError, MisuseError
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.ros.library import BadBag, SqliteBag
+from eventsrc.system_events import MAX_KEPT_BYTES, Excerpt
 from eventsrc.text import visible
 
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 _ROS2_PROFILE: Final = b"\x04\0\0\0ros2"
 _PROFILE_AT: Final = len(MCAP_MAGIC) + 9
 METADATA: Final = "metadata.yaml"
@@ -34,12 +34,29 @@ _SEGMENT_OF_A_LOG: Final = re.compile(r"\d{20}\.mcap")
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag, undecoded. ``received_ns`` is its log time."""
+    """A message of a bag, undecoded. ``received_ns`` is its log time. ``refused`` is the reason if
+    it is too large, with an excerpt for a payload unless it is only too large decompressed."""
 
     topic: str
     type_name: str
     received_ns: int
-    payload: bytes
+    payload: bytes | Excerpt
+    refused: str | None = None
+
+    def decompressed(self) -> "BagMessage":
+        """The message with its payload decompressed, if the bag compresses single messages: no CDR
+        begins like zstd. Raises ZstdError."""
+        if isinstance(self.payload, Excerpt):
+            return self._replace(refused=self.payload.reason)
+        if not self.payload.startswith(ZSTD_MAGIC):
+            return self
+        with zstandard.ZstdDecompressor().stream_reader(self.payload) as stream:
+            plain = stream.read(MAX_KEPT_BYTES + 1)
+        if len(plain) > MAX_KEPT_BYTES:
+            return self._replace(
+                refused=f"a compressed message that holds more than {MAX_KEPT_BYTES:,} bytes"
+            )
+        return self._replace(payload=plain)
 
 
 @dataclass
@@ -54,6 +71,12 @@ class Topic:
     definition_encoding: str
     count: int = 0
     samples: list[bytes] = field(default_factory=list)
+
+    def add_sample(self, message: BagMessage) -> None:
+        """Keep a message, unless it is too large. Raises ZstdError."""
+        plain = message.decompressed()
+        if isinstance(plain.payload, bytes) and plain.refused is None:
+            self.samples.append(plain.payload)
 
 
 Sampled = Callable[[str, int], bool]
@@ -156,10 +179,7 @@ class Bag:
             try:
                 for message in part.messages(topics):
                     has_any = True
-                    if message.payload.startswith(ZSTD_MAGIC):
-                        yield message._replace(payload=_decompressed(message.payload))
-                    else:
-                        yield message
+                    yield message.decompressed()
             except _DAMAGE as error:
                 before = (
                     "what was made of the messages before it is in the log"
@@ -212,14 +232,14 @@ class _McapPart:
                 about = message.key, form.schema, form.encoding, text, form.schema_encoding
                 topic = contents.topic(Topic(*about))
             if sampled(topic.type_name, topic.count):
-                topic.samples.append(_decompressed(message.payload))
+                topic.add_sample(_bag_message(message))
             topic.count += 1
             contents.span(message.logged_ns)
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         for message in self._all():
             if message.key in topics:
-                yield BagMessage(message.key, message.schema, message.logged_ns, message.payload)
+                yield _bag_message(message)
 
     def _all(self) -> Iterator[ForeignMessage]:
         with self.path.open("rb") as file:
@@ -256,7 +276,7 @@ class _SqlitePart:
                 continue
             for number, message in enumerate(bag.messages([each.topic]), before):
                 if sampled(topic.type_name, number):
-                    topic.samples.append(_decompressed(message[-1]))
+                    topic.add_sample(BagMessage(*message))
                 elif not sampled(topic.type_name, 1):
                     break  # only the first is wanted
         for received_ns in bag.span():
@@ -325,15 +345,8 @@ def _first_bytes(file: BinaryIO) -> bytes:
         return b""
 
 
-def _decompressed(payload: bytes) -> bytes:
-    """A message, decompressed if the bag compresses single messages: no CDR begins like zstd."""
-    if not payload.startswith(ZSTD_MAGIC):
-        return payload
-    with zstandard.ZstdDecompressor().stream_reader(payload) as stream:
-        plain = stream.read(MAX_MESSAGE_BYTES + 1)
-    if len(plain) > MAX_MESSAGE_BYTES:
-        raise BadBag(f"a compressed message holds more than {MAX_MESSAGE_BYTES:,} bytes")
-    return plain
+def _bag_message(message: ForeignMessage) -> BagMessage:
+    return BagMessage(message.key, message.schema, message.logged_ns, message.payload)
 
 
 def _files_of(folder: Path) -> list[Path]:

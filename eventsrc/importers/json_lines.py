@@ -27,6 +27,7 @@ from typing import BinaryIO, TypeGuard
 
 from eventsrc.errors import MapfoldError, MisuseError
 from eventsrc.ingest import check_cost
+from eventsrc.system_events import MAX_KEPT_BYTES, Excerpt
 
 from .source import ImportedMessage
 
@@ -144,7 +145,9 @@ def _nanoseconds(seconds: str) -> int | None:
     return value if 0 <= value < _MAX_NS else None
 
 
-MAX_LINE_BYTES = 64 * 1024 * 1024
+MAX_LINE_BYTES = 4 * 1024 * 1024 * 1024
+"""A longer line ends the import: the file has no lines, such as a stream of zeros without end."""
+_PIECE_BYTES = 1024 * 1024
 GZIP_MAGIC = b"\x1f\x8b"
 
 
@@ -173,10 +176,13 @@ class JsonLines:
         )
         number = 0
         try:
-            while line := stream.readline(MAX_LINE_BYTES + 1):
+            while line := stream.readline(MAX_KEPT_BYTES + 1):
                 number += 1
                 self._read += len(line)
-                self._check_length(number, line)
+                if len(line) > MAX_KEPT_BYTES and not line.endswith(b"\n"):
+                    self.at = number
+                    yield self._too_long(number, line, stream)
+                    continue
                 if number == 1:
                     line = line.removeprefix(codecs.BOM_UTF8)
                 if line := line.strip(b" \t\r\n"):
@@ -188,9 +194,23 @@ class JsonLines:
                 "the lines before it are in the log"
             ) from None
 
-    def _check_length(self, number: int, line: bytes) -> None:
-        if len(line) > MAX_LINE_BYTES:
-            raise MisuseError(
-                f"{self.name}: line {number} is longer than {MAX_LINE_BYTES} bytes; "
-                "are these JSON lines, one envelope a line?"
-            )
+    def _too_long(self, number: int, start: bytes, stream: BinaryIO) -> ImportedMessage:
+        """The refusal of a line that is too large to be read, of which ``start`` was read."""
+        excerpt = Excerpt.of(self._pieces(number, start, stream))
+        return ImportedMessage(b"", refused=excerpt.reason, excerpt=excerpt)
+
+    def _pieces(self, number: int, start: bytes, stream: BinaryIO) -> Iterator[bytes]:
+        """The rest of a line, without the byte that ends it."""
+        size = len(start)
+        yield start
+        while piece := stream.readline(_PIECE_BYTES):
+            size += len(piece)
+            self._read += len(piece)
+            if size > MAX_LINE_BYTES:
+                raise MisuseError(
+                    f"{self.name}: line {number} is longer than {MAX_LINE_BYTES:,} bytes; "
+                    "are these JSON lines, one envelope a line?"
+                )
+            yield piece.removesuffix(b"\n")
+            if piece.endswith(b"\n"):
+                return

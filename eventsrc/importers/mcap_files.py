@@ -9,6 +9,7 @@ from eventsrc.errors import MapfoldError
 from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
 from eventsrc.log.format import IMPORTED
+from eventsrc.system_events import Excerpt
 
 from .source import ImportedMessage
 
@@ -37,20 +38,33 @@ class McapFile:
         try:
             for number, message in enumerate(foreign_messages(self._file), start=1):
                 self.at = number
-                self._read += len(message.payload)
-                if message.verbatim is not None:
+                excerpt = message.payload if isinstance(message.payload, Excerpt) else None
+                payload = (
+                    message.payload if isinstance(message.payload, bytes) else message.payload.start
+                )
+                self._read += len(payload) if excerpt is None else excerpt.size
+                is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
+                is_read = is_grid or message.encoding == "json"
+                if excerpt is not None and (is_read or message.verbatim is not None):
                     yield ImportedMessage(
-                        message.payload,
+                        payload,
+                        message.key,
+                        message.logged_ns,
+                        is_foreign=message.encoding == "json" and message.version is None,
+                        refused=excerpt.reason,
+                        excerpt=excerpt,
+                    )
+                elif message.verbatim is not None:
+                    yield ImportedMessage(
+                        payload,
                         message.key,
                         message.logged_ns,
                         message.published_ns,
                         form=message.verbatim,
                     )
-                    continue
-                is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
-                if is_grid or message.encoding == "json":
+                elif is_read:
                     yield ImportedMessage(
-                        message.payload,
+                        payload,
                         message.key,
                         message.logged_ns,
                         message.published_ns,

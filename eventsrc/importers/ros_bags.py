@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from eventsrc.errors import MapfoldError
@@ -13,6 +13,7 @@ from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.messages import DETECTIONS, FLOATS, TEXT, BadMessage
 from eventsrc.ros.stream import Counts
+from eventsrc.system_events import Excerpt
 
 from .bag_files import Bag, BagContents, bag_name
 from .bag_streams import BagOptions, Choice, choose, sampled
@@ -102,8 +103,11 @@ class RosBag:
         decode, add, put = self._types.decode, assembler.add, assembler.put
         detections = assembler.counts.keys()
         for number, message in enumerate(self._bag.messages(wanted), 1):
-            topic, type_name, received_ns, payload = message
-            if topic in grids:
+            topic, type_name, received_ns, payload, refused = message
+            if isinstance(payload, Excerpt) or refused is not None:
+                self._numbers.append(number)
+                ready = put(_refused(payload, topic, received_ns, refused or ""), received_ns)
+            elif topic in grids:
                 grid = self._grid(topic, received_ns, payload, report)
                 if grid is None:
                     continue
@@ -182,8 +186,13 @@ def _report(name: str, contents: BagContents, choice: Choice) -> BagReport:
     return BagReport(*counted, notes=notes, is_useless=is_useless)
 
 
-def _refused(payload: bytes, topic: str, received_ns: int, reason: str) -> ImportedMessage:
-    return ImportedMessage(payload, _key(topic), received_ns, refused=f"{topic}: {reason}")
+def _refused(
+    payload: bytes | Excerpt, topic: str, received_ns: int, reason: str
+) -> ImportedMessage:
+    message = ImportedMessage(b"", _key(topic), received_ns, refused=f"{topic}: {reason}")
+    if isinstance(payload, Excerpt):
+        return replace(message, excerpt=payload)
+    return replace(message, payload=payload)
 
 
 def _key(topic: str) -> str:

@@ -194,10 +194,10 @@ class _Import:
         validation."""
         topic = message.key or self._key
         self.begins |= message.begins
-        if message.refused is not None:
-            self._append_refused(source, message, message.refused)
-        elif not self._topics.takes(topic):
+        if not self._topics.takes(topic):
             self._passed_over[topic, NOT_CHOSEN] += 1
+        elif message.refused is not None:
+            self._append_refused(source, message, message.refused)
         elif message.unread is not None:
             self._passed_over[topic, message.unread] += 1
         elif message.form is not None:
@@ -253,9 +253,11 @@ class _Import:
             self.maps += 1
 
     def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
-        event = rejected_event(
-            message.key or self._key, message.payload, reason, self._time_of(message)
-        )
+        if self._is_for_others(message):
+            self._passed_over[message.key or self._key, NO_ENVELOPES] += 1
+            return
+        payload = message.payload if message.excerpt is None else message.excerpt
+        event = rejected_event(message.key or self._key, payload, reason, self._time_of(message))
         self._writer.append_all([event])
         self._count_rejected(source, reason)
 

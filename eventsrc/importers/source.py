@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from eventsrc.log import MessageFormat
+from eventsrc.system_events import Excerpt
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +21,8 @@ class ImportedMessage:
     belong to another program: if it does not look like an envelope, it is passed over. ``unread``
     is the format of a message that no importer reads; it is passed over, and its payload may be
     left out. ``refused`` is the reason if the source could not read the message: it is kept as
-    rejected. ``begins`` marks the begin of an import in another mapfold log, from which log times
-    may be older than before.
+    rejected; of a payload that is too large ``excerpt`` is kept. ``begins`` marks the begin of an
+    import in another mapfold log, from which log times may be older than before.
     """
 
     payload: bytes
@@ -34,6 +35,7 @@ class ImportedMessage:
     unread: str | None = None
     refused: str | None = None
     begins: bool = False
+    excerpt: Excerpt | None = None
 
 
 class Source(Protocol):

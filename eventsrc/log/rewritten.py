@@ -77,7 +77,7 @@ class _Messages:
 
     def add(self, record: ForeignRecord) -> bool:
         """Add a record; False if it cannot be read or is over a limit."""
-        opcode, content, _ = record
+        opcode, content = record.opcode, record.content
         if opcode == Opcode.MESSAGE:
             return self._add_message(content)
         try:

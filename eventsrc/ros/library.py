@@ -4,14 +4,17 @@ rosbags is in the extra ``[ros]`` and imported when it is first used. It decodes
 from message definitions, so names in a bag's definitions are checked before they get into code.
 """
 
+import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from eventsrc.errors import MapfoldError
+from eventsrc.system_events import MAX_KEPT_BYTES, Excerpt
 
 if TYPE_CHECKING:
+    import apsw
     from rosbags.typesys.store import Typestore
 
 _HEADER: Final = "std_msgs/Header header\n"
@@ -175,8 +178,27 @@ class BagTopic(NamedTuple):
     definition_encoding: str
 
 
+_MESSAGES: Final = """
+    SELECT topics.id, messages.rowid, messages.timestamp, length(messages.data),
+           CASE WHEN typeof(messages.data) = 'blob' AND length(messages.data) <= ?
+                THEN messages.data END
+      FROM messages JOIN topics ON messages.topic_id = topics.id
+     WHERE topics.id IN (SELECT value FROM json_each(?))
+     ORDER BY timestamp
+"""
+"""As rosbags asks, but for data that is too large, which is read in pieces."""
+_UNUSUAL_TABLES: Final = """
+    SELECT name FROM sqlite_master
+     WHERE name IN ('messages', 'topics', 'schema', 'message_definitions')
+       AND (type != 'table' OR sql LIKE 'CREATE VIRTUAL%')
+"""
+"""Views, whose rows may have no end."""
+_PIECE_BYTES: Final = 1024 * 1024
+
+
 class SqliteBag:
-    """One ``.db3`` file of a bag. It is opened for reading and never changed."""
+    """One ``.db3`` file of a bag. It is opened for reading and never changed. What takes more than
+    `MAX_KEPT_BYTES` is not read into memory."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -188,11 +210,18 @@ class SqliteBag:
         self._faults = (ReaderError, apsw.Error, OSError, *_FAULTS)
         self._idl = MessageDefinitionFormat.IDL
         self._none = MessageDefinitionFormat.NONE
+        apsw.connection_hooks.append(limit := _bounded(apsw.SQLITE_LIMIT_LENGTH))
         try:
+            flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+            self._database = apsw.Connection(f"file:{path}?immutable=1", flags=flags)
+            for (name,) in self._database.execute(_UNUSUAL_TABLES):
+                raise BadBag(f"it cannot be opened: {name} is no table")
             self._reader = Reader(path)
             self._reader.open()
         except self._faults as error:
             raise BadBag(f"it cannot be opened: {error}") from None
+        finally:
+            apsw.connection_hooks.remove(limit)
 
     def topics(self) -> list[BagTopic]:
         """The topics by name."""
@@ -208,20 +237,29 @@ class SqliteBag:
             for each in self._reader.connections
         )
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes]]:
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes | Excerpt]]:
         """Yield topic, type, time of receipt and bytes of each message, in order of receipt. Raises
         BadBag after the last readable one."""
-        chosen = [each for each in self._reader.connections if each.topic in topics]
+        chosen = {each.id: each for each in self._reader.connections if each.topic in topics}
         if not chosen:
             return
         try:
-            messages: Iterator[tuple[Any, Any, Any]] = self._reader.messages(chosen)
-            for connection, received_ns, payload in messages:
-                if not isinstance(received_ns, int) or not isinstance(payload, bytes):
+            rows = self._database.execute(_MESSAGES, (MAX_KEPT_BYTES, json.dumps([*chosen])))
+            for topic_id, row, received_ns, size, read in rows:
+                payload = read
+                if payload is None and isinstance(size, int) and size > MAX_KEPT_BYTES:
+                    payload = Excerpt.of(self._pieces(row))
+                if not isinstance(received_ns, int) or not isinstance(payload, bytes | Excerpt):
                     raise BadBag("a message has no bytes or no time")
-                yield connection.topic, connection.msgtype, received_ns, payload
+                yield chosen[topic_id].topic, chosen[topic_id].msgtype, received_ns, payload
         except self._faults as error:
             raise BadBag(str(error)) from None
+
+    def _pieces(self, row: int) -> Iterator[bytes]:
+        """The data of a message."""
+        with self._database.blob_open("main", "messages", "data", row, False) as blob:
+            while piece := blob.read(_PIECE_BYTES):
+                yield piece
 
     def span(self) -> tuple[int, ...]:
         """The times of receipt of first and last message, int nanoseconds; empty without any."""
@@ -232,6 +270,16 @@ class SqliteBag:
     def close(self) -> None:
         """Close the file."""
         self._reader.close()
+        self._database.close()
+
+
+def _bounded(what: int) -> "Callable[[apsw.Connection], None]":
+    """A hook that bounds the length of the texts, blobs and rows that a new connection reads."""
+
+    def limit(connection: "apsw.Connection") -> None:
+        connection.limit(what, MAX_KEPT_BYTES + _PIECE_BYTES)
+
+    return limit
 
 
 _FAULTS: Final = (

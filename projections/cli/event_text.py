@@ -93,7 +93,8 @@ def _summary(event: Event) -> str:
         with contextlib.suppress(ValidationError):  # made by another program
             refused = RejectedPayload.model_validate_json(event.payload)
             # The length of base64 says how many bytes it has, without decoding them.
-            size = len(refused.payload) // 4 * 3 - refused.payload[-2:].count("=")
+            kept = len(refused.payload) // 4 * 3 - refused.payload[-2:].count("=")
+            size = kept if refused.size is None else refused.size
             return f"{refused.key}, {size:,} bytes: {refused.reason}"
     value = _value(event.payload.decode(errors="replace"))
     if isinstance(value, dict) and isinstance(value.get("detections"), list):

@@ -1,5 +1,7 @@
 """Import of MCAP files that are bombs or declare false sizes, in bounded memory."""
 
+import gzip
+import hashlib
 import io
 import random
 import struct
@@ -16,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.mcap_records import MAGIC
+from eventsrc.system_events import EXCERPT_BYTES, RejectedPayload
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log
 from tests.memory import MOST_MIB, run_measured
@@ -70,7 +73,6 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     "a chunk of exbibytes": lambda: chunk(b"", b"", 2**62),
     "a message of exbibytes": lambda: message(b"x", 2**62),
     "a record of exbibytes": lambda: record(7, b"", 2**63),
-    "a message of many bytes": lambda: message(bytes(2**26)),
     "a channel without end": lambda: record(4, bytes(2**25)),
     "a chunk in which a message is longer": lambda: chunk(b"", message(b"x", 2**40), 32),
 }
@@ -88,6 +90,47 @@ def test_a_bomb_ends_the_import_with_its_place_and_little_memory(name: str, tmp_
     assert "Traceback" not in ran.said
     assert ran.peak_mib < MOST_MIB / 2
     assert [e.payload for e in read_log(log)] == [GOOD]
+
+
+LARGE = 70_000_000
+CHUNKS: dict[str, Callable[[bytes], bytes]] = {
+    "in no chunk": lambda records: records,
+    "in a chunk": lambda records: chunk(b"", records, len(records)),
+    "in a zstd chunk": lambda records: chunk(
+        b"zstd", zstandard.ZstdCompressor().compress(records), len(records)
+    ),
+    "in an lz4 chunk": lambda records: chunk(b"lz4", lz4.frame.compress(records), len(records)),
+}
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("packed", mostly_slow(CHUNKS))
+def test_of_a_message_that_is_too_large_an_excerpt_is_kept(packed: str, tmp_path: Path) -> None:
+    file, log = tmp_path / "large.mcap", tmp_path / "log"
+    large = GOOD[:-1] + b"y" * (LARGE - len(GOOD) + 1)
+    around = MAGIC + HEADER + CHANNEL + CHUNKS[packed](message(GOOD) + message(large))
+    file.write_bytes(around + message(GOOD) + record(2, bytes(20)) + MAGIC)
+    ran = run_measured("import", log, file)
+    assert (ran.code, ran.peak_mib < MOST_MIB / 2) == (3, True), ran
+    first, refused, last = read_log(log)
+    assert first.payload == last.payload == GOOD
+    kept = RejectedPayload.model_validate_json(refused.payload)
+    assert kept.raw == large[:EXCERPT_BYTES]
+    assert (kept.size, kept.sha256) == (LARGE, hashlib.sha256(large).hexdigest())
+    assert "payload of 70,000,000 bytes, more than the 67,108,864" in kept.reason
+
+
+@pytest.mark.seconds
+def test_a_line_that_is_too_long_is_refused_and_the_next_is_read(tmp_path: Path) -> None:
+    file, log = tmp_path / "large.jsonl.gz", tmp_path / "log"
+    line = b'{"x": "' + b"y" * 80_000_000 + b'"}'
+    file.write_bytes(gzip.compress(GOOD + b"\n" + line + b"\n" + GOOD, 1))
+    ran = run_measured("import", log, file)
+    assert (ran.code, ran.peak_mib < MOST_MIB / 2) == (3, True), ran
+    _, refused, last = read_log(log)
+    assert last.payload == GOOD
+    kept = RejectedPayload.model_validate_json(refused.payload)
+    assert (kept.size, kept.sha256) == (len(line), hashlib.sha256(line).hexdigest())
 
 
 @pytest.mark.slow

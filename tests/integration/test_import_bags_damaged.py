@@ -1,5 +1,6 @@
 """Bags of ROS 2 that are cut off, damaged, no bags, or hold what is none of its type."""
 
+import hashlib
 import json
 import shutil
 import sqlite3
@@ -7,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 
 from eventsrc.errors import MapfoldError, MisuseError
-from eventsrc.system_events import RejectedPayload
+from eventsrc.system_events import EXCERPT_BYTES, MAX_KEPT_BYTES, REJECTED_KEY, RejectedPayload
 from tests import ros_messages as ros
 from tests.fixtures_log import read_log
 from tests.imported_bags import DRIVE, envelopes, imported
+from tests.memory import MOST_MIB, run_measured
 from tests.ros_bags import RUN, Raw, write_bag
 from tests.ros_messages import SECOND, START, flat
 
@@ -142,6 +145,65 @@ def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Pat
     kept = [RejectedPayload.model_validate_json(event.payload) for event in refused]
     assert kept[0].raw == bytes(lying)
     assert "/detections: no vision_msgs/msg/Detection2DArray in CDR" in kept[0].reason
+
+
+@pytest.mark.seconds
+def test_of_a_large_message_in_sqlite_an_excerpt_is_kept(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite"], bag)
+    size = 100_000_000
+    with sqlite3.connect(bag / "drive.db3") as database:
+        ((row,),) = database.execute(
+            "SELECT min(m.id) FROM messages m JOIN topics t ON t.id = topic_id "
+            "WHERE name = '/detections'"
+        )
+        database.execute("UPDATE messages SET data = zeroblob(?) WHERE id = ?", (size, row))
+    database.close()
+    log = tmp_path / "log"
+    ran = run_measured("import", log, bag)
+    assert (ran.code, ran.peak_mib < MOST_MIB / 2) == (3, True), ran
+    (refused,) = [e for e in read_log(log) if e.key == "mapfold/rejected"]
+    kept = RejectedPayload.model_validate_json(refused.payload)
+    assert (kept.size, kept.raw) == (size, bytes(EXCERPT_BYTES))
+    assert kept.sha256 == hashlib.sha256(bytes(size)).hexdigest()
+    assert len(envelopes(log)) == DRIVE.pictures - 1
+
+
+def test_a_compressed_message_that_is_too_large_is_kept_compressed(tmp_path: Path) -> None:
+    kind = "vision_msgs/msg/Detection2DArray"
+    bomb = zstandard.ZstdCompressor().compress(bytes(MAX_KEPT_BYTES + 1))
+    sent = [ros.detections(START + each * SECOND, "camera") for each in (0, 1)]
+    good = [("/detections", each.header.stamp.sec * SECOND, each) for each in sent]
+    for storage in ("sqlite", "mcap"):
+        hidden = ("/detections", START, Raw(kind, bomb))
+        bag = write_bag(tmp_path / storage / "drive", [good[0], hidden, good[1]], storage)
+        report = imported(tmp_path / storage / "log", bag)
+        assert (report.accepted, report.rejected) == (2, 1)
+        (refused,) = [e for e in read_log(tmp_path / storage / "log") if e.key == REJECTED_KEY]
+        kept = RejectedPayload.model_validate_json(refused.payload)
+        assert (kept.raw, kept.size) == (bomb, None)
+        assert "holds more than 67,108,864 bytes" in kept.reason
+
+
+@pytest.mark.parametrize("name", ["schema", "message_definitions"])
+def test_a_view_whose_rows_have_no_end_is_not_read(
+    drives: dict[str, Path], tmp_path: Path, name: str
+) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite"], bag)
+    with sqlite3.connect(bag / "drive.db3") as database:
+        columns = [row[1] for row in database.execute(f"PRAGMA table_info({name})")]
+        database.execute(f"DROP TABLE {name}")
+        endless = ", ".join(f"x AS {column}" for column in columns)
+        database.execute(
+            f"CREATE VIEW {name} AS WITH RECURSIVE n(x) AS (SELECT 4 UNION ALL SELECT x FROM n) "
+            f"SELECT {endless} FROM n"
+        )
+    database.close()
+    with pytest.raises(MapfoldError, match=f"{name} is no table"):
+        imported(tmp_path / "log", bag)
 
 
 def test_a_type_is_read_as_the_bag_defines_it_and_a_broken_definition_is_told(

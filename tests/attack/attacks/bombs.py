@@ -2,18 +2,21 @@
 bounded memory and time."""
 
 import hashlib
+import sqlite3
 import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from eventsrc.log import LogWriter
+from eventsrc.ros.messages import DETECTIONS
 from projections.model.snapshot import MAGIC as SNAPSHOT_MAGIC
 from projections.settings import Settings
 from tests.attack.arena import Arena
 from tests.attack.bomb_files import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import BY_HAND, KEY
+from tests.ros_bags import Raw, write_bag
 
 GB = 1_000_000_000
 UNFOLDED = 3_200_000_000
@@ -38,6 +41,16 @@ def large_message(arena: Arena) -> None:
     """One message of 300 MB."""
     bomb = arena.folder / "large.mcap"
     mcap_with_large_message(bomb, 300_000_000)
+    _import(arena, bomb)
+
+
+def large_message_in_sqlite(arena: Arena) -> None:
+    """A message of 200 to 900 MB in a bag of ROS 2."""
+    bomb = write_bag(arena.folder / "large", [("/detections", 1, Raw(DETECTIONS, b"?"))], "sqlite")
+    with sqlite3.connect(bomb / "large.db3") as database:
+        size = arena.rng.randrange(200, 900) * 1_000_000
+        database.execute("UPDATE messages SET data = zeroblob(?)", (size,))
+    database.close()
     _import(arena, bomb)
 
 
@@ -81,6 +94,7 @@ def snapshot(arena: Arena) -> None:
 
 CASES: tuple[Callable[[Arena], None], ...] = (
     *(zstd_import, zstd_import_with_false_size, large_message, gzip_import),
+    large_message_in_sqlite,
     *(sparse_segment, zstd_in_segment, snapshot),
 )
 
