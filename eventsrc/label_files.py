@@ -1,11 +1,11 @@
 """Read files of class names, one a line or as a JSON list. The first name is that of class 0."""
 
-import json
 import re
 from pathlib import Path
 from typing import Any, Final
 
 from .errors import MisuseError
+from .user_files import FileFault, parse_json, read_file
 
 _MOST_BYTES: Final = 1_000_000
 _NAME_IN_BRACKETS: Final = re.compile(r"\[[^]\",\n]+\][ \t\r]*(\n|$)")
@@ -20,21 +20,18 @@ def read_label_file(path: Path, else_give: str = "check the path") -> list[Any]:
     """
     place = f"--labels {path}"
     try:
-        with path.open("rb") as file:
-            content = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise MisuseError(f"{place}: {error.strerror or error}; {else_give}") from None
-    if len(content) > _MOST_BYTES:
-        raise MisuseError(f"{place}: larger than {_MOST_BYTES:,} bytes")
+        content = read_file(path, _MOST_BYTES)
+    except FileFault as fault:
+        raise MisuseError(f"{place}: {fault}; {else_give}") from None
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise MisuseError(f"{place}: no UTF-8 text; give a line for each class") from None
     if text.lstrip().startswith("[") and not _NAME_IN_BRACKETS.match(text.lstrip()):
         try:
-            names: list[Any] = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise MisuseError(f"{place}: no JSON list: {error}") from None
+            names: list[Any] = parse_json(text)
+        except FileFault as fault:
+            raise MisuseError(f"{place}: no JSON list: {fault}") from None
         return names
     lines = [line.strip() for line in text.splitlines()]
     while lines and not lines[-1]:

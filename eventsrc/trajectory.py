@@ -12,7 +12,6 @@ where that line fits several.
 """
 
 import csv
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, pairwise
@@ -22,6 +21,7 @@ from typing import BinaryIO, Final, Literal, NamedTuple, TypeAlias
 from .envelope import MAX_POSITION_M, MAX_TIMESTAMP_S
 from .errors import MisuseError
 from .text import visible
+from .user_files import FileFault, open_file, parse_json
 
 MAX_LINE: Final = 4_096
 """Bound of a line's length in characters."""
@@ -86,8 +86,10 @@ def read_trajectory(path: Path) -> Trajectory:
     """The trajectory in a file. Raises TrajectoryError."""
     name = visible(str(path))
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return _read(name, path.suffix.lower(), file)
+    except FileFault as fault:
+        raise TrajectoryError(f"{name}: {fault}; give a trajectory file") from None
     except OSError as error:
         raise TrajectoryError(f"{name}: {error.strerror}; give a trajectory file") from None
 
@@ -242,9 +244,9 @@ def _cells(text: str) -> list[str]:
 
 def _parse_json(text: str) -> _Line:
     try:
-        record = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise _LineError(f"no JSON: {error}: {_shown(text)}") from None
+        record = parse_json(text)
+    except FileFault as fault:
+        raise _LineError(f"no JSON: {fault}: {_shown(text)}") from None
     if not isinstance(record, dict):
         raise _LineError(f"no JSON object: {_shown(text)}")
     _check_names(list(record))

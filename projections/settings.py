@@ -6,8 +6,9 @@ refused, not mixed.
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import (
     BaseModel,
@@ -23,6 +24,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from eventsrc.envelope import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
+from eventsrc.user_files import FileFault, parse_json, read_file
 
 from .errors import SettingsError
 from .evidence import EvidenceConstants
@@ -223,6 +225,20 @@ class Settings(BaseModel):
                 raise SettingsError(_no_setting(name)) from None
             raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
         return settings
+
+
+MAX_SETTINGS_BYTES: Final = 64 * 1024
+
+
+def read_settings(file: Path) -> Settings:
+    """The settings in a file of JSON. Raises FileFault if it cannot be read, SettingsError for what
+    is in it; the messages do not name the file."""
+    content = read_file(file, MAX_SETTINGS_BYTES)
+    try:
+        document = parse_json(content)
+    except FileFault as fault:
+        raise SettingsError(f"not JSON: {fault}") from None
+    return Settings.from_document(document)
 
 
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(

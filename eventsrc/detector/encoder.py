@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from eventsrc.envelope import MAX_DIMENSION, Text
 from eventsrc.errors import MisuseError
+from eventsrc.user_files import FileFault, read_file
 
 from .onnx_model import ModelError, OnnxModel
 from .picture import Pixels
@@ -56,14 +57,17 @@ class Preparation(BaseModel):
         return self.size[0], self.size[1]
 
 
+_MAX_PREPARATION_BYTES: Final = 64 * 1024
+
+
 def read_preparation(model: Path) -> Preparation:
     """The preparation of a model. Raises MisuseError."""
     path = model.with_suffix(".json")
     try:
-        text = path.read_bytes()
-    except OSError as error:
+        text = read_file(path, _MAX_PREPARATION_BYTES)
+    except FileFault as fault:
         raise MisuseError(
-            f"{path}: {error.strerror}; this file describes the input of {model.name},"
+            f"{path}: {fault}; this file describes the input of {model.name},"
             ' such as {"model": "NAME", "size": 224, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5,'
             " 0.5]}; see docs/detector.md"
         ) from None

@@ -18,6 +18,7 @@ from eventsrc.clock import system_clock
 from eventsrc.envelope import MAX_TIMESTAMP_S
 from eventsrc.errors import MisuseError
 from eventsrc.text import visible
+from eventsrc.user_files import FileFault, open_file
 
 from .picture import (
     JPEG_START,
@@ -111,8 +112,10 @@ def _stamp_in(path: Path) -> float:
 def _reader(path: Path) -> Callable[[], Pixels]:
     def pixels() -> Pixels:
         try:
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 data = file.read(MAX_PICTURE_BYTES + 1)
+        except FileFault as fault:
+            raise PictureError(str(fault)) from None
         except OSError as error:
             raise PictureError(error.strerror or str(error)) from None
         return decode(data)

@@ -12,7 +12,7 @@ with the colours instead.
 """
 
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import yaml
@@ -26,6 +26,14 @@ from eventsrc.ingest import abbreviate
 from eventsrc.occupancy_map import MAX_MAP_CELLS, OCCUPIED, UNKNOWN, InvalidMap, OccupancyMap
 from eventsrc.system_events import MAX_MAP_SIDE, MapYaw, Resolution
 from eventsrc.text import visible
+from eventsrc.user_files import (
+    MAX_DEPTH,
+    MAX_DIGITS,
+    FileFault,
+    checked_int,
+    read_file,
+    too_deep,
+)
 
 MAX_YAML_BYTES = 64 * 1024
 MAX_IMAGE_BYTES = 128 * 1024 * 1024
@@ -67,10 +75,9 @@ def read_map_yaml(path: Path, floor: str | None = None) -> OccupancyMap:
 def _described(path: Path) -> _MapFile:
     text = _content(path, MAX_YAML_BYTES)
     try:
-        document = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = visible(" ".join(str(error).split()))
-        raise MisuseError(f"{path}: no YAML: {reason}; give a map server's map.yaml") from None
+        document = _parse_yaml(text)
+    except FileFault as fault:
+        raise MisuseError(f"{path}: no YAML: {fault}; give a map server's map.yaml") from None
     if not isinstance(document, dict):
         raise MisuseError(
             f"{path}: no map.yaml: it has no fields such as image and resolution, but is"
@@ -119,14 +126,64 @@ _ADVICE: Final = {
 
 def _content(path: Path, limit: int) -> bytes:
     try:
-        with path.open("rb") as file:
-            content = file.read(limit + 1)
-    except (OSError, ValueError) as error:  # ValueError: a name with a null character
-        reason = getattr(error, "strerror", None) or error
-        raise MisuseError(f"{visible(str(path))}: {reason}; check the path") from None
-    if len(content) > limit:
-        raise MisuseError(f"{path}: larger than {limit:,} bytes; is this the right file?")
-    return content
+        return read_file(path, limit)
+    except FileFault as fault:
+        raise MisuseError(f"{visible(str(path))}: {fault}; check the path") from None
+
+
+def _parse_yaml(text: bytes) -> Any:
+    """A YAML document by the rules of `eventsrc.user_files`. Aliases are refused, as a short text
+    with them can be a document without end. Raises FileFault."""
+    try:
+        return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
+    except FileFault:
+        raise
+    except yaml.YAMLError as error:
+        raise FileFault(visible(" ".join(str(error).split()))) from None
+    except RecursionError:
+        raise too_deep() from None
+    except (ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
+        # of PyYAML, for values that are not of the type of their tag
+        raise FileFault(f"a value that is not of its type ({error})") from None
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """A SafeLoader with the bounds of `eventsrc.user_files`."""
+
+    _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            alias = self.peek_event()
+            raise FileFault(
+                f"line {alias.start_mark.line + 1}: an alias, *{visible(alias.anchor)[:40]}; "
+                "write the value there instead"
+            )
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise too_deep()
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_yaml_int(self, node: Any) -> int:
+        return checked_int(super().construct_yaml_int(_short(node)), node.value)
+
+    def construct_yaml_float(self, node: Any) -> float:
+        return float(super().construct_yaml_float(_short(node)))
+
+
+def _short(node: Any) -> Any:
+    if isinstance(node.value, str) and len(node.value) > MAX_DIGITS:
+        line = node.start_mark.line + 1
+        raise FileFault(
+            f"line {line}: a number of {len(node.value):,} characters, {visible(node.value[:20])}…"
+        )
+    return node
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 def _cells(pixels: NDArray[np.uint8], described: _MapFile) -> NDArray[np.uint8]:

@@ -1,6 +1,5 @@
 """`open_log` and `fold`: from a folder of MCAP segments to a `Map`."""
 
-import json
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
@@ -9,11 +8,12 @@ from typing import Any, TypeAlias
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
+from eventsrc.user_files import FileFault
 from projections.corrections import Corrections
 from projections.errors import SettingsError
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
-from projections.settings import Settings
+from projections.settings import Settings, read_settings
 
 from .map import Map
 
@@ -80,9 +80,8 @@ def _parse(settings: Mapping[str, Any] | str | Path) -> Settings:
     if isinstance(settings, Mapping):
         return Settings.from_document(dict(settings))
     try:
-        document = json.loads(Path(settings).read_text("utf-8"))
-    except OSError as error:
-        raise MisuseError(f"settings {settings}: {error.strerror}; give a file of JSON") from None
-    except (ValueError, RecursionError) as error:
-        raise SettingsError(f"settings {settings}: not JSON: {error}") from None
-    return Settings.from_document(document)
+        return read_settings(Path(settings))
+    except FileFault as fault:
+        raise MisuseError(f"settings {settings}: {fault}; give a file of JSON") from None
+    except SettingsError as error:
+        raise SettingsError(f"settings {settings}: {error}") from None

@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
 from eventsrc.errors import MisuseError
+from eventsrc.user_files import FileFault, read_file
 from projections.relocalize import (
     Answer,
     Camera,
@@ -16,6 +17,7 @@ from projections.relocalize import (
     rank,
     read_question,
 )
+from projections.relocalize.reading import MAX_QUESTION_BYTES
 
 from .map import Map
 
@@ -61,6 +63,6 @@ def _read(question: QuestionLike) -> Question:
     if not isinstance(question, str | Path):
         return read_question(question)
     try:
-        return parse_question(Path(question).read_bytes())
-    except OSError as error:
-        raise MisuseError(f"question {question}: {error.strerror}; give a file") from None
+        return parse_question(read_file(Path(question), MAX_QUESTION_BYTES))
+    except FileFault as fault:
+        raise MisuseError(f"question {question}: {fault}; give a file of JSON") from None

@@ -5,7 +5,6 @@ function that uses it: the imports of all of them take longer than most commands
 """
 
 import contextlib
-import json
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,9 +19,10 @@ from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from eventsrc.transport.config import DEFAULT_ENDPOINT, ZenohOptions
+from eventsrc.user_files import FileFault, read_file
 from projections.corrections import NO_CORRECTIONS, Corrections
 from projections.errors import QuestionError, SettingsError
-from projections.settings import Settings
+from projections.settings import Settings, read_settings
 
 from .signals import sigterm_unwinds
 from .terminal import say
@@ -108,13 +108,9 @@ def settings_of(
 
 def _settings_of_file(file: Path) -> Settings:
     try:
-        return Settings.from_document(json.loads(file.read_text("utf-8")))
-    except OSError as error:
-        raise SettingsError(f"--settings {file}: {error.strerror}") from None
-    except SettingsError as error:
+        return read_settings(file)
+    except (FileFault, SettingsError) as error:
         raise SettingsError(f"--settings {file}: {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise SettingsError(f"--settings {file}: not JSON: {error}") from None
 
 
 def past_settings(
@@ -262,30 +258,25 @@ ImageOption = Annotated[
         show_default=False,
     ),
 ]
-_MAX_QUESTION_BYTES = 16 * 1024 * 1024
 
 
 def question_from(query: str) -> "Question":
     """The question of a file or of stdin. Raises QuestionError that names the file."""
-    from projections.relocalize import parse_question
+    from projections.relocalize import MAX_QUESTION_BYTES, parse_question
 
     try:
-        payload = _read_question(query)
-    except OSError as error:
-        raise QuestionError(f"{query}: {error.strerror}; give a JSON file, or -") from None
-    if len(payload) > _MAX_QUESTION_BYTES:
-        raise QuestionError(f"{query}: more than {_MAX_QUESTION_BYTES} bytes; send fewer crops")
+        if query == "-":
+            payload = sys.stdin.buffer.read(MAX_QUESTION_BYTES + 1)
+        else:
+            payload = read_file(Path(query), MAX_QUESTION_BYTES)
+    except FileFault as fault:
+        raise QuestionError(f"{query}: {fault}; give a JSON file, or -") from None
+    if len(payload) > MAX_QUESTION_BYTES:
+        raise QuestionError(f"{query}: larger than {MAX_QUESTION_BYTES:,} bytes; send fewer crops")
     try:
         return parse_question(payload)
     except QuestionError as error:
         raise QuestionError(f"{query}: {error}") from None
-
-
-def _read_question(query: str) -> bytes:
-    if query == "-":
-        return sys.stdin.buffer.read(_MAX_QUESTION_BYTES + 1)
-    with Path(query).open("rb") as file:
-        return file.read(_MAX_QUESTION_BYTES + 1)
 
 
 def camera_from(hfov: float | None, image: str | None) -> "Camera | None":

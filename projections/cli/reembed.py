@@ -18,6 +18,7 @@ from eventsrc.detector.vision import check_installed, decode
 from eventsrc.reembedding import DEFAULT_BATCH, DEFAULT_TOPIC, Reembedding, Vector, reembed
 from eventsrc.system_events import MAX_REEMBEDDED
 from eventsrc.text import counted, visible
+from eventsrc.user_files import open_file
 
 from .detect_checks import device_of
 from .edit_command import user_at_host
@@ -37,7 +38,7 @@ class CropModel:
         model = path.read_bytes()
         digest = hashlib.sha256(model + b"\0" + preparation.model_dump_json().encode())
         for name in weight_files(model):
-            with (path.parent / name).open("rb") as weights:
+            with open_file(path.parent / name) as weights:
                 digest.update(hashlib.file_digest(weights, "sha256").digest())
         self.sha256 = digest.hexdigest()
 

@@ -16,6 +16,7 @@ import typer
 from eventsrc.errors import MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
+from eventsrc.user_files import FileFault, open_file
 from projections.errors import QuestionError
 from projections.model.fold import fold_log
 from projections.model.log_commands import read_corrections
@@ -242,9 +243,9 @@ def question_lines(query: str) -> Iterator[Iterator[bytes]]:
         return
     with contextlib.ExitStack() as stack:
         try:
-            file = stack.enter_context(Path(query).open("rb"))
-        except OSError as error:
-            raise QuestionError(f"{query}: {error.strerror}; give a file of lines, or -") from None
+            file = stack.enter_context(open_file(Path(query)))
+        except FileFault as fault:
+            raise QuestionError(f"{query}: {fault}; give a file of lines, or -") from None
         yield _lines(file.readline, query)
 
 

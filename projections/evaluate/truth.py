@@ -6,16 +6,17 @@ truth never goes into a log.
 """
 
 import gzip
-import json
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from eventsrc.envelope import RunId
 from eventsrc.errors import MisuseError
+from eventsrc.user_files import FileFault, open_file, parse_json
 
 Key = tuple[str, int]
 """run_id and keyframe_id."""
@@ -51,6 +52,10 @@ class Truth:
         return found.instances[index]
 
 
+_MAX_LINE_BYTES: Final = 16 * 1024 * 1024
+"""A longer line is read as several, which are no JSON."""
+
+
 def read_truth(paths: Iterable[Path]) -> Truth:
     """Read truth files. Raises MisuseError naming file and line."""
     return Truth({(line.run_id, line.keyframe_id): line for path in paths for line in _read(path)})
@@ -58,19 +63,23 @@ def read_truth(paths: Iterable[Path]) -> Truth:
 
 def _read(path: Path) -> list[TrueKeyframe]:
     try:
-        data = path.read_bytes()
-        text = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+        with open_file(path) as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            stream: BinaryIO = gzip.GzipFile(fileobj=file) if packed else file  # type: ignore[assignment]
+            lines = enumerate(iter(lambda: stream.readline(_MAX_LINE_BYTES), b""), start=1)
+            return [_parse(path, number, line) for number, line in lines if line.strip()]
+    except FileFault as fault:
+        raise MisuseError(f"--truth {path}: {fault}") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error):
+        raise MisuseError(f"--truth {path}: the gzip stream is cut short or damaged") from None
     except OSError as error:
         raise MisuseError(f"--truth {path}: {error.strerror or error}") from None
-    except (EOFError, zlib.error):
-        raise MisuseError(f"--truth {path}: the gzip stream is cut short or damaged") from None
-    lines = enumerate(text.splitlines(), start=1)
-    return [_parse(path, number, line) for number, line in lines if line.strip()]
 
 
 def _parse(path: Path, number: int, line: bytes) -> TrueKeyframe:
     try:
-        return TrueKeyframe.model_validate(json.loads(line))
+        return TrueKeyframe.model_validate(parse_json(line))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

@@ -9,6 +9,7 @@ from typing import Final
 from eventsrc.errors import LogError, LogNotFound, MisuseError, NotALog
 from eventsrc.log.reader import segments_of
 from eventsrc.text import counted, visible
+from eventsrc.user_files import FileFault, read_file
 
 MAX_LIST_BYTES: Final = 16 * 1024 * 1024
 MAX_NAME_BYTES: Final = 255
@@ -90,10 +91,10 @@ def _holds_log(folder: Path) -> bool:
 
 
 def _listed(file: Path) -> list[Site]:
-    with file.open("rb") as opened:
-        data = opened.read(MAX_LIST_BYTES + 1)
-    if len(data) > MAX_LIST_BYTES:
-        raise MisuseError(f"{file}: more than {MAX_LIST_BYTES:,} bytes; is it a list of logs?")
+    try:
+        data = read_file(file, MAX_LIST_BYTES)
+    except FileFault as fault:
+        raise MisuseError(f"{file}: {fault}; is it a list of logs?") from None
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:

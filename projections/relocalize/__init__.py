@@ -26,6 +26,7 @@ from .ranking import (
     rank,
 )
 from .reading import (
+    MAX_QUESTION_BYTES,
     parse_json,
     parse_question,
     read_crops,
@@ -38,6 +39,7 @@ from .walls import WallMap
 
 __all__ = [
     "DEFAULT_CAMERA",
+    "MAX_QUESTION_BYTES",
     "NEIGHBOURS",
     "UNKNOWN_BELOW",
     "Answer",

@@ -20,8 +20,10 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from eventsrc import user_files
 from eventsrc.envelope import MAX_DIMENSION, EnvelopeCamera, Text, describe_error
 from eventsrc.text import counted
+from eventsrc.user_files import FileFault
 from projections.errors import QuestionError
 from projections.exact import quantise, to_float32
 
@@ -69,6 +71,10 @@ class MovementModel(BaseModel):
     dyaw: Annotated[float, Field(ge=-MAX_TURNED_RAD, le=MAX_TURNED_RAD)]
 
 
+MAX_QUESTION_BYTES: Final = 16 * 1024 * 1024
+"""Bound of a file with a question."""
+
+
 def parse_question(payload: bytes) -> Question:
     """Read a question. Raises QuestionError that names what is wrong and what to send instead."""
     return read_question(parse_json(payload))
@@ -84,16 +90,15 @@ def parse_json(payload: bytes) -> Any:
             f" {MAX_MARKS}; send at most {MAX_CROPS} crops"
         )
     try:
-        return json.loads(payload)
-    except json.JSONDecodeError as error:
-        if error.msg == "Extra data":
+        return user_files.parse_json(payload)
+    except FileFault as fault:
+        cause = fault.__cause__
+        if isinstance(cause, json.JSONDecodeError) and cause.msg == "Extra data":
             raise QuestionError(
-                f"there is more after the question, in line {error.lineno}; send one JSON document,"
+                f"there is more after the question, in line {cause.lineno}; send one JSON document,"
                 " such as one line of a file of envelopes"
             ) from None
-        raise QuestionError(f"the question is not JSON: {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise QuestionError(f"the question is not JSON: {error}") from None
+        raise QuestionError(f"the question is not JSON: {fault}") from None
 
 
 def read_crops(document: Any) -> tuple[Crop, ...]:

@@ -19,6 +19,7 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from eventsrc.errors import MisuseError, TransportError
+from eventsrc.user_files import FileFault, open_file
 
 from .answering import RepeatFilter
 from .connections import MAX_CONNECTIONS, REQUEST_S, Connection, Connections
@@ -58,9 +59,9 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     for option, file in (("--tls-cert", certificate), ("--tls-key", key)):
         try:
-            file.open("rb").close()
-        except OSError as error:
-            raise MisuseError(f"{option} {file}: {error.strerror or error}") from None
+            open_file(file).close()
+        except FileFault as fault:
+            raise MisuseError(f"{option} {file}: {fault}") from None
     try:
         context.load_cert_chain(certificate, key, password=lambda: b"")  # never prompt
     except (ssl.SSLError, ValueError) as error:

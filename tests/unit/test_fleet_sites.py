@@ -82,7 +82,7 @@ def test_a_list_has_names_and_paths_relative_to_it(tmp_path: Path) -> None:
         (b"\xff\xfe\n", "not UTF-8 at byte 0"),
         (b"n" * 256 + b" x\n", "at most 255 bytes"),
         (b'{"detections":"' + b"A" * 20_000, '\'{"detections":"AAAA'),
-        (b"a x\n" * (MAX_LIST_BYTES // 4 + 1), "more than 16,777,216 bytes"),
+        (b"a x\n" * (MAX_LIST_BYTES // 4 + 1), "larger than 16,777,216 bytes"),
     ],
 )
 def test_a_list_that_cannot_be_is_refused(tmp_path: Path, content: bytes, wrong: str) -> None:
