@@ -8,6 +8,7 @@
     ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
     .ledger.json                       the gap ledger, folded from the events: a cache
+    .sealed.json                       how far the log is sealed: see `sealed_end`
 
 A segment is named by its base, the offset of its first event. While a sealed file replaces its
 active one, both exist for an instant; the sealed one counts.
@@ -58,12 +59,15 @@ IMPORTED = "imported"
 events before it."""
 PREVIOUS = "previous_sha256"
 """In the head of a sealed segment, and of no active one: the hash of the segment before."""
+FOLLOWING = "following"
+"""In the head of a sealed segment: the offset after its last event, so that a file that was cut
+tells what is missing. Segments of earlier versions have none."""
 MARK_SEED = "mark_seed"
 """In the head of an active segment, in hex: see `mcap_records.encode_mark`. Segments of earlier
 versions have none, which is seed 0."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")
 _BASE = re.compile(r"\d{1,20}", re.ASCII)
-_NANOSECONDS = re.compile(r"[0-9]{1,19}")
+_NUMBER = re.compile(r"[0-9]{1,19}")
 HEAD_BYTES = 4096
 """More than any head takes."""
 
@@ -84,6 +88,18 @@ def head_metadata(log_id: str, base: Offset, extra: dict[str, str] | None = None
     """The metadata at the head of a segment, active or sealed."""
     values = {"format": FORMAT, "log_id": log_id, "base": str(base), **(extra or {})}
     return _mcap.metadata_with_crc(metadata_name(SEGMENT_METADATA, log_id, base), values)
+
+
+def read_number(text: str) -> Offset:
+    """An offset in decimal digits; ValueError for anything else."""
+    if not _NUMBER.fullmatch(text):
+        raise ValueError(f"{text[:40]!r} is no offset")
+    return Offset(int(text))
+
+
+def end_in(head: dict[str, str], base: Offset) -> Offset:
+    """Where a segment ends by its head; its base if the head does not say."""
+    return max(base, Offset(int(head.get(FOLLOWING, base))))
 
 
 def origin_notes(head: dict[str, str]) -> dict[str, str]:
@@ -177,7 +193,9 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
         raise BadRecord("the segment's metadata has no log id or no base")
     if not _SEED.fullmatch(values.get(MARK_SEED, "0")):
         raise BadRecord("the segment's metadata has an invalid mark seed")
-    if not _NANOSECONDS.fullmatch(values.get(BEGUN, "0")):
+    if not _NUMBER.fullmatch(values.get(FOLLOWING, "0")):
+        raise BadRecord("the segment's metadata has an invalid end")
+    if not _NUMBER.fullmatch(values.get(BEGUN, "0")):
         raise BadRecord("the segment's metadata has an invalid time")
     return values
 
@@ -276,6 +294,7 @@ DUPLICATE = ".duplicate"
 MISNAMED = ".misnamed"
 LOCK = "lock"
 LEDGER = ".ledger.json"
+SEALED_END = ".sealed.json"
 
 _NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active)")
 _MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")

@@ -1,8 +1,8 @@
 """Check that the segments of a log belong together, and whether they are still the same.
 
 Log id: a segment copied from another log has a valid name and valid checksums. A reader stops at it
-and a writer does not start. Recovery goes by the majority of segments, and does nothing without
-one.
+and a writer does not start. Recovery keeps those of one log, chosen by `own_log_id`, and sets the
+others aside.
 
 Signatures: what is folded from a log (its gap ledger, snapshots of the map) is kept with the
 signatures of the segments it was folded from, and used only while these are the same. A growing
@@ -12,10 +12,10 @@ segment may be sealed and new ones may be added behind; any other change means t
 
 import contextlib
 import os
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from eventsrc.advised import advised
 from eventsrc.envelope import Offset
@@ -49,27 +49,37 @@ def common_log_id(segments: Iterable[SegmentPath]) -> str | None:
     return None if found is None else found[1]
 
 
-def majority_log_id(log_ids: Iterable[tuple[Path, str]]) -> str | None:
-    """The log id that most of these segments carry. Raises LogDamaged when two are equally common:
-    which files are wrong must then be decided by a person."""
-    by_path = dict(log_ids)
-    ranked = Counter(by_path.values()).most_common(2)
-    if len(ranked) == 2 and ranked[0][1] == ranked[1][1]:
-        one, other = ((p, i) for i, _ in ranked for p in [_first(by_path, i)])
-        raise LogDamaged(mixed_logs_message(*one, *other))
-    return ranked[0][0] if ranked else None
+class CarriedId(NamedTuple):
+    """The log id and base in the head of a file, and whether the file has the name of that base."""
+
+    log_id: str
+    base: Offset
+    rightly_named: bool
 
 
-def _first(by_path: dict[Path, str], log_id: str) -> Path:
-    return min(path for path, carried in by_path.items() if carried == log_id)
+def own_log_id(carried: Iterable[CarriedId], noted: str | None) -> str | None:
+    """The log id of a log whose files carry several: that which most of them carry; of equally
+    common ones ``noted``, by `sealed_end`, else that of more files under their right names, else
+    that whose first segment begins first. None if there is none."""
+    by_id: defaultdict[str, list[CarriedId]] = defaultdict(list)
+    for each in carried:
+        by_id[each.log_id].append(each)
+
+    def rank(log_id: str) -> tuple[int, bool, int, int, str]:
+        files = by_id[log_id]
+        rightly_named = sum(file.rightly_named for file in files)
+        first = min(file.base for file in files)
+        return len(files), log_id == noted, rightly_named, -first, log_id
+
+    return max(by_id, key=rank, default=None)
 
 
 def mixed_logs_message(one: Path, log_id: str, other: Path, other_id: str) -> str:
     """The error text for two segments of different logs."""
     return (
         f"{one} belongs to log {log_id}, but {other.name} to log {other_id}; put the right file in "
-        "place of the wrong one, or move that away and run "
-        f"`{advised('log', 'recover', one.parent)}`"
+        f"place of the wrong one, or run `{advised('log', 'recover', one.parent)}`, which sets the "
+        "segments of the other log aside"
     )
 
 

@@ -21,6 +21,7 @@ from .active_file import ActiveFile
 from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from .log_identity import mixed_logs_message
+from .sealed_end import sealed_end, sealed_end_of
 from .sealed_segment import SealedFile
 from .segment import Unreadable, chunk_events
 
@@ -38,10 +39,13 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._open: OrderedDict[int, OpenSegment] = OrderedDict()
+        end = sealed_end(path)  # before the folder is listed: a writer may be active
         self._segments = segments_of(path)
         self._last = _open_segment(path, self._segments[-1])
         self.log_id = self._last.log_id
         """From its last segment; reading stops at a segment with another id."""
+        if end is not None and end.log_id == self.log_id:
+            end.require(path, self.next_offset)
 
     @property
     def next_offset(self) -> Offset:
@@ -76,8 +80,11 @@ class LogReader:
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
         report = _raise_at_gap(self.path)
         self._report_damaged_end(FIRST_OFFSET, report)
+        end = sealed_end_of(self.path, self.log_id)
         segments = list_growing(self.path)
         known = self.refresh()  # after listing the folder: a writer may be active
+        if end is not None:
+            end.require(self.path, known)
         for newest in segments[-1:]:
             if newest.base > known:
                 report(
@@ -245,13 +252,21 @@ class LogReader:
 
 
 def segments_of(path: Path) -> list[SegmentPath]:
-    """The segments of a log; LogNotFound or NotALog when there are none, LogError when the folder
-    may not be read."""
+    """The segments of a log; LogNotFound, NotALog or LogDamaged when there are none, LogError when
+    the folder may not be read."""
     try:
         return _segments_of(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise LogError(f"{path}: {reason}; check the folder's rights and its disk") from error
+
+
+def segments_left(path: Path) -> list[SegmentPath]:
+    """`segments_of`, and none, instead of LogDamaged, where all of a log are missing."""
+    try:
+        return segments_of(path)
+    except LogDamaged:
+        return []
 
 
 def _segments_of(path: Path) -> list[SegmentPath]:
@@ -261,8 +276,11 @@ def _segments_of(path: Path) -> list[SegmentPath]:
         raise NotALog(
             f"{path} is a file; a log is a directory. `{advised('import', 'LOG', path)}` imports it"
         )
+    end = sealed_end(path)
     segments = list_growing(path)
     if not segments:
+        if end is not None:
+            end.require(path, FIRST_OFFSET)
         raise NotALog(f"{path} holds no log segment (….mcap); check the path")
     return segments
 

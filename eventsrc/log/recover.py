@@ -27,6 +27,7 @@ from .format import (
     LEDGER,
     PREVIOUS,
     SEALED,
+    SEALED_END,
     SegmentPath,
     half_renamed,
     head_at_any_base,
@@ -38,12 +39,13 @@ from .format import (
 )
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
-from .reader import segments_of
+from .reader import segments_left
 from .rebuild_segment import adjacent_times, rebuild_segment, slice_scan
 from .rename_segments import Moved, quarantine, rename_segments
 from .scan import scan_active
 from .scan_sealed import scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
+from .sealed_end import SealedEnd, sealed_end, sealed_end_of, write_sealed_end
 from .sealed_segment import check_sealed
 from .segment import Scan
 
@@ -93,12 +95,12 @@ class RecoveryReport:
 def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryReport:
     """Recover a log.
 
-    Raises LogNotFound, NotALog or LogBusy; LogDamaged when its segments belong to two logs in equal
-    number or one was made by another program; TooManyLosses when more than ``max_losses`` events
-    would be added that the damaged bytes cannot have held; LogError when the disk fails.
+    Raises LogNotFound, NotALog or LogBusy; LogDamaged when a segment was made by another program;
+    TooManyLosses when more than ``max_losses`` events would be added that the damaged bytes cannot
+    have held; LogError when the disk fails.
     """
     if not (log.is_dir() and half_renamed(log)):
-        segments_of(log)
+        segments_left(log)
     try:
         with WriterLock(log, system_clock):
             return _Recovery(log, max_losses).run()
@@ -122,10 +124,12 @@ class _Recovery:
     def run(self) -> RecoveryReport:
         for path in leftovers(self._log):
             unlink_quietly(path)
-        log_id, self._moved = rename_segments(self._log)
+        noted = sealed_end(self._log)
+        log_id, self._moved = rename_segments(self._log, None if noted is None else noted.log_id)
         if self._moved:
             delete_durably(self._log / LEDGER)
-        self._log_id = log_id or uuid.uuid4().hex
+        self._log_id = log_id or (uuid.uuid4().hex if noted is None else noted.log_id)
+        self._sealed_end = sealed_end_of(self._log, self._log_id)
         segments = list_segments(self._log)
         watched = reported(segments, "recovering", len(segments), "segments")
         for index, segment in enumerate(watched):
@@ -133,24 +137,44 @@ class _Recovery:
             if segment.base > self._next_offset:
                 self._fill_from_overlapping(segment)
             if segment.base > self._next_offset:
-                self._replace_missing(segment)
+                self._replace_missing(segment.base, segment)
             if segment.base < self._next_offset:
                 self._set_aside_overlapping(segment)
             else:
                 self._recover_segment(segment, following)
         self._fill_from_overlapping(None)
+        if self._sealed_end is not None and self._sealed_end.following > self._next_offset:
+            self._replace_missing(self._sealed_end.following, None)
+        self._note_sealed_end()
         return RecoveryReport(
             self._log, self._next_offset, tuple(self._recovered), tuple(self._moved)
         )
 
-    def _replace_missing(self, following: SegmentPath) -> None:
+    def _replace_missing(self, end: Offset, following: SegmentPath | None) -> None:
         """Put a segment of losses in place of a missing one."""
         scan = Scan(self._next_offset, None, next_offset=self._next_offset)
-        scan.add_gap_until(following.base)
+        scan.add_gap_until(end)
         self._rewrite(None, scan, following)
 
+    def _note_sealed_end(self) -> None:
+        """Write how far the log is sealed, if the file says anything else."""
+        if self._previous is None:
+            delete_durably(self._log / SEALED_END)
+            return
+        end = SealedEnd(self._log_id, self._previous.base, self._next_offset)
+        if sealed_end(self._log) != end:
+            write_sealed_end(self._log, end)
+
+    def _reach(self, segment: SegmentPath, following: SegmentPath | None) -> Offset | None:
+        """Where a segment ends at least, by the next one or by `sealed_end`; None if unknown."""
+        if self._overlapping:
+            return None
+        if following is not None:
+            return following.base
+        return None if self._sealed_end is None else self._sealed_end.reach(segment.base)
+
     def _recover_segment(self, segment: SegmentPath, following: SegmentPath | None) -> None:
-        reach = following.base if following is not None and not self._overlapping else None
+        reach = self._reach(segment, following)
         if segment.sealed:
             unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
             scan = _scan(segment, reach)
@@ -195,7 +219,7 @@ class _Recovery:
         evidence = (
             f"{following.path.name} begins there"
             if following
-            else "according to the offsets in the file"
+            else f"according to the offsets in the file and {SEALED_END}"
         )
         next_step = (
             f"If that is right, run `{advised('log', 'recover', self._log, '--yes')}`; else move "

@@ -3,7 +3,8 @@
 Log id and base in the head of a segment identify its log and its offsets. Its name may be wrong,
 because people copy, restore and rename files. The rules:
 
-* A segment of another log than most files here is set aside as ``….foreign``.
+* A segment of another log is set aside as ``….foreign-LOG_ID``. Which log this is says
+  `own_log_id`: usually that of most files.
 * A segment under a wrong name is renamed.
 * Of several files with the same base the one with the most good events stays; the others are set
   aside as ``….duplicate``.
@@ -15,15 +16,17 @@ Nothing is deleted. A file is renamed in two steps, by way of ``….misnamed``; 
 interrupted between them goes on from there.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from eventsrc.advised import advised
 from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.text import visible
 
 from . import mcap_records as _mcap
 from .durable_files import sync_directory
@@ -42,11 +45,13 @@ from .format import (
     segment_files,
     segment_path,
 )
-from .log_identity import majority_log_id
+from .log_identity import CarriedId, own_log_id
 from .scan import scan_active
 from .scan_sealed import scan_sealed
 from .sealed_segment import check_sealed
 from .segment import Scan
+
+_FILE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +88,12 @@ class RenamedSegments(NamedTuple):
     moved: list[Moved]
 
 
-def rename_segments(log: Path) -> RenamedSegments:
-    """Set aside and rename segment files, holding the writer lock. Raises LogDamaged, with nothing
-    done, for segments of two logs in equal number, and for MCAP files of other programs."""
+def rename_segments(log: Path, noted: str | None) -> RenamedSegments:
+    """Set aside and rename segment files, holding the writer lock; ``noted`` is the log id in
+    `sealed_end`. Raises LogDamaged, with nothing done, for MCAP files of other programs."""
     files = [_inspect(segment.path, segment) for segment in segment_files(log)]
     files += [_inspect(path, _target_of(path)) for path in half_renamed(log)]
-    log_id = majority_log_id((f.path, f.log_id) for f in files if f.log_id is not None)
+    log_id = own_log_id((c for f in files if (c := _carried(f)) is not None), noted)
     moved: list[Moved] = []
     by_base: defaultdict[Offset, list[_SegmentFile]] = defaultdict(list)
     for file in files:
@@ -97,9 +102,9 @@ def rename_segments(log: Path) -> RenamedSegments:
     for file in files:
         if file.log_id not in (None, log_id):
             reason = f"it belongs to log {file.log_id}, not {log_id}"
-            moved.append(quarantine(file.path, FOREIGN, reason))
+            moved.append(quarantine(file.path, _foreign_suffix(file.log_id), visible(reason)))
     bases = sorted(by_base)
-    for base, following in zip(bases, [*bases[1:], None], strict=True):
+    for base, following in zip(bases, [*bases[1:], None], strict=False):
         moved += _keep_best(by_base[base], following)
     moved += _rename(log, [same_base[0] for same_base in by_base.values()])
     return RenamedSegments(log_id, moved)
@@ -132,6 +137,19 @@ def _rename(log: Path, files: list[_SegmentFile]) -> list[Moved]:
         path.rename(_target_of(path).path)
     sync_directory(log)
     return moved
+
+
+def _carried(file: _SegmentFile) -> CarriedId | None:
+    if file.log_id is None:
+        return None
+    base = file.target.base
+    return CarriedId(file.log_id, base, file.path.name.startswith(f"{base:020d}"))
+
+
+def _foreign_suffix(log_id: str | None) -> str:
+    """With the log id, if that can be part of a file's name: any program may have written it."""
+    usable = log_id is not None and _FILE_NAME.fullmatch(log_id)
+    return f"{FOREIGN}-{log_id}" if usable else FOREIGN
 
 
 def _target_of(path: Path) -> SegmentPath:

@@ -41,6 +41,7 @@ from .format import (
 from .log_identity import common_log_id
 from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
+from .sealed_end import SealedEnd, note_sealed, sealed_end_of
 from .sealed_segment import SealedFile
 from .segment import Scan
 
@@ -84,8 +85,8 @@ class _Leftover:
 def restart(log: Path) -> Restart:
     """Clean up what is left over. The caller holds the writer lock.
 
-    Raises LogDamaged for damage in what a writer needs, for segments of different logs, and for a
-    segment under the name of another.
+    Raises LogDamaged for damage in what a writer needs, for segments of different logs, for a
+    segment under the name of another, and for sealed segments that are missing at the end.
     """
     for path in leftovers(log):
         unlink_quietly(path)
@@ -206,6 +207,7 @@ def _seal_now(log: Path, left: _Leftover) -> None:
     base, end, notes = left.segment.base, left.scan.next_offset, origin_notes(file.head)
     plan = SegmentPlan(log, file.log_id, base, previous, end, notes)
     seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
+    note_sealed(log, SealedEnd(file.log_id, base, end))
     left.segment.path.unlink()
     sync_directory(log)
 
@@ -220,3 +222,6 @@ def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
         state.previous_sha256 = file_sha256(sealed[-1].path)
     if state.unsealed:
         state.next_offset = max(state.next_offset, found[-1].scan.next_offset)
+    end = sealed_end_of(log, state.log_id)
+    if end is not None:
+        end.require(log, state.next_offset)

@@ -11,7 +11,7 @@ from eventsrc.errors import LogDamaged, NotALog
 
 from . import mcap_records as _mcap
 from .file_bytes import FileBytes
-from .format import HEAD_BYTES, WrongPlace, read_head
+from .format import HEAD_BYTES, WrongPlace, end_in, read_head
 from .mcap_records import BadRecord, Metadata
 from .rewritten import add_messages, is_rewritten
 from .scan import check_chunk
@@ -21,17 +21,19 @@ from .segment import ChunkRef, Scan
 
 def scan_sealed(path: Path, base: Offset, following: Offset | None) -> Scan:
     """Scan every chunk. ``following`` is the base of the next segment, if there is one: where this
-    one ends if its index is damaged. Raises WrongPlace for a segment of another base."""
+    one ends if its index is damaged. A segment that was cut, and where nothing says how many events
+    it had, lacks at least one. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
         scan = _scan(path, data, base, following)
-        scan.rewritten = is_rewritten(data[:HEAD_BYTES])
     if scan.rewritten:
         add_messages(path, scan, following)
     return scan
 
 
 def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -> Scan:
-    scan = Scan(base, _log_id(path, base, data), next_offset=base)
+    head = _head(path, base, data)
+    scan = Scan(base, head.get("log_id"), next_offset=base)
+    scan.rewritten = is_rewritten(data[:HEAD_BYTES])
     edges: set[tuple[Offset, Offset]] | None = None
     try:
         index = SealedFile(path, base)
@@ -55,18 +57,27 @@ def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -
         if first >= scan.next_offset and (edges is None or (first, after) in edges):
             scan.add_chunk(ChunkRef(at, length, first, after))
             end = at + length
-    scan.add_gap_until(max(recorded_end, following or base))
+    recorded_end = max(recorded_end, end_in(head, base), following or base)
+    scan.add_gap_until(recorded_end)
+    if recorded_end == base and not scan.rewritten and not _ends_in_magic(data):
+        # It was cut, and has the head of an earlier version, which does not name its end.
+        scan.add_gap_until(Offset(scan.next_offset + 1))
     scan.lost_bytes = _count_lost_bytes(len(data), scan)
     return scan
 
 
-def _log_id(path: Path, base: Offset, data: FileBytes) -> str | None:
+def _head(path: Path, base: Offset, data: FileBytes) -> dict[str, str]:
+    """The values in the head, none if it is damaged."""
     try:
-        return read_head(path, data[:HEAD_BYTES], base)[0]["log_id"]
+        return read_head(path, data[:HEAD_BYTES], base)[0]
     except WrongPlace:
         raise
     except (LogDamaged, NotALog):
-        return None
+        return {}
+
+
+def _ends_in_magic(data: FileBytes) -> bool:
+    return data[max(0, len(data) - len(_mcap.MAGIC)) : len(data)] == _mcap.MAGIC
 
 
 def _find_chunks(data: FileBytes) -> Iterator[int]:

@@ -11,7 +11,8 @@ copied as they are; only their heads are parsed, for the index. The channel reco
 needs lead it.
 
 The seal holds the number of events in each chunk, which the MCAP index does not, so that an offset
-is found without reading chunks. The head holds the SHA-256 of the segment before: the chain.
+is found without reading chunks. The head holds the SHA-256 of the segment before: the chain. It
+also names the segment's end, so that a file that was cut tells what is missing.
 """
 
 import hashlib
@@ -38,6 +39,7 @@ from .durable_files import (
 )
 from .format import (
     ACTIVE,
+    FOLLOWING,
     PREVIOUS,
     SEALED,
     SEALING,
@@ -248,7 +250,8 @@ class _Builder:
         self._edges = [0]
         self._log_ns: list[int] = []
         self._stamp_ns: list[int] = []
-        head = head_metadata(plan.log_id, plan.base, {PREVIOUS: plan.previous_sha256, **plan.notes})
+        values = {PREVIOUS: plan.previous_sha256, FOLLOWING: str(plan.following), **plan.notes}
+        head = head_metadata(plan.log_id, plan.base, values)
         start = file_head(head)
         length = len(_mcap.encode(head))
         self._metadata.append(MetadataIndex(len(start) - length, length, head.name))

@@ -24,6 +24,7 @@ from .durable_files import sync_directory
 from .format import ACTIVE, SEALED, head_of, origin_notes, segment_path
 from .seal import SegmentPlan, seal
 from .seal_process import ProcessGone, SealingProcess
+from .sealed_end import SealedEnd, note_sealed
 
 _NICE: Final = 10
 """Recording has priority, but not so much that sealing starves on a busy machine."""
@@ -120,6 +121,7 @@ class Sealer:
             previous = self._previous_sha256
             plan = SegmentPlan(self._log, self._log_id, base, previous, following, notes)
             self._sealed_sha256 = self._seal_in_process(plan) or self._seal_here(plan)
+            note_sealed(self._log, SealedEnd(self._log_id, base, following))
             active.unlink()
         elif not segment_path(self._log, base, SEALED).exists():
             lost = f"offsets {base} to {following - 1} are lost"

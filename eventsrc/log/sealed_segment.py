@@ -17,7 +17,7 @@ from eventsrc.envelope import Offset
 from eventsrc.errors import LogDamaged
 
 from . import mcap_records as _mcap
-from .format import NO_SCHEMA, is_metadata_of, is_verbatim
+from .format import NO_SCHEMA, end_in, is_metadata_of, is_verbatim
 from .mcap_records import (
     BadRecord,
     Channel,
@@ -139,6 +139,8 @@ class SealedFile(SegmentFile):
         if len(edges) != len(indexes) + 1:
             raise BadRecord("the seal does not fit the index")
         self.next_offset = edges[-1]
+        if end_in(self.head, self.next_offset) != self.next_offset:
+            raise BadRecord("the seal does not fit the head")
         self.chunks = [
             ChunkRef(position, length, first, following, channels)
             for (position, length, channels), (first, following) in zip(

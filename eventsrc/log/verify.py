@@ -12,12 +12,13 @@ from eventsrc.advised import advised
 from eventsrc.envelope import FIRST_OFFSET, Offset
 from eventsrc.errors import LogDamaged, LogError, NotALog
 from eventsrc.progress import report_progress
-from eventsrc.text import counted
+from eventsrc.text import counted, visible
 
 from .format import (
     IMPORTED,
     PREVIOUS,
     SEALED,
+    SEALED_END,
     SegmentPath,
     WrongPlace,
     head_at_any_base,
@@ -25,11 +26,12 @@ from .format import (
     segment_path,
 )
 from .lock import is_held
-from .log_identity import majority_log_id
-from .reader import segments_of
+from .log_identity import CarriedId, own_log_id
+from .reader import segments_left
 from .scan import scan_active, scanned_events
 from .scan_sealed import scan_sealed
 from .seal import NO_PREVIOUS, REPLACES
+from .sealed_end import InvalidSealedEnd, SealedEnd, read_sealed_end, sealed_end
 from .sealed_segment import check_sealed
 from .segment import Scan
 from .verify_events import EventFindings, Finding, Kind
@@ -51,9 +53,10 @@ def verify_log(log: Path) -> Verification:
     """Verify a log. Raises LogNotFound, NotALog, or LogError if the disk cannot be read."""
     before: list[SegmentPath] = []
     while True:
-        segments = segments_of(log)
+        end = sealed_end(log)  # before the folder is listed: a writer may be active
+        segments = segments_left(log)
         try:
-            return _Verifier(log, segments).run()
+            return _Verifier(log, segments, end).run()
         except OSError as error:
             sealed_meanwhile = isinstance(error, FileNotFoundError) and segments != before
             if not sealed_meanwhile:
@@ -63,13 +66,14 @@ def verify_log(log: Path) -> Verification:
 
 
 class _Verifier:
-    def __init__(self, log: Path, segments: list[SegmentPath]) -> None:
+    def __init__(self, log: Path, segments: list[SegmentPath], end: SealedEnd | None) -> None:
         self._log = log
         self._segments = segments
         self._has_writer = is_held(log)
         self._found: list[Finding] = []
         self._events = EventFindings()
-        self._log_id = _majority_log_id(segments)
+        self._log_id = _log_id_of(segments, end)
+        self._end = end if end is not None and end.log_id == self._log_id else None
         self._next_offset = FIRST_OFFSET
         self._count = 0
         self._bytes_done = 0
@@ -81,10 +85,12 @@ class _Verifier:
     def run(self) -> Verification:
         size = 0
         for index, segment in enumerate(self._segments):
-            is_last = index + 1 == len(self._segments)
-            size += self._verify_segment(
-                segment, None if is_last else self._segments[index + 1].base
-            )
+            if index + 1 < len(self._segments):
+                reach: Offset | None = self._segments[index + 1].base
+            else:
+                reach = None if self._end is None else self._end.reach(segment.base)
+            size += self._verify_segment(segment, reach)
+        self._check_sealed_end()
         report_progress("verifying", 1, 1, "MB")
         return Verification(
             self._log,
@@ -128,6 +134,22 @@ class _Verifier:
         self._bytes_done += size
         self._next_offset = scan.next_offset
         return size
+
+    def _check_sealed_end(self) -> None:
+        """Report sealed segments that are missing at the end, and a `SealedEnd` that says nothing
+        about this log."""
+        if self._end is not None and self._end.following > self._next_offset:
+            first, last = self._next_offset, Offset(self._end.following - 1)
+            self._add("gap", "segments that were sealed are not there", SEALED_END, first, last)
+        repair = f"ignored; `{advised('log', 'recover', self._log)}` replaces it"
+        try:
+            end = read_sealed_end(self._log)
+        except InvalidSealedEnd as error:
+            self._add("crc", f"{error}; {repair}", SEALED_END)
+            return
+        if end is not None and self._log_id not in (None, end.log_id):
+            text = f"belongs to log {end.log_id}, not {self._log_id}: {repair}"
+            self._add("log_id", visible(text), SEALED_END)
 
     def _report(self, done: int) -> None:
         total = max(self._bytes // 1_000_000, 1)
@@ -213,16 +235,16 @@ def _size_of(segment: SegmentPath) -> int:
         return 0
 
 
-def _majority_log_id(segments: list[SegmentPath]) -> str | None:
-    """The log id that most segments carry; None without a majority: then that of the
-    first segment is used."""
+def _log_id_of(segments: list[SegmentPath], end: SealedEnd | None) -> str | None:
+    """The log id that recovery would keep; None if no head can be read."""
     carried = []
     for segment in segments:
         try:
-            carried.append((segment.path, head_at_any_base(segment.path)["log_id"]))
+            head = head_at_any_base(segment.path)
         except (LogDamaged, NotALog):
             continue
-    try:
-        return majority_log_id(carried)
-    except LogDamaged:
-        return None
+        base = Offset(int(head["base"]))
+        carried.append(CarriedId(head["log_id"], base, base == segment.base))
+    if not carried and end is not None:
+        return end.log_id
+    return own_log_id(carried, None if end is None else end.log_id)

@@ -263,10 +263,10 @@ def recover(
     """Repair a log that is damaged or was left by a crash, keeping everything that can be read.
 
     Originals in which something recorded is damaged are kept as *.damaged; segments of other logs
-    are renamed to *.foreign, those whose events are in other segments too to *.duplicate; wrong
-    names are corrected. Lost offsets become mapfold/loss events; without --yes at most 100,000 more
-    than the damaged bytes can have held. Exit 0: nothing was lost or out of place, 3: something
-    was.
+    are renamed to *.foreign-LOG_ID, those whose events are in other segments too to *.duplicate;
+    wrong names are corrected. Lost offsets become mapfold/loss events; without --yes at most
+    100,000 more than the damaged bytes can have held. Exit 0: nothing was lost or out of place, 3:
+    something was.
     """
     report = recover_log(log, max_losses=sys.maxsize if yes else DEFAULT_MAX_LOSSES)
     if json_:

@@ -110,7 +110,7 @@ def check(path: Path, events: int, segments: int) -> None:
     """Everything is there, sealed, and the chain of hashes holds."""
     assert [e.payload for e in read_log(path)] == [b"%d" % n for n in range(events)]
     assert {f.kind for f in verify_log(path).findings} == {"schema"}
-    assert sorted(p.suffix for p in path.iterdir()) == ["", *[".mcap"] * segments]
+    assert sorted(p.suffix for p in path.iterdir()) == ["", ".json", *[".mcap"] * segments]
 
 
 def test_one_process_seals_all_segments(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,4 +217,4 @@ def test_the_process_of_a_dead_writer_changes_nothing_in_its_log(log_path: Path)
         writer.append(KEY, b"next")
     assert process._process.wait(TIMEOUT_S) == 1
     assert [e.payload for e in read_log(log_path)][-1] == b"next"
-    assert sorted(p.suffix for p in log_path.iterdir()) == ["", ".mcap", ".mcap"]
+    assert sorted(p.suffix for p in log_path.iterdir()) == ["", ".json", ".mcap", ".mcap"]

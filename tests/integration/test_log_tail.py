@@ -14,6 +14,7 @@ import pytest
 
 from eventsrc.errors import LogDamaged, LogError, LogNotFound
 from eventsrc.log import Event, LogReader, LogWriter, follow
+from eventsrc.log.format import SEALED_END
 from eventsrc.log.mcap_records import MARK_BYTES
 from tests.chaos.log_writer import payload_at
 from tests.fixtures_log import BY_HAND, KEY, flip, write_log
@@ -164,6 +165,7 @@ def test_a_tail_reads_events_that_recovery_found_behind_the_last_mark(log_path: 
     torn = active.read_bytes()[:-MARK_BYTES]
     writer.close()
     next(log_path.glob("*.mcap")).unlink()
+    (log_path / SEALED_END).unlink()
     active.write_bytes(torn)  # as after a kill between the sync and the mark
     with tail(log_path) as got:
         assert next_event(got).payload == b"zero"

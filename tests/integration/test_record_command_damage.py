@@ -13,7 +13,7 @@ import pytest
 
 from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.log.format import LEDGER
+from eventsrc.log.format import LEDGER, SEALED_END
 from eventsrc.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.robot.publisher import EnvelopePublisher
 from eventsrc.transport.session import Received, Session, ZenohOptions
@@ -143,6 +143,7 @@ def _leave_torn(log: Path) -> None:
         whole = active.read_bytes()
     (sealed,) = log.glob("*.mcap")
     sealed.unlink()
+    (log / SEALED_END).unlink()
     active.write_bytes(whole[: whole.index(last) + 20])
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
-from eventsrc.log.format import ACTIVE, SEALED, file_head, head_metadata, segment_path
+from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, file_head, head_metadata, segment_path
 from eventsrc.log.mcap_records import (
     encode_mark,
     encode_message_head,
@@ -38,6 +38,7 @@ def make(path: Path, name: str, *, each: int = EACH, events: int = EVENTS) -> li
 
 def leave_active(path: Path, base: int) -> Path:
     """Make the last sealed segment a growing one again, as a killed writer leaves it."""
+    (path / SEALED_END).unlink(missing_ok=True)
     events = [e.payload for e in read_log(path, base)]
     with LogReader(path) as reader:
         log_id = reader.log_id
@@ -77,7 +78,8 @@ def test_a_sealed_segment_of_another_log_over_the_growing_one(quick_path: Path) 
         LogWriter(log)
     before = files(log)
     report = recover_log(log)
-    assert [(m.name, m.now) for m in report.moved] == [(active.name, active.name + ".foreign")]
+    (moved,) = report.moved
+    assert (moved.name, moved.now.partition("-")[0]) == (active.name, active.name + ".foreign")
     assert report.findings
     assert payloads_of(log) == ours[: EVENTS - EACH]
     assert set(before.values()) == set(files(log).values())
@@ -250,15 +252,33 @@ def test_any_permutation_of_names_keeps_every_event_at_its_offset(
     assert not recover_log(log).findings
 
 
-def test_segments_of_two_logs_in_equal_number_are_not_touched(quick_path: Path) -> None:
-    make(quick_path / "a", "a", events=2 * EACH)
-    make(quick_path / "b", "b", events=2 * EACH)
+@pytest.mark.parametrize("noted", [True, False])
+@pytest.mark.parametrize("which", [0, EACH])
+def test_of_two_logs_in_equal_number_one_is_set_aside(
+    quick_path: Path, which: int, noted: bool
+) -> None:
+    """The other than `sealed_end` names; without it, the one that does not begin at offset 0."""
+    ours = make(quick_path / "a", "a", events=2 * EACH)
+    theirs = make(quick_path / "b", "b", events=2 * EACH)
+    ids = {name: verify_log(quick_path / name).log_id for name in "ab"}
     log = quick_path / "a"
-    shutil.copy(segment_path(quick_path / "b", EACH, SEALED), segment_path(log, EACH, SEALED))
+    shutil.copy(segment_path(quick_path / "b", which, SEALED), segment_path(log, which, SEALED))
+    if not noted:
+        (log / SEALED_END).unlink()
+    own = "a" if noted or which else "b"
     before = files(log)
-    with pytest.raises(LogDamaged, match="put the right file in place of the wrong one"):
-        recover_log(log)
-    assert files(log) == before
+    assert verify_log(log).log_id == ids[own]
+    (moved,) = recover_log(log).moved
+    foreign = "b" if own == "a" else "a"
+    assert moved.now == f"{moved.name}.foreign-{ids[foreign]}"
+    assert f"it belongs to log {ids[foreign]}, not {ids[own]}" in moved.reason
+    assert set(before.values()) <= set(files(log).values())
+    kept = [*(theirs if own == "b" else ours)[:EACH], *[None] * EACH]
+    if own == "a":
+        kept = [None if number // EACH == which // EACH else p for number, p in enumerate(ours)]
+    assert payloads_of(log) == kept[: len(payloads_of(log))]
+    assert len(payloads_of(log)) == (2 * EACH if noted else EACH)
+    assert {f.kind for f in verify_log(log).findings} <= {"loss"}
 
 
 def test_very_many_losses_need_confirmation(tmp_path: Path) -> None:

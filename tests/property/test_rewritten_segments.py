@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 
 from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
-from eventsrc.log.format import ACTIVE, SEALED, segment_path
+from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, segment_path
 from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log
@@ -141,6 +141,7 @@ def test_a_folder_of_foreign_files_only_is_not_changed(log: Path) -> None:
     run = Commands.in_folder(log.parent)
     for base in (EACH, 2 * EACH):
         segment_path(log, base, SEALED).unlink()
+    (log / SEALED_END).unlink()
     path = segment_path(log, 0, SEALED)
     rewrite(path, metadata=())
     there = len(plainly_read(path))
