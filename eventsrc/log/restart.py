@@ -62,6 +62,9 @@ class Restart:
     torn_events: int = 0
     unsealed: list[tuple[Offset, Offset]] = field(default_factory=list)
     """Base and next offset of the finished segments to be sealed, in order."""
+    empty: SegmentPath | None = None
+    """The last segment, if it has no events. The next writer replaces it under its name; until then
+    it may be the only file that has the log's id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +115,14 @@ def restart(log: Path) -> Restart:
         for left in found:
             _seal_now(log, left)
     _read_end(log, state, found)
+    if state.empty is not None and state.empty.base != state.next_offset:
+        state.empty.path.unlink()  # other segments hold its offset
+        sync_directory(log)
     return state
 
 
 def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
-    """The left-over segments that have events; those without are deleted."""
+    """The left-over segments that have events; those without are deleted, except for the last."""
     found = []
     for index, segment in enumerate(segments):
         if segment.sealed:
@@ -134,6 +140,9 @@ def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> l
             if left.scan.log_id is not None:
                 # The writer had reached this offset, even if files before it are missing.
                 state.next_offset = max(state.next_offset, segment.base)
+                if reach is None:
+                    state.empty = segment
+                    continue
             segment.path.unlink()
             sync_directory(log)
     return found

@@ -37,6 +37,7 @@ from eventsrc.commands import Command, parse_command
 from eventsrc.envelope import Offset
 from eventsrc.errors import TransportError
 from eventsrc.log import LogReader, LogWriter, verify_log
+from eventsrc.log.format import list_segments
 from eventsrc.recorder.edits import send_command
 from eventsrc.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.robot.publisher import EnvelopePublisher
@@ -255,7 +256,7 @@ class Ordeal:
         return Program(MAPFOLD, ["record", str(self._log), *keys, "--accept-edits"])
 
     def _log_exists(self) -> bool:
-        return any(self._log.glob("*.mcap*"))
+        return self._log.is_dir() and bool(list_segments(self._log))
 
     def _start_editor(self) -> None:
         if self._editor is None and self._log_exists():

@@ -1,5 +1,7 @@
 """Segments that a killed writer left are finished at the next start and sealed in background."""
 
+import errno
+import os
 import threading
 from pathlib import Path
 
@@ -9,6 +11,7 @@ from eventsrc.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal_worker as _sealer
+from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.format import ACTIVE, SEALED, segment_path
 from tests.fixtures_log import BY_HAND, KEY, read_log
 
@@ -150,3 +153,24 @@ def test_a_writer_refuses_to_start_on_damage_in_the_last_segment(log_path: Path)
     active.write_bytes(data)
     with pytest.raises(LogDamaged, match="offsets 0 to 0 were recorded and cannot be read"):
         LogWriter(log_path)
+
+
+def test_an_empty_log_keeps_its_id_where_the_next_writer_dies(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it has made a segment of its own: killed, or stopped by a full disk."""
+    with LogWriter(log_path) as writer:
+        log_id = writer.log_id
+
+    def create(_: ActiveSegment) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as full:
+        full.setattr(ActiveSegment, "create", create)
+        with pytest.raises(LogError, match="free space"):
+            LogWriter(log_path)
+    with LogReader(log_path) as reader:
+        assert reader.log_id == log_id
+    with LogWriter(log_path) as writer:
+        assert (writer.log_id, writer.append(KEY, b"0")) == (log_id, 0)
+    assert [f.kind for f in verify_log(log_path).findings] == ["schema"]
