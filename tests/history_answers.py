@@ -33,8 +33,10 @@ class KnownInMemory(KnownHistory):
     def history(self) -> Any:
         return self._records
 
-    @property
-    def latest(self) -> MapView:
+    def covering(self, end: Offset) -> Any:
+        return self._records
+
+    def _whole_view(self, history: Any) -> Any:
         return self._view
 
     def at(self, end: Offset | None = None) -> MapView:

@@ -60,8 +60,9 @@ class Timeline:
 
     def merges(self, point: int | str = "end") -> list[dict[str, Any]]:
         """Every merge of places up to a point, as ``mapfold merges --json``."""
-        known = self._timeline.knowing(self._offset(point))
-        return [merge_document(known.history, each) for each in known.merges(self._offset(point))]
+        end = self._offset(point)
+        known = self._timeline.knowing(end)
+        return [merge_document(known.covering(end), each) for each in known.merges(end)]
 
     def why(self, thing: str, point: int | str = "end") -> dict[str, Any]:
         """The history of a place or an object, as ``mapfold why --json``.

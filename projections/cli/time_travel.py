@@ -125,27 +125,27 @@ def merges(
         if show is not None:
             found = [_numbered(found, show)]
         if json_:
-            emit([merge_document(known.history, merge) for merge in found])
+            emit([merge_document(known.covering(end), merge) for merge in found])
         elif show is not None:
-            display(merge_text(known.history, found[0]))
+            display(merge_text(known.covering(end), found[0]))
         else:
-            display(merges_text(known.history, found, end))
+            display(merges_text(known.covering(end), found, end))
 
 
 def _show_refusals(known: KnownHistory, end: Offset, *, json_: bool) -> None:
     found = known.refusals(end)
     if json_:
-        emit([refusal_document(known.history, refusal) for refusal in found])
+        emit([refusal_document(known.covering(end), refusal) for refusal in found])
     else:
-        display(refusals_text(known.history, found))
+        display(refusals_text(known.covering(end), found))
 
 
 def _show_object_merges(known: KnownHistory, end: Offset, *, json_: bool) -> None:
     found = known.object_merges(end)
     if json_:
-        emit([object_merge_document(known.history, merge) for merge in found])
+        emit([object_merge_document(known.covering(end), merge) for merge in found])
     else:
-        display(object_merges_text(known.history, found))
+        display(object_merges_text(known.covering(end), found))
 
 
 def _draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:

@@ -19,6 +19,7 @@ from typing import TypeVar
 from eventsrc.errors import MisuseError
 from eventsrc.ingest import Accepted, ingest
 from eventsrc.log import LogReader
+from eventsrc.log.reader import OnGap
 from projections import relocalize
 from projections.exact import quantise, to_float32
 from projections.model.log_commands import read_corrections
@@ -58,9 +59,12 @@ class Question:
         return self.asked.crops
 
 
-def read_keyframes(logs: Iterable[Path], settings: Settings | None = None) -> Iterator[Accepted]:
+def read_keyframes(
+    logs: Iterable[Path], settings: Settings | None = None, on_gap: OnGap | None = None
+) -> Iterator[Accepted]:
     """Every valid keyframe of the logs with a pose, each (run, keyframe) once; where the settings
-    name a space, with the vectors of that space alone, also those given later."""
+    name a space, with the vectors of that space alone, also those given later. Raises LogDamaged,
+    or calls ``on_gap``, for damage."""
     model = None if settings is None else settings.embedding_model
     seen: set[Key] = set()
     for log in logs:
@@ -68,7 +72,7 @@ def read_keyframes(logs: Iterable[Path], settings: Settings | None = None) -> It
             later = None
             if settings is not None and model is not None:
                 later = vectors_of(reader, settings, read_corrections(reader))
-            for event in reader.read():
+            for event in reader.read(on_gap=on_gap):
                 if not event.is_envelope:
                     continue
                 found = ingest(event.payload, max_bytes=sys.maxsize)

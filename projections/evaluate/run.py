@@ -92,7 +92,9 @@ def evaluate(
     keyframes = list(read_keyframes(query_logs, settings))
     if query_logs:
         check_truth(keyframes, truth)
-    rooms = RoomIndex(list(read_keyframes([map_log])), keyframes, truth)
+    # Damage before `end` has been raised by the fold.
+    mapped = list(read_keyframes([map_log], on_gap=lambda _: None))
+    rooms = RoomIndex(mapped, keyframes, truth)
     runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
     if workers is None:
         workers = default_workers()

@@ -11,11 +11,11 @@ from functools import partial
 from typing import TypeVar
 
 from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import MisuseError
+from eventsrc.errors import LogDamaged, MisuseError
 from eventsrc.log import LogReader
 from eventsrc.text import counted
 from projections.corrections import Corrections
-from projections.errors import LogPointError
+from projections.errors import FoldError, LogPointError
 from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
 from projections.model.snapshot_cache import SnapshotCache
 from projections.model.space_vectors import new_map, with_vectors
@@ -105,10 +105,22 @@ class KnownHistory:
     @property
     def latest(self) -> MapView:
         """The map up to `end`, read-only; its observations carry no embeddings."""
-        history = self.history
+        return self._whole_view(self.history)
+
+    def _whole_view(self, history: StoredHistory) -> StoredView:
         if self._latest is None or self._latest.next_offset != history.next_offset:
             self._latest = StoredView(history, history.next_offset, self._cache)
         return self._latest
+
+    def covering(self, end: Offset) -> StoredHistory:
+        """The history of all that can be read and folded, for a question about the map after
+        ``end`` events. Raises FoldError, LogDamaged for an event before ``end`` only."""
+        try:
+            return self.history
+        except (FoldError, LogDamaged):
+            if not self._recorder.has(end):
+                raise
+        return self._history_of(end)
 
     def _history_of(self, end: Offset) -> StoredHistory:
         """The history of ``end`` events or more."""
@@ -132,13 +144,14 @@ class KnownHistory:
             self._snapshot_tried = True
             if self._has_snapshot(wanted):
                 return self.folded(wanted)
-        return self._view(wanted if self._recorder.has(wanted) else self.end, wanted)
+        known = self._recorder.has(wanted)
+        return self._view(self._history_of(wanted) if known else self.covering(wanted), wanted)
 
     def at_once(self, end: Offset) -> MapView:
         """`at`, for one question: events from ``end`` on are not folded."""
         if not self._recorder.has(end) and self._has_snapshot(end):
             return self.folded(end)
-        return self._view(end, end)
+        return self._view(self._history_of(end), end)
 
     def folded(self, end: Offset) -> MapView:
         """The map at ``end``, folded from the nearest snapshot."""
@@ -146,9 +159,8 @@ class KnownHistory:
             self.reader, self.settings, end, note=self._note, corrections=self.corrections
         )[1]
 
-    def _view(self, known: Offset, end: Offset) -> MapView:
-        """The map at ``end`` from a history of ``known`` events or more."""
-        history = self._history_of(known)
+    def _view(self, history: StoredHistory, end: Offset) -> MapView:
+        """The map at ``end`` from a history of as many events or more."""
         with gc_paused():
             return StoredView(history, end, self._cache)
 
@@ -168,24 +180,28 @@ class KnownHistory:
 
     def merges(self, end: Offset | None = None) -> list[Merge]:
         """Every merge of places by the first ``end`` events, in order."""
-        return _before(self.history.merges, self._checked(end))
+        last = self._checked(end)
+        return _before(self.covering(last).merges, last)
 
     def refusals(self, end: Offset | None = None) -> list[Refusal]:
         """Every merge that a command refused in the first ``end`` events, in order."""
-        return _before(self.history.refusals, self._checked(end))
+        last = self._checked(end)
+        return _before(self.covering(last).refusals, last)
 
     def object_merges(self, end: Offset | None = None) -> list[ObjectMerge]:
         """Every merge of objects by the first ``end`` events, in order."""
-        return _before(self.history.object_merges, self._checked(end))
+        last = self._checked(end)
+        return _before(self.covering(last).object_merges, last)
 
     def why(self, thing: str, end: Offset | None = None) -> Explanation:
         """The history of a place or an object, and the commands about it.
 
         ``thing`` is an id, or the name of a place. Raises NoSuchThing with the nearest names.
         """
-        history, last = self.history, self._checked(end)
+        last = self._checked(end)
+        history = self.covering(last)
         if thing in history.object_ordinals:
-            seen = self.latest.observations.__getitem__
+            seen = self._whole_view(history).observations.__getitem__
             explained = explain_object(history, seen, find_object(history, thing), last)
             commands = object_commands(self._entries, history, explained.facts["det_ids"])
             return with_entries(explained, commands)
@@ -194,36 +210,27 @@ class KnownHistory:
         try:
             place = find_place(history, thing, last)
         except NoSuchThing:
-            self._refuse_keyframe(thing, last)
+            _refuse_keyframe(history, thing, last)
             raise
         commands = place_commands(self._entries, history, place, last)
         return with_entries(explain_place(history, place, last), commands)
 
-    def _refuse_keyframe(self, text: str, end: Offset) -> None:
-        """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
-        keyframe = keyframe_ordinal(self.history, text)
-        if keyframe is None:
-            return
-        place = id_of_place(self.history, self.history.place_at(keyframe, end))
-        raise MisuseError(
-            f"{text} is a keyframe, in {place or 'no place'}; give a place, an object or two"
-            " keyframes"
-        )
-
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which
         commands join them or keep them apart."""
-        history, last = self.history, self._checked(end)
+        last = self._checked(end)
+        history = self.covering(last)
         a, b = (find_keyframe(history, text) for text in (first, second))
         commands = same_place_commands(self._entries, history, (a, b), last)
         return with_entries(explain_same_place(history, a, b, last), commands)
 
     def facts(self, end: Offset | None = None) -> HistoryFacts:
         """The map after ``end`` events, for evaluating conditions."""
-        history = self.history
+        last = self._checked(end)
+        history = self.covering(last)
         if self._index is None:
             self._index = CountIndex(history)
-        return HistoryFacts(history, self._index, self._checked(end))
+        return HistoryFacts(history, self._index, last)
 
     def bisect(
         self,
@@ -242,7 +249,8 @@ class KnownHistory:
         if self._checked(start) > facts.end:
             raise LogPointError(f"the start ({start}) is after the end ({facts.end}); swap them")
         _check_names(asked, facts)
-        return Searcher(asked, facts, self.history.cause_at).search(start, facts.end, scan=scan)
+        cause_at = self.covering(facts.end).cause_at
+        return Searcher(asked, facts, cause_at).search(start, facts.end, scan=scan)
 
     def _checked(self, end: Offset | None) -> Offset:
         return checked_end(self.reader, end)
@@ -286,3 +294,14 @@ def _check_names(expression: Expression, facts: HistoryFacts) -> None:
         if not facts.has(mention.kind, mention.text):
             error = NoSuchThing(mention.kind.value, mention.text, facts.names(mention.kind))
             raise expression.error_at(mention.column, str(error))
+
+
+def _refuse_keyframe(history: StoredHistory, text: str, end: Offset) -> None:
+    """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
+    keyframe = keyframe_ordinal(history, text)
+    if keyframe is None:
+        return
+    place = id_of_place(history, history.place_at(keyframe, end))
+    raise MisuseError(
+        f"{text} is a keyframe, in {place or 'no place'}; give a place, an object or two keyframes"
+    )

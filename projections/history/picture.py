@@ -50,18 +50,18 @@ def draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
     when ``out`` is not the name of a picture or cannot be written.
     """
     before, after = known.at(merge.cause.offset), known.at(Offset(merge.cause.offset + 1))
-    bounds = _bounds_of_merge(known, merge)
+    history = known.covering(after.next_offset)
+    bounds = _bounds_of_merge(history, merge)
     figure, panels = _panels(2, bounds, (2, _PANEL_IN), _HEADER_IN)
     for panel, view, when in zip(panels, (before, after), ("before", "after"), strict=True):
         _draw_map(panel, view)
-        _draw_chains(panel, known, merge)
+        _draw_chains(panel, history, merge)
         at = view.next_offset
-        names = [place_title(known.history, place, at) for place in merge.places]
+        names = [place_title(history, place, at) for place in merge.places]
         shown = " and ".join(names) if when == "before" else names[0]
         panel.axes.set_title(f"--at {view.next_offset}, {when}: {shown}", fontsize=10)
-    history = known.history
     header = f"merge {merge.number}, {merge.cause.when}: {merge_reason(history, merge)}"
-    legend = _ROOMS_LEGEND if known.settings.places == "rooms" else _LEGEND
+    legend = _ROOMS_LEGEND if history.settings.places == "rooms" else _LEGEND
     figure.suptitle(f"{fill(header, _HEADER_WIDTH)}\n{legend}", fontsize=9.5)
     _save(figure, out)
 
@@ -111,11 +111,11 @@ def _draw_map(panel: Canvas, view: MapView) -> None:
     panel.axes.set_aspect("equal")
 
 
-def _draw_chains(panel: Canvas, known: KnownHistory, merge: Merge) -> None:
+def _draw_chains(panel: Canvas, history: History, merge: Merge) -> None:
     """The bridge with its ε circle and neighbours, and the chains of core points."""
-    history, end = known.history, Offset(merge.cause.offset + 1)
+    end = Offset(merge.cause.offset + 1)
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
-    if known.settings.places == "rooms":
+    if history.settings.places == "rooms":
         _draw_links(panel, history, merge)
     else:
         _draw_neighbours(panel, history, merge, end)
@@ -148,16 +148,15 @@ def _draw_neighbours(panel: Canvas, history: History, merge: Merge, end: Offset)
     )
 
 
-def _bounds_of_merge(known: KnownHistory, merge: Merge) -> Bounds:
+def _bounds_of_merge(history: History, merge: Merge) -> Bounds:
     """A square around the bridge and the core points that join the places."""
-    history = known.history
     points = [merge.bridge, *(k for chain in chains_of(history, merge) for k in chain.points)]
-    if known.settings.places == "rooms":
+    if history.settings.places == "rooms":
         points += (k for link in merge.links for k in (link.core, link.neighbour))
     spots = history.neighbours.positions(points)
     (x0, y0), (x1, y1) = spots.min(axis=0), spots.max(axis=0)
     x, y = float(x0 + x1) / 2, float(y0 + y1) / 2
-    settings = known.settings
+    settings = history.settings
     margin = settings.rooms.drive_m if settings.places == "rooms" else _AROUND_EPS * settings.eps_m
     half = float(max(x1 - x0, y1 - y0)) / 2 + margin
     return x - half, y - half, x + half, y + half

@@ -63,7 +63,7 @@ class Timeline:
         self._note = note
         self._cache = cache
         self._commands: list[RecordedCommand] = []
-        self._commands_end: Offset | None = None
+        self._commands_end = FIRST_OFFSET
         self._compiled: dict[int, Corrections] = {}
         self._histories: dict[tuple[str, tuple[Offset, ...]], KnownHistory] = {}
 
@@ -86,11 +86,10 @@ class Timeline:
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> list[RecordedCommand]:
         """The commands recorded from ``start`` to before ``end``, undone ones too."""
-        if self._commands_end is None or self._commands_end < self.end:
-            known = self.end
-            self._commands += read_commands(self.reader, start=self._commands_end or FIRST_OFFSET)
-            self._commands_end = known
         last = self.end if end is None else end
+        if self._commands_end < last:
+            self._commands += read_commands(self.reader, last, self._commands_end)
+            self._commands_end = last
         return [recorded for recorded in self._commands if start <= recorded.offset < last]
 
     def corrections(self, known_at: Offset | None = None) -> Corrections:
@@ -213,7 +212,7 @@ class Timeline:
         """For each place of ``before`` that is absorbed after ``end`` events, by id: its survivor
         and the cause. A command may put that merge before ``before``, so all merges are searched; a
         place is the same in both maps if its founder is."""
-        history = self.knowing(known_at).history
+        history = self.knowing(known_at).covering(end)
         founders = {p.place_id: before.keyframes[p.founder].offset for p in before.places.values()}
         return {
             place_name(history, place): (place_name(history, merge.survivor), merge.cause)

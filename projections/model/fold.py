@@ -3,7 +3,6 @@
 import gc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import islice
 from typing import NamedTuple
 
 from eventsrc.envelope import Offset
@@ -19,6 +18,7 @@ from projections.settings import Settings
 from .parsing import READ_AHEAD as READ_AHEAD
 from .parsing import ParsedEvent as ParsedEvent
 from .parsing import parse_events as parse_events
+from .parsing import parsed_stretches
 from .snapshot_cache import SnapshotCache
 from .space_vectors import new_map, with_vectors
 from .view import MapView
@@ -42,13 +42,13 @@ def fold_events(
     Up to ``ahead`` of them are read and validated together before the first is folded, which is
     quicker. With 1, for a live log, each is read when its deltas are asked for.
 
-    Raises FoldError at an envelope that does not validate. The map is as before it then: its
+    Raises LogDamaged behind the last event before damage, and FoldError at an envelope that does
+    not validate. The map is as before it then: its
     ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
     Continue with another call from the offset after it; events read ahead are lost with this one.
     """
-    coming = iter(events)
-    while chunk := list(islice(coming, ahead)):
-        for event in parse_events(chunk):
+    for stretch in parsed_stretches(events, ahead):
+        for event in stretch:
             yield FoldedEvent(event.offset, fold_parsed(event, semantic_map))
 
 

@@ -51,14 +51,16 @@ def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
     return parsed_events
 
 
-def parsed_stretches(events: Iterable[Event]) -> Iterator[list[ParsedEvent]]:
-    """`parse_events` of every `READ_AHEAD` events. What precedes damage is yielded before
-    LogDamaged is raised."""
+def parsed_stretches(
+    events: Iterable[Event], ahead: int = READ_AHEAD
+) -> Iterator[list[ParsedEvent]]:
+    """`parse_events` of every ``ahead`` events. What precedes damage is yielded before LogDamaged
+    is raised."""
     stretch: list[Event] = []
     try:
         for event in events:
             stretch.append(event)
-            if len(stretch) == READ_AHEAD:
+            if len(stretch) == ahead:
                 yield parse_events(stretch)
                 stretch = []
     except LogDamaged:

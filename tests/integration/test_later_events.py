@@ -1,0 +1,185 @@
+"""An answer about W is the same whatever the log has after W: events that cannot be folded or read,
+of another embedding space, conflicting, or that correct the map."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.commands import Reembed, UseSettings
+from eventsrc.envelope import DetId
+from eventsrc.log import NEVER, LogReader, LogWriter
+from eventsrc.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
+from projections.reducers.objects import object_id
+from tests.commands import Commands
+from tests.commands_in_logs import append_command, command, forget_run, keep_apart
+from tests.corrected_logs import EVENTS, LEFT, documents
+from tests.envelopes import detection, envelope, payload
+from tests.logs import KEY, append_raw, write_log
+from tests.thorough import mostly_slow
+
+W = 24
+"""The events asked about: behind the merge of two rooms, before those of the other run."""
+CUP_AT = "--at", str(W)
+OBJECT = object_id(DetId("cup-1"))
+QUESTION = [detection("cup", [1.0, 0.0, 0.0])]
+TRUTH = [
+    {"run_id": "run-a", "keyframe_id": n, "room": f"room {n // 7}", "instances": []}
+    for n in range(20)
+]
+
+
+def _other_space(log: Path) -> None:
+    seen = [detection("cup", [1.0, 0.5], embedding_model="another")]
+    write_log(log, [envelope(40 + n, 0.5, 0.0, detections=seen) for n in range(9)])
+
+
+def _conflict(log: Path) -> None:
+    write_log(log, [envelope(n, 9.0, 9.0) for n in range(5)])
+
+
+def _correction(log: Path) -> None:
+    append_command(log, forget_run("run-a"))
+    append_command(log, keep_apart(0, 9))
+    append_command(log, command(UseSettings, settings={"eps_m": 0.1}))
+
+
+def _false_vectors(log: Path) -> None:
+    append_raw(log, b"no vectors", key=EMBEDDINGS_KEY)
+    given = {"space": "another", "dim": 3, "first": EVENTS, "end": EVENTS + 1, "detections": 1}
+    append_command(log, command(Reembed, **given, sha256="0" * 64))
+    append_command(log, command(UseSettings, settings={"embedding_model": "another"}))
+
+
+def _newest(log: Path, suffix: str) -> Path:
+    return max(log.glob(f"*{suffix}"))
+
+
+def _torn(log: Path) -> None:
+    with LogWriter(log, fsync=NEVER) as writer:
+        for number in range(60, 90):
+            writer.append(KEY, payload(envelope(number, 0.5)))
+            writer.sync()
+        growing = _newest(log, ".active")
+        torn = growing.read_bytes()
+    sealed = _newest(log, ".mcap")
+    sealed.unlink()
+    growing.write_bytes(torn[: len(torn) * 2 // 3])
+
+
+def _rotten(log: Path) -> None:
+    """A segment between others of which bytes have changed."""
+    for first in (60, 70):
+        write_log(log, [envelope(number, 0.5) for number in range(first, first + 10)])
+    middle = sorted(log.glob("*.mcap"))[-2]
+    content = bytearray(middle.read_bytes())
+    content[len(content) // 8 : len(content) // 2] = os.urandom(
+        len(content) // 2 - len(content) // 8
+    )
+    middle.write_bytes(content)
+
+
+def _lost(log: Path) -> None:
+    """A segment between others is not there."""
+    for first in (60, 70):
+        write_log(log, [envelope(number, 0.5) for number in range(first, first + 10)])
+    sorted(log.glob("*.mcap"))[-2].unlink()
+
+
+HINDRANCES: dict[str, tuple[Callable[[Path], None], bool]] = {
+    "unfoldable": (lambda log: append_raw(log, b'{"run_id": "broken"}'), True),
+    "torn": (_torn, True),
+    "no map": (lambda log: append_raw(log, b"{}", key=MAP_KEY), True),
+    "other space": (_other_space, True),
+    "conflict": (_conflict, True),
+    "rotten": (_rotten, False),
+    "lost": (_lost, False),
+    "no command": (lambda log: append_raw(log, b'{"kind": "later"}', key=COMMAND_KEY), False),
+    "correction": (_correction, False),
+    "false vectors": (_false_vectors, False),
+}
+"""What comes after W, and whether the commands behind it can be read."""
+
+QUESTIONS: dict[str, tuple[str, ...]] = {
+    "state": ("state", "log", *CUP_AT, "--json"),
+    "state, keyframe": ("state", "log", "--at", "run-a:23", "--json"),
+    "draw": ("draw", "log", *CUP_AT, "--out", "out/map.svg"),
+    "merges": ("merges", "log", *CUP_AT, "--json"),
+    "merges, text": ("merges", "log", *CUP_AT),
+    "one merge": ("merges", "log", *CUP_AT, "--show", "1"),
+    "drawn merge": ("merges", "log", *CUP_AT, "--draw", "1", "--out", "out/merge.svg"),
+    "refused": ("merges", "log", *CUP_AT, "--refused", "--json"),
+    "objects": ("merges", "log", *CUP_AT, "--objects", "--json"),
+    "why a place": ("why", "log", LEFT, *CUP_AT, "--json"),
+    "why an object": ("why", "log", OBJECT, *CUP_AT, "--json"),
+    "why the same": ("why", "log", "run-a:0", "run-a:9", *CUP_AT, "--json"),
+    "why unknown": ("why", "log", "run-x_p9", *CUP_AT),
+    "diff": ("diff", "log", "9", str(W), "--json"),
+    "bisect": ("bisect", "log", "merged('run-a_p1')", "--to", str(W), "--json"),
+    "bisect, unknown": ("bisect", "log", "size('run-x_p9') > 1", "--to", str(W)),
+    "whatif": ("whatif", "log", *CUP_AT, "--set", "eps_m=0.6", "--json"),
+    "export": ("export", "log", *CUP_AT, "--graphml", "out/map.graphml", "--csv", "out/csv"),
+    "foxglove": ("export", "log", *CUP_AT, "--foxglove", "out/map.mcap"),
+    "rerun": ("export", "log", *CUP_AT, "--rerun", "out/map.rrd"),
+    "contents": ("query", "contents", LEFT, "--log", "log", *CUP_AT, "--json"),
+    "relocalize": ("relocalize", "question.json", "--log", "log", "--as-of", str(W), "--json"),
+    "evaluate": ("evaluate", "--map", "log", *CUP_AT, "--truth", "truth.jsonl", "--json"),
+    "cat": ("log", "cat", "log", "--to", str(W), "--json"),
+}
+KNOWN_LATER = "state", "draw", "merges", "why a place", "diff", "bisect", "whatif", "export"
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log that ends shortly after W."""
+    folder = tmp_path_factory.mktemp("before")
+    write_log(folder / "log", documents())
+    (folder / "question.json").write_text(json.dumps(QUESTION))
+    (folder / "truth.jsonl").write_text("\n".join(map(json.dumps, TRUTH)))
+    return folder
+
+
+def _said(folder: Path, name: str, *more: str) -> tuple[int, Any, dict[str, bytes]]:
+    """Exit code, what a command in ``folder`` prints, without times, and the files it writes."""
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    said = Commands.in_folder(folder)(*QUESTIONS[name], *more, code=None)
+    shown: Any = said.out if said.code == 0 else said.out + said.err
+    if name == "evaluate" and said.code == 0:  # what it asks is of the whole log's rooms
+        shown = {part: said.json[part] for part in ("places", "objects")}
+    elif name == "whatif":
+        shown = re.sub(r'seconds": [0-9.e-]+', "", shown)
+    files = {
+        str(path.relative_to(folder)): b"" if path.suffix == ".rrd" else path.read_bytes()
+        for path in sorted((folder / "out").rglob("*.*"))
+    }
+    return said.code, shown, files
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("hindrance", mostly_slow(list(HINDRANCES)))
+def test_an_answer_does_not_depend_on_later_events(
+    before: Path, tmp_path: Path, hindrance: str
+) -> None:
+    hinder, readable = HINDRANCES[hindrance]
+    shutil.copytree(before, tmp_path, dirs_exist_ok=True)
+    hinder(tmp_path / "log")
+    with LogReader(tmp_path / "log") as reader:
+        last = reader.next_offset
+    assert last >= EVENTS
+    differing = []
+    for name in QUESTIONS:
+        expected = _said(before, name)
+        if "unknown" not in name:
+            assert expected[0] == 0, expected[1]
+        later = [["--known-at", str(last)]] if readable and name in KNOWN_LATER else []
+        differing += [
+            (name, *more, found[1])
+            for more in ([], *later)
+            if (found := _said(tmp_path, name, *more)) != expected
+        ]
+    assert not differing
