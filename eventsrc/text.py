@@ -1,4 +1,4 @@
-r"""Text for people: numbers with a noun, and text from outside made safe for a terminal.
+r"""Text for people: numbers with a noun, rows under a header, text from outside made safe to print.
 
 Escape sequences, which begin with a C0 or C1 control, can move a terminal's cursor, set its title
 or type answers; bidirectional overrides and isolates show a name in another order than it has; a
@@ -7,12 +7,30 @@ are shown as escapes: ``\x1b``, ``\u202e``, ``\n``.
 """
 
 import re
+from collections.abc import Collection, Iterable, Sequence
 from typing import Final
 
 
 def counted(number: int, word: str) -> str:
     """``1 keyframe``, ``2 keyframes``, ``3,000 keyframes``."""
     return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+
+
+def table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
+) -> str:
+    """Rows under the header in columns two spaces apart; ``right`` names those aligned right."""
+    cells = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    to_right = [name in right for name in header]
+    lines = (
+        "  ".join(
+            cell.rjust(width) if flush else cell.ljust(width)
+            for cell, width, flush in zip(row, widths, to_right, strict=True)
+        ).rstrip()
+        for row in cells
+    )
+    return "".join(f"{line}\n" for line in lines)
 
 
 _UNSAFE: Final = re.compile(

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
-from eventsrc.text import counted, visible
+from eventsrc.text import counted, table, visible
 from projections.evaluate.own_scores import own_scores
-from projections.history.rendering import table
 from projections.relocalize import UNKNOWN_BELOW
 
 from .localiser import CROPS, OwnScores

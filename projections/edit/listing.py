@@ -22,10 +22,9 @@ from eventsrc.commands import (
     UseSettings,
 )
 from eventsrc.envelope import Offset
-from eventsrc.text import counted, visible
+from eventsrc.text import counted, table, visible
 from projections.corrections import RecordedCommand
 from projections.history.records import iso_time
-from projections.history.rendering import table
 from projections.model.command_text import command_document
 from projections.settings import Settings, assignment_texts, settings_by_name
 

@@ -1,11 +1,11 @@
 """Text output of `mapfold diff`, `merges`, `bisect` and `why`."""
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from eventsrc.envelope import Offset
-from eventsrc.text import counted
+from eventsrc.text import counted, table
 from projections.deltas import PlaceOrdinal
 from projections.model.command_text import command_title
 from projections.model.records import Estimate
@@ -18,23 +18,6 @@ from .history import History
 from .merges import merge_reason, refuser
 from .names import keyframe_name, place_name, place_title
 from .records import EdgeChange, Merge, ObjectMerge, Refusal
-
-
-def table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
-) -> str:
-    """Rows under the header in columns two spaces apart; ``right`` names those aligned right."""
-    cells = [list(header), *(list(row) for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
-    to_right = [name in right for name in header]
-    lines = (
-        "  ".join(
-            cell.rjust(width) if flush else cell.ljust(width)
-            for cell, width, flush in zip(row, widths, to_right, strict=True)
-        ).rstrip()
-        for row in cells
-    )
-    return "".join(f"{line}\n" for line in lines)
 
 
 def shortened(lines: Sequence[str], most: int | None, hint: str) -> list[str]:

@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 
 from eventsrc.envelope import Offset
+from eventsrc.text import table
 from projections.model.command_text import command_title
 from projections.model.partitions import Regrouping
 
-from .rendering import shortened, table
+from .rendering import shortened
 from .whatif import Alternative, WhatIf
 
 _HEADER = ("settings", "places", "noise", "merges", "objects", "places ARI", "objects ARI")
