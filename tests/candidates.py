@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.view import MapView
-from projections.relocalize import Candidates
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Candidates
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
 
 
 def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:

@@ -4,10 +4,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from eventsrc import commands
-from eventsrc.commands import Anchor, Command, encode_command
+from eventsrc.envelope import commands
+from eventsrc.envelope.commands import Anchor, Command, encode_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 
 _numbers = count()
 

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from eventsrc.commands import Command, encode_command
+from eventsrc.envelope.commands import Command, encode_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from projections.edit.current import CurrentMap
 from projections.edit.make import Stamp
-from projections.settings import Settings
+from projections.fold.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.logs import write_log
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.append import append_payload
-from eventsrc.crops import (
+from eventsrc.adapters.reembedding import Vector
+from eventsrc.envelope.crops import (
     CROP_ENCODING,
     CROP_SCHEMA,
     CROP_SCHEMA_ENCODING,
@@ -17,9 +17,9 @@ from eventsrc.crops import (
     Crop,
     encode_crop,
 )
-from eventsrc.envelope import DetId
+from eventsrc.envelope.model import DetId
 from eventsrc.log import NEVER, LogWriter, MessageFormat
-from eventsrc.reembedding import Vector
+from eventsrc.record.append import append_payload
 from tests.envelopes import detection, embedding, envelope, payload
 
 KEY = "tb/detections"

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from eventsrc.log import LogReader
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
 from tests.commands_in_logs import append_command, name_place
 from tests.logs import write_log
 

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools
-from projections.serve.guard import Guard, SafeHeaders
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
-from projections.serve.metrics import CountedResponses, ServiceMetrics
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.guard import Guard, SafeHeaders
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
+from projections.surfaces.serve.metrics import CountedResponses, ServiceMetrics
 from tests.http_attacks import ask, request, status
 
 TOKEN = "0123456789abcdef-not-a-secret"

@@ -1,7 +1,7 @@
 """Wait until the server has dropped what rebuilds replaced."""
 
-from projections.database.connection import Targets, connect
-from projections.database.replaced_tables import wait_for_drop
+from projections.postgres.connection import Targets, connect
+from projections.postgres.replaced_tables import wait_for_drop
 
 
 def wait_for_drops(targets: Targets) -> None:

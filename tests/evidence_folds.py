@@ -5,12 +5,12 @@ from typing import Any
 
 from hypothesis import HealthCheck, settings
 
-from eventsrc.commands import Command
-from eventsrc.envelope import Offset
-from projections import deltas as d
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.model.view import MapView
-from projections.settings import Settings
+from eventsrc.envelope.commands import Command
+from eventsrc.envelope.model import Offset
+from projections.fold import deltas as d
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 from tests.folds import Folded, recounted_adjacency, recounted_places
 from tests.thorough import examples
 

@@ -5,14 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from eventsrc.envelope import DetId, Offset
-from projections.deltas import ObservationOrdinal, Pose, RunOrdinal
-from projections.evidence import EvidenceConstants
-from projections.exact import metres_to_um, unit_vectors
-from projections.pair_groups import PairGroups
-from projections.reducers.evidence_objects import EvidenceObjects, ObjectDelta
-from projections.reducers.sights import Sighting
-from projections.settings import Camera
+from eventsrc.envelope.model import DetId, Offset
+from projections.fold.deltas import ObservationOrdinal, Pose, RunOrdinal
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
+from projections.fold.exact import metres_to_um, unit_vectors
+from projections.fold.pair_groups import PairGroups
+from projections.fold.settings import Camera
+from projections.fold.sights import Sighting
 
 CAMERA = Camera(hfov_deg=70.0, width_px=640.0, height_px=400.0)
 FOCAL = CAMERA.width_px / 2 / math.tan(math.radians(CAMERA.hfov_deg / 2))

@@ -6,8 +6,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from eventsrc.append import append_payload
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectedPose,
@@ -27,9 +26,10 @@ from eventsrc.commands import (
     UseSettings,
     encode_command,
 )
-from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogWriter, parse_fsync
-from eventsrc.system_events import COMMAND_KEY
+from eventsrc.record.append import append_payload
 from tests.envelopes import payload
 from tests.fixtures_timetravel import walks
 

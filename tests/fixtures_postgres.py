@@ -13,8 +13,8 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.database.connection import Targets, connect, ensure_extension
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.connection import Targets, connect, ensure_extension
+from projections.postgres.embedded import EmbeddedServer
 from tests.killed_runs import hold_run, remove_killed_runs
 from tests.servers import CARELESS, MEMORY_DISK, RUN_HOME
 from tests.thorough import mostly_slow

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools
 from tests.described_maps import build
 from tests.logs import walk, write_log
 

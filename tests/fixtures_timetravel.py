@@ -6,8 +6,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogWriter, parse_fsync
+from eventsrc.record.append import append_payload
 from tests.envelopes import detection, envelope, payload
 
 VECTORS = {"cup": [1.0, 0.0, 0.1, 0.0], "chair": [0.0, 1.0, 0.0, 0.1], "lamp": [0.3, 0.0, 1.0, 0.0]}

@@ -12,13 +12,13 @@ from typing import IO
 
 import pytest
 
-from eventsrc.transport.session import Router, Session, ZenohOptions, open_session
+from eventsrc.record.transport.session import Router, Session, ZenohOptions, open_session
 from tests import prefork
 
-MAPFOLD = "from projections.cli import main; main()"
+MAPFOLD = "from projections.surfaces.cli import main; main()"
 PUBLISHER = """
 import sys
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 endpoint, key, *payloads = sys.argv[1:]
 with open_session(ZenohOptions(connect=(endpoint,)), mode="client") as session:
     publisher = session.publisher(key)

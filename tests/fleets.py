@@ -8,12 +8,12 @@ from pathlib import Path
 
 from psycopg import sql
 
-from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
-from projections.database.check import check
-from projections.database.connection import Targets, connect
-from projections.database.embedded import EmbeddedServer
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from projections.fold.settings import Settings
+from projections.postgres.check import check
+from projections.postgres.connection import Targets, connect
+from projections.postgres.embedded import EmbeddedServer
 from tests.envelopes import payload
 from tests.logs import KEY, walk, write_log
 

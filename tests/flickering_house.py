@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.sim import simulate_run
+from eventsrc.adapters.sim import simulate_run
 
 
 @cache

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.ingest import Accepted, ingest
-from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.deltas import Delta
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from eventsrc.envelope.ingest import Accepted, ingest
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.deltas import Delta
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 
 from .envelopes import payload
 
@@ -79,7 +79,7 @@ def near_matrix(n: int, is_near: NearTest) -> np.ndarray:
 
 
 class NaivePlaces:
-    """The rules of `projections.reducers.places`, word by word, from scratch at every point.
+    """The rules of `projections.fold.places`, word by word, from scratch at every point.
 
     ``labels`` is the founding number of each point's place, None for noise; ``founders`` are the
     points that founded the places.

@@ -3,16 +3,16 @@
 from collections.abc import Iterable
 from typing import Any
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from projections.history import Timeline
 from projections.history.diff import difference_of, rows_of
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document
-from projections.model.digest import map_digest
-from projections.model.export import state_document, state_text
-from projections.model.fold import fold_events
-from projections.model.space_vectors import new_map
-from projections.model.view import MapView
+from projections.map.digest import map_digest
+from projections.map.export import state_document, state_text
+from projections.map.fold import fold_events
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
 from tests.memory_history import MemoryHistory
 from tests.past_view import view_at
 

@@ -9,10 +9,10 @@ import zipfile
 from pathlib import Path
 from unittest.mock import patch
 
+from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.merges import merge_document
-from projections.model.digest import map_digest
-from projections.settings import Settings
+from projections.map.digest import map_digest
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 FILE_BYTES = 20_000
@@ -22,7 +22,7 @@ FILE_BYTES = 20_000
 def answers(log: Path, notes: list[str]) -> str:
     """Some answers as text; the history is kept however short it is."""
     with (
-        patch("projections.history.timeline_cache.MIN_EVENTS", 1),
+        patch("projections.store.timeline_cache.MIN_EVENTS", 1),
         Timeline(log, RULES, note=notes.append) as timeline,
     ):
         history = timeline.history

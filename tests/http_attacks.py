@@ -56,7 +56,7 @@ import resource, sys
 if limit := sys.argv.pop(1):
     resource.setrlimit(resource.RLIMIT_NOFILE, (int(limit), int(limit)))
 sys.argv.insert(1, "serve")
-from projections.cli import main
+from projections.surfaces.cli import main
 main()
 """
 

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from eventsrc.importers import BagOptions, ImportReport, import_files
 from eventsrc.log import LogWriter
+from eventsrc.record.importers import BagOptions, ImportReport, import_files
 from tests.fixtures_log import read_log
 from tests.ros_bags import Drive
 

@@ -8,8 +8,8 @@ import shutil
 from pathlib import Path
 from typing import IO
 
-from projections.database.embedded import EmbeddedServer
-from projections.errors import EmbeddedServerError
+from projections.fold.errors import EmbeddedServerError
+from projections.postgres.embedded import EmbeddedServer
 
 _NAME = re.compile(r"mapfold-test-([0-9]+)")
 _LOCK = "run.lock"

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.calibrate.sightings import Row
-from projections.deltas import Pose
-from projections.exact import metres_to_um, quantise
-from projections.settings import Camera
+from projections.fold.deltas import Pose
+from projections.fold.exact import metres_to_um, quantise
+from projections.fold.settings import Camera
+from projections.localize.calibrate.sightings import Row
 
 CAMERA = Camera(hfov_deg=80.0, width_px=800.0, height_px=600.0)
 DIM = 1024

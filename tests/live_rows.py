@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import LogReader
-from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.database.live_fold import LiveFold, batches
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.settings import Settings
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.settings import Settings
+from projections.postgres.live_fold import LiveFold, batches
+from projections.postgres.memory_sink import MemorySink, MemoryTables
 
 
 def followed_and_rebuilt(

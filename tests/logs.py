@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
+from eventsrc.record.append import append_payload
 from tests.envelopes import detection, envelope, payload
 
 KEY = "tb/detections"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.grey_images import encode_png
-from eventsrc.occupancy_map import OCCUPIED, UNKNOWN, Cells, OccupancyMap
+from eventsrc.envelope.grey_images import encode_png
+from eventsrc.envelope.occupancy_map import OCCUPIED, UNKNOWN, Cells, OccupancyMap
 
 _VALUES = {"#": OCCUPIED, ".": 0, "?": UNKNOWN}
 _SHADES = {"#": 0, ".": 254, "?": 205}

@@ -5,7 +5,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from projections.cli import main
+from projections.surfaces.cli import main
 from tests import prefork
 
 MOST_MIB = 600

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from eventsrc.envelope import FIRST_OFFSET, KeyframeId, Offset, RunId
-from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.deltas import (
+from eventsrc.envelope.model import FIRST_OFFSET, KeyframeId, Offset, RunId
+from projections.fold import packed
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.deltas import (
     Delta,
     EventSkipped,
     KeyframeAdded,
@@ -36,9 +37,10 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
-from projections.history.history import NEVER, NO_PLACE, History
-from projections.history.neighbours import Neighbours, Posed
-from projections.history.records import (
+from projections.fold.settings import Settings
+from projections.store.history import NEVER, NO_PLACE, History
+from projections.store.neighbours import Neighbours, Posed
+from projections.store.records import (
     Cause,
     EdgeChange,
     Merge,
@@ -48,8 +50,6 @@ from projections.history.records import (
     Refusal,
     cause_of,
 )
-from projections.reducers import packed
-from projections.settings import Settings
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The rules of `projections.reducers.constrained_places`, word by word, as slow as can be."""
+"""The rules of `projections.fold.constrained_places`, word by word, as slow as can be."""
 
 from collections.abc import Callable, Hashable, Iterable
 from itertools import combinations

@@ -5,7 +5,7 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from projections.corrections import Corrections
+from projections.fold.corrections import Corrections
 
 from .naive_constrained import NaiveConstrainedPlaces
 from .naive_map import NaiveMap, cosine_q40, micrometres

@@ -2,7 +2,7 @@
 
 It shares no code with what it checks: it reads JSON documents, not validated envelopes; it computes
 in fractions and Python integers; after every keyframe it counts everything again. Only the rules
-are the same (docstrings in `projections.reducers`), and the text of `projections.model.digest`,
+are the same (docstrings in `projections.fold`), and the text of `projections.map.digest`,
 which it writes by itself.
 """
 
@@ -154,7 +154,7 @@ class NaiveMap:
         return [None if k["pose"] is None else next(coming) for k in self.keyframes]
 
     def digest(self) -> str:
-        """What `projections.model.digest.map_digest` must say."""
+        """What `projections.map.digest.map_digest` must say."""
         labels = self._labels()
         sections = {
             "runs": [(run, min(times)) for run, times in self.runs.items()],

@@ -1,4 +1,4 @@
-"""The rules of `projections.reducers.rooms`, word by word, from scratch at every keyframe."""
+"""The rules of `projections.fold.rooms`, word by word, from scratch at every keyframe."""
 
 import math
 from collections.abc import Hashable

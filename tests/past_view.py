@@ -4,11 +4,10 @@ from bisect import bisect_left
 
 from msgspec.structs import astuple, replace
 
-from eventsrc.envelope import Offset
-from projections.deltas import PlaceOrdinal
-from projections.history.history import History
-from projections.history.records import ObjectHistory, count_before, last_before
-from projections.model.records import (
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import PlaceOrdinal
+from projections.fold.survivors import PlaceSurvivors
+from projections.map.records import (
     Estimate,
     KeyframeRecord,
     ObjectRecord,
@@ -17,8 +16,9 @@ from projections.model.records import (
     Relocation,
     RunRecord,
 )
-from projections.model.view import MapView
-from projections.reducers.survivors import PlaceSurvivors
+from projections.map.view import MapView
+from projections.store.history import History
+from projections.store.records import ObjectHistory, count_before, last_before
 
 
 def view_at(history: History, latest: MapView, end: Offset) -> MapView:

@@ -26,7 +26,7 @@ from tests.thorough import THOROUGH
 
 ROOT = Path(__file__).parents[1]
 
-MAPFOLD = "projections.cli:main"
+MAPFOLD = "projections.surfaces.cli:main"
 
 # Does in ten milliseconds what the program does; for scripts that call `mapfold`.
 _STAND_IN = """#!{python} -IS

@@ -26,7 +26,7 @@ from typing import Any
 
 import pydantic
 
-from projections.cli import COMMANDS, terminal
+from projections.surfaces.cli import COMMANDS, terminal
 
 MODULES = (
     *COMMANDS.values(),
@@ -36,9 +36,9 @@ MODULES = (
     "matplotlib.patheffects",
     "mcap.reader",
     "mcap.writer",
-    "projections.drawing",
-    "projections.export",
-    "projections.palette",
+    "projections.adapters.drawing",
+    "projections.adapters.export",
+    "projections.adapters.palette",
     "rich._emoji_codes",
     "rich.progress",
     "typer._adapters",

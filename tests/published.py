@@ -4,12 +4,9 @@ import json
 from pathlib import Path
 
 from eventsrc.log import LogReader
-from eventsrc.robot.acks import (
-    Ack,
-    payload_sha256,
-)
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import ZenohOptions
+from eventsrc.record.robot.acks import Ack, payload_sha256
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import ZenohOptions
 from tests.fixtures_log import KEY
 
 

@@ -7,9 +7,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from eventsrc.append import append_payload
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter, NewEvent, seal
-from eventsrc.system_events import MAP_KEY
+from eventsrc.record.append import append_payload
 from tests.commands_in_logs import append_to, forget_keyframes, keep_apart, name_place
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import BY_HAND

@@ -6,11 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-from eventsrc.gap_history import ledger_of
-from eventsrc.gaps import DEFAULT_SETTLE_NS
+from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.transport.session import Session
+from eventsrc.record.gap_history import ledger_of
+from eventsrc.record.recorder import Recorder, RecorderReport
+from eventsrc.record.transport.session import Session
 from tests.fixtures_log import KEY
 from tests.fixtures_zenoh import DEADLINE_S
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from eventsrc.log import LogReader
-from projections.database import TailProgress, TailReport, rebuild, tail
-from projections.database.connection import Targets
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.postgres import TailProgress, TailReport, rebuild, tail
+from projections.postgres.connection import Targets
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows, expected_graph, parsed
 

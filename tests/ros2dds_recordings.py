@@ -6,25 +6,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from eventsrc.gap_history import ledger_of
-from eventsrc.log import (
-    Event,
-    LogReader,
-    LogWriter,
-    VerbatimEvent,
-)
-from eventsrc.recorder import Recorder
-from eventsrc.recorder.bridged import Bridge
-from eventsrc.recorder.unfinished import message_of
+from eventsrc.envelope.system_events import MAP_KEY
+from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
+from eventsrc.record.gap_history import ledger_of
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.bridged import Bridge
+from eventsrc.record.recorder.unfinished import message_of
+from eventsrc.record.transport.session import Session
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.bridge_keys import topic_of
 from eventsrc.ros.derivation import derive
-from eventsrc.system_events import MAP_KEY
-from eventsrc.transport.session import Session
-from projections.cli.bridged import NOTHING, recording_of
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.surfaces.cli.bridged import NOTHING, recording_of
 from tests import ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S

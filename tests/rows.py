@@ -11,11 +11,11 @@ from typing import Any
 import psycopg
 from psycopg import sql
 
-from projections.database.connection import Targets
-from projections.database.memory_sink import MemoryTables
-from projections.exact import Q40
-from projections.model.view import MapView
-from projections.place_types import place_type
+from projections.fold.exact import Q40
+from projections.fold.place_types import place_type
+from projections.map.view import MapView
+from projections.postgres.connection import Targets
+from projections.postgres.memory_sink import MemoryTables
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",

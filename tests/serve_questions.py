@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from eventsrc.transport.session import Session
-from projections.serve import Answerer, FairQueue
-from projections.serve.guard import Guard
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
+from eventsrc.record.transport.session import Session
+from projections.surfaces.serve import Answerer, FairQueue
+from projections.surfaces.serve.guard import Guard
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
 from tests.envelopes import detection
 from tests.logs import WEIRD, walk
 

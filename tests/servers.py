@@ -13,8 +13,8 @@ from pathlib import Path
 
 import psycopg
 
-from projections.database.connection import connect, ensure_extension
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.connection import connect, ensure_extension
+from projections.postgres.embedded import EmbeddedServer
 from tests.thorough import THOROUGH
 
 WAIT_S = 120.0

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from eventsrc.sim import SimulatedRun, simulate_run
+from eventsrc.adapters.sim import SimulatedRun, simulate_run
 
 
 @cache

@@ -1,9 +1,9 @@
 """Deltas as fusion by evidence gives them, made by hand, and the rows that they must give.
 
 `SyntheticDeltas` makes events whose deltas keep to the order and the promises of
-`projections.deltas`, also of kinds that a real fold gives rarely: merges, missing and relocated
-Objects. `expected_rows` computes from all deltas at once what the tables must hold; it shares
-nothing with the view or the sinks but the label numbering that docs/projections.md promises.
+`projections.fold.deltas`, also of kinds that a real fold gives rarely: merges, missing and
+relocated Objects. `expected_rows` computes from all deltas at once what the tables must hold; it
+shares nothing with the view or the sinks but the label numbering that docs/projections.md promises.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from projections import deltas as d
-from projections.exact import Q40, quantise
+from projections.fold import deltas as d
+from projections.fold.exact import Q40, quantise
 from tests.rows import gid
 
 _CLASSES = ("cup", "x'}) DETACH DELETE r //", "☕", "chair")

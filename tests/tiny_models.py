@@ -1,7 +1,7 @@
 """ONNX models with known weights: a detector that finds coloured boxes, an encoder of mean colours.
 
-They are made for the pictures of `eventsrc.sim.pictures`, whose colours lie on a lattice of five
-levels a channel, and they are real models: onnxruntime runs them as it runs any other.
+They are made for the pictures of `eventsrc.adapters.sim.pictures`, whose colours lie on a lattice
+of five levels a channel, and they are real models: onnxruntime runs them as it runs any other.
 """
 
 import json
@@ -14,8 +14,8 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from eventsrc.sim.house import House
-from eventsrc.sim.pictures import Colour, thing_colours
+from eventsrc.adapters.sim.house import House
+from eventsrc.adapters.sim.pictures import Colour, thing_colours
 
 OPSET = 17
 STRIDE = 4

@@ -4,7 +4,7 @@ import json
 import math
 import random
 
-from eventsrc.envelope import ENVELOPE_VERSION
+from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.log import Event, MessageFormat, NewEvent, VerbatimEvent
 
 KEY = "tb/detections"

@@ -7,7 +7,7 @@ those that have been added.
 import os
 from pathlib import Path
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .file_bytes import FileBytes

@@ -23,9 +23,9 @@ import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from eventsrc.clock import Clock, system_clock
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogError
+from eventsrc.base.clock import Clock, system_clock
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.model import Offset
 
 from .durable_files import FsyncPolicy, replace_durably, sync_file, write_all
 from .event import NewEvent

@@ -14,7 +14,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
 
 GROUP_EVENTS = 256
 GROUP_BYTES = 4 * 1024 * 1024

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from eventsrc.envelope import ENVELOPE_VERSION, Offset
-from eventsrc.system_events import is_system_key
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import is_system_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Event:
     ``offset`` is its index in the log, which alone orders events. ``logged_ns`` is when it was
     written, ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix
     epoch; either may run backwards. ``payload`` is the message verbatim, in the envelope form of
-    ``version`` (see `eventsrc.upcast`).
+    ``version`` (see `eventsrc.envelope.upcast`).
     """
 
     offset: Offset

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 
 from .format import DAMAGED, free_name
 

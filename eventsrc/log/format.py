@@ -26,11 +26,11 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from eventsrc.advised import advised
-from eventsrc.commands import COMMAND
-from eventsrc.envelope import ENVELOPE_VERSION, Envelope, Offset
-from eventsrc.errors import LogDamaged, NotALog
-from eventsrc.system_events import (
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.commands import COMMAND
+from eventsrc.envelope.model import ENVELOPE_VERSION, Envelope, Offset
+from eventsrc.envelope.system_events import (
     COMMAND_KEY,
     EMBEDDINGS_KEY,
     LOSS_KEY,

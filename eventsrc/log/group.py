@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
-from eventsrc.crc import crc32
-from eventsrc.envelope import Offset
+from eventsrc.base.crc import crc32
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .durable_files import FsyncPolicy

@@ -17,8 +17,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from eventsrc.clock import Clock
-from eventsrc.errors import LogBusy
+from eventsrc.base.clock import Clock
+from eventsrc.base.errors import LogBusy
 
 from .format import LOCK
 

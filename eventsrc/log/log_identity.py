@@ -17,19 +17,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.envelope.model import Offset
 
-from .format import (
-    BEGUN,
-    HEAD_BYTES,
-    SegmentPath,
-    WrongPlace,
-    head_of,
-    list_growing,
-    read_head,
-)
+from .format import BEGUN, HEAD_BYTES, SegmentPath, WrongPlace, head_of, list_growing, read_head
 
 
 def common_log_id(segments: Iterable[SegmentPath]) -> str | None:

@@ -40,8 +40,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from eventsrc.crc import crc32
-from eventsrc.envelope import Offset
+from eventsrc.base.crc import crc32
+from eventsrc.envelope.model import Offset
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "mapfold"

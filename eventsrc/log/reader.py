@@ -12,10 +12,10 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 
-from eventsrc.advised import advised
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged, LogError, LogNotFound, NotALog
-from eventsrc.progress import report_progress
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
+from eventsrc.base.progress import report_progress
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .active_file import ActiveFile
 from .event import Event

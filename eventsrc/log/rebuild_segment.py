@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from eventsrc.envelope import ENVELOPE_VERSION, Offset
-from eventsrc.errors import LogDamaged, NotALog
-from eventsrc.system_events import LOSS_KEY, Loss
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
 
 from . import mcap_records as _mcap
 from .active_file import ActiveFile

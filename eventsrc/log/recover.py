@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from eventsrc.advised import advised
-from eventsrc.clock import system_clock
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged, LogError, NotALog
-from eventsrc.progress import reported
+from eventsrc.base.advised import advised
+from eventsrc.base.clock import system_clock
+from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.progress import reported
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, NotALog
-from eventsrc.text import visible
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.base.text import visible
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .durable_files import sync_directory

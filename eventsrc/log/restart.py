@@ -20,9 +20,9 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from eventsrc.advised import advised
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
 from .active_file import ActiveFile

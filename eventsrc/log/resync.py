@@ -13,7 +13,7 @@ skipped by their lengths:
 
 from typing import NamedTuple
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .file_bytes import FileBytes

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
 from .foreign_mcap import ForeignDamage, ForeignRecord, foreign_records

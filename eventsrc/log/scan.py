@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .event import Event

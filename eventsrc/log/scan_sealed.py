@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, NotALog
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .file_bytes import FileBytes

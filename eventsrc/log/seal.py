@@ -25,18 +25,12 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from eventsrc.crc import crc32
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.crc import crc32
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
-from .durable_files import (
-    drop_cached,
-    replace_durably,
-    sync_file,
-    unlink_quietly,
-    write_all,
-)
+from .durable_files import drop_cached, replace_durably, sync_file, unlink_quietly, write_all
 from .format import (
     ACTIVE,
     FOLLOWING,

@@ -24,8 +24,8 @@ import sys
 from pathlib import Path
 from typing import IO, Any, Final, cast
 
-from eventsrc.errors import LogDamaged
-from eventsrc.own_process import python_command
+from eventsrc.base.errors import LogDamaged
+from eventsrc.base.own_process import python_command
 
 from .active_file import ActiveFile
 from .durable_files import replace_durably, unlink_quietly

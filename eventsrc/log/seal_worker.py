@@ -15,9 +15,9 @@ from collections import deque
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.envelope.model import Offset
 
 from .active_file import ActiveFile
 from .durable_files import sync_directory

@@ -16,9 +16,9 @@ import stat
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .durable_files import replace_durably, sync_file, unlink_quietly, write_all

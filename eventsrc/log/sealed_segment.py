@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from eventsrc.advised import advised
-from eventsrc.crc import crc32
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.advised import advised
+from eventsrc.base.crc import crc32
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .format import NO_SCHEMA, end_in, is_metadata_of, is_verbatim

@@ -24,10 +24,10 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel, ValidationError
 
-from eventsrc.advised import advised
-from eventsrc.envelope import KeyframeId, Offset, RunId
-from eventsrc.errors import MisuseError
-from eventsrc.text import counted
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
 
 from .event import Event
 from .reader import LogReader, OnGap

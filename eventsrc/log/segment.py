@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
 from .event import Event, MessageFormat, VerbatimEvent

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 
 from .event import Event
 from .reader import LogReader

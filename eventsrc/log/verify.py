@@ -8,11 +8,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.advised import advised
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged, LogError, NotALog
-from eventsrc.progress import report_progress
-from eventsrc.text import counted, visible
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.progress import report_progress
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .format import (
     IMPORTED,

@@ -27,14 +27,14 @@ from typing import Final, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from eventsrc.commands import InvalidCommand, encode_command, parse_command
-from eventsrc.embeddings import InvalidEmbeddings, decode_embeddings
-from eventsrc.envelope import KeyframeId, Offset, RunId, has_keyframe_id
-from eventsrc.gaps import Gap, GapLedger, gap_of
-from eventsrc.ingest import Accepted
-from eventsrc.occupancy_map import InvalidMap, decode_map
-from eventsrc.ros.derivation import read_recording
-from eventsrc.system_events import (
+from eventsrc.base.text import visible
+from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
+from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
+from eventsrc.envelope.gaps import Gap, GapLedger, gap_of
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import KeyframeId, Offset, RunId, has_keyframe_id
+from eventsrc.envelope.occupancy_map import InvalidMap, decode_map
+from eventsrc.envelope.system_events import (
     COMMAND_KEY,
     EMBEDDINGS_KEY,
     LOSS_KEY,
@@ -44,8 +44,8 @@ from eventsrc.system_events import (
     Loss,
     RejectedPayload,
 )
-from eventsrc.text import visible
-from eventsrc.upcast import read_envelope
+from eventsrc.envelope.upcast import read_envelope
+from eventsrc.ros.derivation import read_recording
 
 from .event import Event
 

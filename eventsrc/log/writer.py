@@ -17,12 +17,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.clock import Clock, system_clock
-from eventsrc.envelope import ENVELOPE_VERSION, Offset
-from eventsrc.errors import LogError, MapfoldError, NotALog
-from eventsrc.system_events import is_system_key
-from eventsrc.text import visible
+from eventsrc.base.advised import advised
+from eventsrc.base.clock import Clock, system_clock
+from eventsrc.base.errors import LogError, MapfoldError, NotALog
+from eventsrc.base.text import visible
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import is_system_key
 
 from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly

@@ -20,8 +20,8 @@ answers queries::
 import re
 from typing import Final
 
-from eventsrc.errors import MisuseError
-from eventsrc.text import visible
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
 
 SLASH: Final = "§"
 MAX_TOKEN: Final = 4_096

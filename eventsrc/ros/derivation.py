@@ -16,12 +16,12 @@ from typing import Annotated, Any, Final, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from eventsrc.cdr_grids import GRID_SCHEMA
-from eventsrc.envelope import RunId
-from eventsrc.errors import LogDamaged
-from eventsrc.grid_messages import read_grid_message
-from eventsrc.occupancy_map import InvalidMap
-from eventsrc.system_events import MAP_KEY, ROS_KEY
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.cdr_grids import GRID_SCHEMA
+from eventsrc.envelope.grid_messages import read_grid_message
+from eventsrc.envelope.model import RunId
+from eventsrc.envelope.occupancy_map import InvalidMap
+from eventsrc.envelope.system_events import MAP_KEY, ROS_KEY
 
 from .assembler import Assembled, Assembler, RosMessage
 from .library import MessageTypes, Undecodable

@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from eventsrc.errors import MapfoldError
-from eventsrc.system_events import MAX_KEPT_BYTES, Excerpt
+from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 
 if TYPE_CHECKING:
     import apsw

@@ -13,7 +13,7 @@ import numpy as np
 import pybase64
 from pydantic_core import from_json
 
-from eventsrc.envelope import covariance_fault
+from eventsrc.envelope.model import covariance_fault
 
 from .transforms import Transform, unit_transform
 

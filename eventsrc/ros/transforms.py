@@ -12,7 +12,7 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import Final, Generic, NamedTuple, TypeVar
 
-from eventsrc.envelope import MAX_POSITION_M
+from eventsrc.envelope.model import MAX_POSITION_M
 
 MAX_SAMPLES: Final = 200_000
 """Samples that a buffer keeps. When there are more, the older half of each link is deleted."""

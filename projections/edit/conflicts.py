@@ -3,8 +3,10 @@
 from collections.abc import Callable, Collection, Hashable, Iterable
 from typing import TypeVar
 
-from eventsrc.advised import advised
-from eventsrc.commands import (
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from eventsrc.envelope.commands import (
     Command,
     DifferentObjects,
     DropDetection,
@@ -13,11 +15,9 @@ from eventsrc.commands import (
     ForgetRun,
     SameObject,
 )
-from eventsrc.envelope import DetId, KeyframeId, RunId
-from eventsrc.errors import MisuseError
-from eventsrc.text import visible
-from projections.corrections import Keyframe, RecordedCommand
-from projections.model.command_text import command_on
+from eventsrc.envelope.model import DetId, KeyframeId, RunId
+from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.map.command_text import command_on
 
 from .current import CurrentMap
 

@@ -4,17 +4,17 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from eventsrc.commands import (
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted
+from eventsrc.envelope.commands import (
     MAX_COMMAND_BYTES,
     MAX_YAW_RAD,
     CorrectPoses,
     RigidTransform,
     encode_command,
 )
-from eventsrc.envelope import MAX_POSITION_M, KeyframeId
-from eventsrc.errors import MisuseError
-from eventsrc.text import counted
-from eventsrc.trajectory import Trajectory
+from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId
+from eventsrc.envelope.trajectory import Trajectory
 
 from .conflicts import check_run_in_map
 from .current import CurrentMap

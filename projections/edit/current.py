@@ -4,26 +4,21 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
-from eventsrc.advised import advised
-from eventsrc.envelope import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
-from eventsrc.errors import MisuseError
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader
-from eventsrc.system_events import COMMAND_KEY
-from projections.corrections import (
-    Corrections,
-    Keyframe,
-    RecordedCommand,
-    compile_corrections,
-)
-from projections.deltas import PlaceOrdinal, PlacesMerged
+from projections.fold.corrections import Corrections, Keyframe, RecordedCommand, compile_corrections
+from projections.fold.deltas import PlaceOrdinal, PlacesMerged
+from projections.fold.objects import object_id
+from projections.fold.settings import Settings
 from projections.history import NoSuchThing
-from projections.model.fold import READ_AHEAD, fold_events, fold_log_cached, gc_paused
-from projections.model.log_commands import read_commands
-from projections.model.records import KeyframeRecord, ObjectRecord, ObservationRecord
-from projections.model.space_vectors import new_map
-from projections.model.view import MapView
-from projections.reducers.objects import object_id
-from projections.settings import Settings
+from projections.map.fold import READ_AHEAD, fold_events, fold_log_cached, gc_paused
+from projections.map.log_commands import read_commands
+from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
 
 SettingsOf = Callable[[Corrections], Settings]
 """The settings of the map, given the log's corrections."""

@@ -6,20 +6,20 @@ import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from eventsrc.commands import Command
-from eventsrc.envelope import Offset
+from eventsrc.base.progress import working
+from eventsrc.base.text import counted
+from eventsrc.envelope.commands import Command
+from eventsrc.envelope.model import Offset
 from eventsrc.log import cache_folder, make_cache_folder
-from eventsrc.progress import working
-from eventsrc.text import counted
-from projections.corrections import (
+from projections.fold.corrections import (
     Corrections,
     RecordedCommand,
     compile_corrections,
     map_fingerprint,
 )
-from projections.deltas import PlaceOrdinal
+from projections.fold.deltas import PlaceOrdinal
 from projections.history.diff import Difference, difference_of, rows_of
-from projections.model.view import MapView
+from projections.map.view import MapView
 
 from .current import CurrentMap
 

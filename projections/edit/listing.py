@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from eventsrc.advised import advised
-from eventsrc.commands import (
+from eventsrc.base.advised import advised
+from eventsrc.base.text import counted, table, visible
+from eventsrc.envelope.commands import (
     Command,
     CorrectPoses,
     DifferentObjects,
@@ -21,12 +22,11 @@ from eventsrc.commands import (
     UndoMerge,
     UseSettings,
 )
-from eventsrc.envelope import Offset
-from eventsrc.text import counted, table, visible
-from projections.corrections import RecordedCommand
-from projections.history.records import iso_time
-from projections.model.command_text import command_document
-from projections.settings import Settings, assignment_texts, settings_by_name
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import RecordedCommand
+from projections.fold.settings import Settings, assignment_texts, settings_by_name
+from projections.map.command_text import command_document
+from projections.store.records import iso_time
 
 from .effect import Effect
 from .make import undone_by

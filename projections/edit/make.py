@@ -12,8 +12,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ValidationError
 
-from eventsrc.advised import advised
-from eventsrc.commands import (
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     DifferentObjects,
@@ -29,12 +31,10 @@ from eventsrc.commands import (
     UndoMerge,
     UseSettings,
 )
-from eventsrc.envelope import DetId, KeyframeId, RunId, describe_error
-from eventsrc.errors import MisuseError
-from eventsrc.text import counted, visible
-from projections.corrections import Keyframe, RecordedCommand
+from eventsrc.envelope.model import DetId, KeyframeId, RunId, describe_error
+from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.fold.settings import Settings
 from projections.history import NoSuchThing
-from projections.settings import Settings
 
 from .conflicts import (
     EditRefused,

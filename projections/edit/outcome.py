@@ -10,8 +10,9 @@ from itertools import combinations
 from math import sqrt
 from typing import NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.commands import (
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectPoses,
@@ -22,12 +23,11 @@ from eventsrc.commands import (
     SameObject,
     UndoMerge,
 )
-from eventsrc.envelope import DetId
-from eventsrc.errors import LogError
-from projections.corrections import Keyframe, RecordedCommand
-from projections.deltas import ObjectOrdinal, PlaceOrdinal
-from projections.errors import FoldError
-from projections.model.view import MapView
+from eventsrc.envelope.model import DetId
+from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
+from projections.fold.errors import FoldError
+from projections.map.view import MapView
 
 from .conflicts import EditRefused, describe
 from .current import CurrentMap

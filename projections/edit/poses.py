@@ -11,9 +11,9 @@ from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from eventsrc.commands import CorrectedPose
-from eventsrc.envelope import KeyframeId
-from eventsrc.trajectory import Trajectory, TrajectoryPose
+from eventsrc.envelope.commands import CorrectedPose
+from eventsrc.envelope.model import KeyframeId
+from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
 
 DEFAULT_SLACK_S = 0.05
 

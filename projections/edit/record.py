@@ -8,18 +8,18 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.advised import advised
-from eventsrc.commands import Command, encode_command
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogBusy, MapfoldError, TransportError
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogBusy, MapfoldError, TransportError
+from eventsrc.base.text import visible
+from eventsrc.envelope.commands import Command, encode_command
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.log.lock import is_held
-from eventsrc.recorder.edits import NewerCommand, NoAnswer, send_command
-from eventsrc.system_events import COMMAND_KEY
-from eventsrc.text import visible
-from eventsrc.transport.session import Session
-from projections.corrections import check_settings
-from projections.model.log_commands import read_commands
+from eventsrc.record.recorder.edits import NewerCommand, NoAnswer, send_command
+from eventsrc.record.transport.session import Session
+from projections.fold.corrections import check_settings
+from projections.map.log_commands import read_commands
 
 from .conflicts import EditRefused
 from .current import CurrentMap, SettingsOf

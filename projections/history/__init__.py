@@ -6,13 +6,14 @@ event that made a condition true. `what_if` folds the log under other settings, 
 its commands, and compares.
 """
 
+from projections.store.records import Cause
+
 from .bisect import Search, Turn
 from .conditions import Expression, ExpressionError
 from .diff import Difference
 from .explanation import Entry, Explanation
 from .known import KnownHistory, Progress
 from .names import NoSuchThing
-from .records import Cause
 from .timeline import Timeline
 from .whatif import WhatIf, what_if
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
+from projections.store.history import NEVER, History
+from projections.store.records import Cause, ObjectHistory, PlaceHistory
 
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression
-from .history import NEVER, History
 from .names import id_of_place, keyframe_name, keyframe_ordinal
-from .records import Cause, ObjectHistory, PlaceHistory
 
 
 class CountIndex:

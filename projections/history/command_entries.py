@@ -7,7 +7,8 @@ place, and about an object if a detection that it names is one of the object's.
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from eventsrc.commands import (
+from eventsrc.base.text import counted
+from eventsrc.envelope.commands import (
     Anchor,
     CorrectPoses,
     DifferentObjects,
@@ -17,18 +18,17 @@ from eventsrc.commands import (
     SameObject,
     UndoMerge,
 )
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from eventsrc.text import counted
-from projections.corrections import Keyframe, RecordedCommand
-from projections.deltas import KeyframeOrdinal, PlaceOrdinal
-from projections.model.command_text import command_document, command_name, command_title
+from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
+from projections.map.command_text import command_document, command_name, command_title
+from projections.store.history import History
+from projections.store.records import Cause, PlaceHistory, Refusal
 
 from .explanation import Entry
-from .history import History
 from .merges import refusal_reason
 from .names import log_name, place_name
-from .records import Cause, PlaceHistory, Refusal
 
 _NS = 1e9
 

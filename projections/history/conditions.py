@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
 
 from .condition_functions import FUNCTIONS, Direction, Facts, Function, Names, Type, Value
 

@@ -11,15 +11,14 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import msgspec
 
-from eventsrc.envelope import Offset, RunId
-from projections.corrections import RecordedCommand
-from projections.model.command_text import command_document
-from projections.model.digest import map_digest
-from projections.model.records import Estimate, KeyframeRecord, Relocation
-from projections.model.view import MapView
-
-from .records import Cause
-from .stored_view import StoredView
+from eventsrc.envelope.model import Offset, RunId
+from projections.fold.corrections import RecordedCommand
+from projections.map.command_text import command_document
+from projections.map.digest import map_digest
+from projections.map.records import Estimate, KeyframeRecord, Relocation
+from projections.map.view import MapView
+from projections.store.records import Cause
+from projections.store.stored_view import StoredView
 
 
 @dataclass(frozen=True, slots=True)

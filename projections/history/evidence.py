@@ -9,14 +9,13 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from eventsrc.envelope import Offset
-from eventsrc.text import counted
-from projections.deltas import MergeEvidence, ObjectEstimated, ObjectMissing
-from projections.exact import UM_PER_M
-from projections.model.records import Estimate
-
-from .history import History
-from .records import ObjectHistory, last_before
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import MergeEvidence, ObjectEstimated, ObjectMissing
+from projections.fold.exact import UM_PER_M
+from projections.map.records import Estimate
+from projections.store.history import History
+from projections.store.records import ObjectHistory, last_before
 
 _NATS = 1000
 

@@ -6,11 +6,20 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from eventsrc.envelope import Offset
-from eventsrc.text import counted
-from projections.deltas import ObjectSeen, ObservationOrdinal, PlaceOrdinal, Pose
-from projections.exact import Q40, mean_m
-from projections.model.records import ObservationRecord
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import ObjectSeen, ObservationOrdinal, PlaceOrdinal, Pose
+from projections.fold.exact import Q40, mean_m
+from projections.map.records import ObservationRecord
+from projections.store.history import History
+from projections.store.records import (
+    Cause,
+    Merge,
+    ObjectHistory,
+    ObjectMerge,
+    PlaceHistory,
+    count_before,
+)
 
 from .evidence import (
     evidence_document,
@@ -20,10 +29,8 @@ from .evidence import (
     standing_text,
     votes_text,
 )
-from .history import History
 from .merges import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title
-from .records import Cause, Merge, ObjectHistory, ObjectMerge, PlaceHistory, count_before
 
 MOST_FOUNDERS = 6
 """Founding members that are named; one event may place many keyframes."""

@@ -1,7 +1,7 @@
 """The history of one log under given settings and the commands recorded before a point.
 
 The first question that needs the history folds the log once. The history is kept in memory and
-beside the log (`projections.history.timeline_cache`); later questions are look-ups. An event at
+beside the log (`projections.store.timeline_cache`); later questions are look-ups. An event at
 offset o, and a merge it causes, shows in ``at(o + 1)``. A command shows in every map of a history
 that knows it.
 """
@@ -10,29 +10,28 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TypeVar
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
-from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.base.errors import LogDamaged, MisuseError
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from eventsrc.text import counted
-from projections.corrections import Corrections
-from projections.errors import FoldError, LogPointError
-from projections.model.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
-from projections.model.snapshot_cache import SnapshotCache
-from projections.model.space_vectors import new_map, with_vectors
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections
+from projections.fold.errors import FoldError, LogPointError
+from projections.fold.settings import Settings
+from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
+from projections.map.snapshot_cache import SnapshotCache
+from projections.map.space_vectors import new_map, with_vectors
+from projections.map.view import MapView
+from projections.store.history_recorder import HistoryRecorder, map_at
+from projections.store.history_recorder import Progress as Progress
+from projections.store.records import Merge, ObjectMerge, Refusal
+from projections.store.stored_history import StoredHistory
+from projections.store.stored_view import StoredView
+from projections.store.timeline_cache import TimelineCache
 
 from .bisect import CountIndex, HistoryFacts, Search, Searcher
-from .command_entries import (
-    EntryMaker,
-    object_commands,
-    place_commands,
-    same_place_commands,
-)
+from .command_entries import EntryMaker, object_commands, place_commands, same_place_commands
 from .conditions import Expression
 from .explanation import Explanation, explain_object, explain_place, with_entries
-from .history_recorder import HistoryRecorder, map_at
-from .history_recorder import Progress as Progress
 from .names import (
     NoSuchThing,
     find_keyframe,
@@ -41,11 +40,7 @@ from .names import (
     id_of_place,
     keyframe_ordinal,
 )
-from .records import Merge, ObjectMerge, Refusal
 from .same_place import explain_same_place
-from .stored_history import StoredHistory
-from .stored_view import StoredView
-from .timeline_cache import TimelineCache
 
 _Caused = TypeVar("_Caused", Merge, Refusal, ObjectMerge)
 

@@ -20,16 +20,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from eventsrc.envelope import Offset
-from eventsrc.text import counted
-from projections.corrections import RecordedCommand
-from projections.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceLink, PlaceOrdinal
-from projections.model.command_text import command_document, command_on, command_title
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import RecordedCommand
+from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceLink, PlaceOrdinal
+from projections.map.command_text import command_document, command_on, command_title
+from projections.store.history import History
+from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal
 
 from .evidence import evidence_document
-from .history import History
 from .names import keyframe_name, log_name, place_name
-from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
 MOST_SEEN = 4
 """The most objects that a text names; of more, the first are named and the others counted."""

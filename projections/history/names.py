@@ -8,13 +8,12 @@ import difflib
 import re
 from collections.abc import Iterable
 
-from eventsrc.envelope import KeyframeId, Offset, RunId
-from eventsrc.errors import MisuseError
-from projections.corrections import Keyframe
-from projections.deltas import KeyframeOrdinal, PlaceOrdinal
-
-from .history import History
-from .records import ObjectHistory, PlaceHistory
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
+from projections.fold.corrections import Keyframe
+from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
+from projections.store.history import History
+from projections.store.records import ObjectHistory, PlaceHistory
 
 MOST_NAMES = 5
 """Names that an error message lists."""

@@ -25,11 +25,11 @@ from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from eventsrc.envelope import FIRST_OFFSET, DetId, Offset
-from eventsrc.errors import MapfoldError
+from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import Event, LogReader
-from projections.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
-from projections.deltas import (
+from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
+from projections.fold.deltas import (
     KeyframeAdded,
     KeyframePlaced,
     ObjectFound,
@@ -39,22 +39,22 @@ from projections.deltas import (
     PlacesMerged,
     RunSeen,
 )
-from projections.model.digest import map_digest
-from projections.model.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
-from projections.model.space_vectors import new_map
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+from projections.store.column_rows import TableWriter
+from projections.store.history import History
+from projections.store.history_recorder import map_at
+from projections.store.records import PlaceHistory
+from projections.store.stored_history import StoredHistory
+from projections.store.tables import Tables
 
-from .column_rows import TableWriter
-from .history import History
-from .history_recorder import map_at
 from .known import Progress
-from .records import PlaceHistory
-from .stored_history import StoredHistory
-from .tables import Tables
 
 if TYPE_CHECKING:
-    from projections.evaluate.truth import Truth
+    from projections.localize.evaluate.truth import Truth
 
 Offsets: TypeAlias = "array[int]"
 
@@ -117,7 +117,7 @@ class FoldResult:
     fused_later: tuple[tuple[int, int, int], ...]
     names: dict[str, str]
     scores: dict[str, dict[str, Any]] | None
-    """``places`` and ``objects`` against the truth (`projections.evaluate.scores`)."""
+    """``places`` and ``objects`` against the truth (`projections.localize.evaluate.scores`)."""
     seconds: float
     view: MapView | None = None
     """The map itself, if asked for; do not change it."""
@@ -168,7 +168,7 @@ def fold_result(
 
 def _scores(view: MapView, truth: "Truth") -> dict[str, dict[str, Any]]:
     # Here and not above: the scores are slow to import, and of few commands.
-    from projections.evaluate.scores import object_scores, place_scores
+    from projections.localize.evaluate.scores import object_scores, place_scores
 
     return {"places": place_scores(view, truth), "objects": object_scores(view, truth)}
 
@@ -264,7 +264,7 @@ class _Fold:
 
 
 def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
-    """As `projections.model.fold.fold_events`, but validating once for all folds."""
+    """As `projections.map.fold.fold_events`, but validating once for all folds."""
     read = parse_events(chunk)
     for fold in folds:
         started = time.perf_counter()

@@ -4,20 +4,20 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from eventsrc.envelope import Offset
-from eventsrc.text import counted, table
-from projections.deltas import PlaceOrdinal
-from projections.model.command_text import command_title
-from projections.model.records import Estimate
+from eventsrc.base.text import counted, table
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import PlaceOrdinal
+from projections.map.command_text import command_title
+from projections.map.records import Estimate
+from projections.store.history import History
+from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
 from .evidence import evidence_text
 from .explanation import Explanation
-from .history import History
 from .merges import merge_reason, refuser
 from .names import keyframe_name, place_name, place_title
-from .records import EdgeChange, Merge, ObjectMerge, Refusal
 
 
 def shortened(lines: Sequence[str], most: int | None, hint: str) -> list[str]:

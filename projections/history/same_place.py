@@ -5,15 +5,15 @@ place at any later event. The two are in one place from the event after which bo
 the same place, and the merges on the two chains up to that event are the reason.
 """
 
-from eventsrc.envelope import Offset
-from eventsrc.text import counted
-from projections.deltas import KeyframeOrdinal
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import KeyframeOrdinal
+from projections.store.history import NEVER, History
+from projections.store.records import Merge
 
 from .explanation import Entry, Explanation, position_text
-from .history import NEVER, History
 from .merges import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title
-from .records import Merge
 
 
 def explain_same_place(

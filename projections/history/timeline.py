@@ -10,22 +10,22 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeAlias
 
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.model.fold import FoldedEvent
-from projections.model.log_commands import read_commands
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.settings import Settings
+from projections.map.fold import FoldedEvent
+from projections.map.log_commands import read_commands
+from projections.map.view import MapView
+from projections.store.history import History
+from projections.store.records import Cause, Merge
 
 from .bisect import HistoryFacts, Search
 from .conditions import Expression
 from .diff import Difference, difference_of
 from .explanation import Explanation
-from .history import History
 from .known import KnownHistory, Progress, checked_end
 from .names import place_name
-from .records import Cause, Merge
 
 SettingsChoice: TypeAlias = Callable[[Corrections], Settings]
 """A function that returns the settings to fold with under some corrections, which may hold the

@@ -8,20 +8,20 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from eventsrc.envelope import DetId, Offset
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.errors import SettingsError
-from projections.model.command_text import command_document, command_name
-from projections.model.partitions import PartitionComparison, Regrouping, compare_partitions
-from projections.settings import Settings, assignment_texts
+from eventsrc.envelope.model import DetId, Offset
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.errors import SettingsError
+from projections.fold.settings import Settings, assignment_texts
+from projections.map.command_text import command_document, command_name
+from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
+from projections.store.history import NEVER
 
-from .history import NEVER
 from .known import Progress
 from .names import NoSuchThing
 from .parallel import NO_NUMBER, FoldResult, Rules, fold_all
 
 if TYPE_CHECKING:
-    from projections.evaluate.truth import Truth
+    from projections.localize.evaluate.truth import Truth
 
 MOST_ALTERNATIVES = 200
 

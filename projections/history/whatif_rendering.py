@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
-from eventsrc.envelope import Offset
-from eventsrc.text import table
-from projections.model.command_text import command_title
-from projections.model.partitions import Regrouping
+from eventsrc.base.text import table
+from eventsrc.envelope.model import Offset
+from projections.map.command_text import command_title
+from projections.map.partitions import Regrouping
 
 from .rendering import shortened
 from .whatif import Alternative, WhatIf

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.embedded import EmbeddedServer
 
 from . import killing, speed, which_site
 

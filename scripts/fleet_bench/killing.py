@@ -8,16 +8,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
-from projections.database.check import check
-from projections.database.connection import connect
-from projections.fleet.cluster import DaskCluster
-from projections.fleet.engine import Ended
-from projections.fleet.local_pool import LocalPool
-from projections.fleet.replaying import ReplayRequest, replay_site
-from projections.fleet.sites import Site
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from projections.adapters.fleet.cluster import DaskCluster
+from projections.adapters.fleet.engine import Ended
+from projections.adapters.fleet.local_pool import LocalPool
+from projections.adapters.fleet.replaying import ReplayRequest, replay_site
+from projections.adapters.fleet.sites import Site
+from projections.fold.settings import Settings
+from projections.postgres.check import check
+from projections.postgres.connection import connect
 from scripts.projections_bench.world import KEY, World
 
 from .speed import WORKERS, dask_cluster, replayed, requests_for

@@ -13,13 +13,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from projections.database.embedded import EmbeddedServer
-from projections.fleet.cluster import ClusterError, DaskCluster
-from projections.fleet.engine import Ended, Engine, Progress
-from projections.fleet.local_pool import LocalPool
-from projections.fleet.replaying import ReplayRequest, SiteReplay, replay_site
-from projections.fleet.site_databases import site_databases
-from projections.fleet.sites import Site
+from projections.adapters.fleet.cluster import ClusterError, DaskCluster
+from projections.adapters.fleet.engine import Ended, Engine, Progress
+from projections.adapters.fleet.local_pool import LocalPool
+from projections.adapters.fleet.replaying import ReplayRequest, SiteReplay, replay_site
+from projections.adapters.fleet.site_databases import site_databases
+from projections.adapters.fleet.sites import Site
+from projections.postgres.embedded import EmbeddedServer
 from scripts.projections_bench.world import make_log
 
 WORKERS = 2
@@ -90,7 +90,13 @@ def _seconds(name: str, address: str, requests: Sequence[ReplayRequest]) -> floa
     started = time.perf_counter()
     if name == REPLAYS:
         for request in requests:
-            command = [sys.executable, "-m", "projections.cli", "replay", str(request.site.log)]
+            command = [
+                sys.executable,
+                "-m",
+                "projections.surfaces.cli",
+                "replay",
+                str(request.site.log),
+            ]
             command += ["--db", request.databases.graph_url]
             subprocess.run(command, check=True, capture_output=True)
         return time.perf_counter() - started

@@ -8,16 +8,21 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from projections.evaluate.baselines import best_cosine
-from projections.evaluate.questions import Question, make_questions, make_view_questions, spread
-from projections.evaluate.scores import (
+from projections.adapters.fleet.which_site import which_site
+from projections.localize.evaluate.baselines import best_cosine
+from projections.localize.evaluate.questions import (
+    Question,
+    make_questions,
+    make_view_questions,
+    spread,
+)
+from projections.localize.evaluate.scores import (
     auroc,
     calibration_floor,
     expected_calibration_error,
     instances_of,
 )
-from projections.fleet.which_site import which_site
-from projections.relocalize import Answer, Camera, ExactIndex, rank
+from projections.localize.relocalize import Answer, Camera, ExactIndex, rank
 from tests.bench.truth.localising import later_runs, make_map
 from tests.bench.truth.worlds import Case, load_generator, make_case, pairs
 

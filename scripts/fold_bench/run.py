@@ -15,16 +15,16 @@ sys.path.insert(0, str(Path(__file__).parent))
 from plain import fold_plain
 from streams import DIM, MODEL, house_walk, keyframes, pictures, random_walk
 
-from eventsrc.ingest import Accepted, ingest
+from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
-from projections.exact import unit_vectors
-from projections.model.fold import READ_AHEAD, fold_events, fold_log, gc_paused
-from projections.model.view import MapView
-from projections.reducers.core_index import CoreIndex
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.places import Places
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold.core_index import CoreIndex
+from projections.fold.exact import unit_vectors
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.places import Places
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.fold import READ_AHEAD, fold_events, fold_log, gc_paused
+from projections.map.view import MapView
 
 QUICK = "--quick" in sys.argv
 EPS_UM, LEAST = 1_500_000, 3

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eventsrc.envelope import Detection, DetId, Envelope
-from eventsrc.ingest import Accepted
-from projections.settings import Camera
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import Detection, DetId, Envelope
+from projections.fold.settings import Camera
 
 WIDTH_M, DEPTH_M = 20.0, 15.0
 DIM = 512

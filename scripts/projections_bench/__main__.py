@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.embedded import EmbeddedServer
 
 from . import corrections, floor, live, queries, whole
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import psycopg
 
-from eventsrc.commands import Anchor, Command, KeepApart, NamePlace, encode_command
+from eventsrc.envelope.commands import Anchor, Command, KeepApart, NamePlace, encode_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter, parse_fsync
-from eventsrc.system_events import COMMAND_KEY
-from projections.database import TailProgress, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.database.embedded import EmbeddedServer
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import TailProgress, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.embedded import EmbeddedServer
 
 from .world import make_log
 

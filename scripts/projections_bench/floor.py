@@ -29,15 +29,15 @@ import psycopg
 from psycopg import sql
 
 from eventsrc.log import LogReader
-from projections.database import graph_schema as _graph_ddl
-from projections.database import rebuild, vector_table
-from projections.database.connection import Targets, connect
-from projections.database.embedded import EmbeddedServer
-from projections.database.labels import GRAPH, LABELS, TABLE
-from projections.database.replaced_tables import wait_for_drop
-from projections.model.fold import fold_log
-from projections.model.parsed_log import default_workers
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.parsed_log import default_workers
+from projections.postgres import graph_schema as _graph_ddl
+from projections.postgres import rebuild, vector_table
+from projections.postgres.connection import Targets, connect
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.labels import GRAPH, LABELS, TABLE
+from projections.postgres.replaced_tables import wait_for_drop
 
 from .world import DIM, make_log
 

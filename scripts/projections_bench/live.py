@@ -4,13 +4,13 @@ import threading
 import time
 from pathlib import Path
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter, parse_fsync
-from projections.database import TailProgress, TailReport, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.database.embedded import EmbeddedServer
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from projections.fold.settings import Settings
+from projections.postgres import TailProgress, TailReport, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.embedded import EmbeddedServer
 
 from .world import KEY, World, make_log
 

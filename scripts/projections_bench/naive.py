@@ -21,10 +21,10 @@ from typing import Any, LiteralString
 import psycopg
 from pgvector.psycopg import register_vector
 
-from projections.database.connection import connect
-from projections.database.cypher import connect_for_cypher
-from projections.exact import to_float32
-from projections.model.view import MapView
+from projections.fold.exact import to_float32
+from projections.map.view import MapView
+from projections.postgres.connection import connect
+from projections.postgres.cypher import connect_for_cypher
 
 VERTICES = ("Run", "Keyframe", "Pose", "Observation", "Object", "Place")
 EDGES = ("HAS_KEYFRAME", "HAS_POSE", "HAS_OBSERVATION", "OBSERVES", "LOCATED_IN", "IN_PLACE",

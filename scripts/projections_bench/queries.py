@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import psycopg
 
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.database.embedded import EmbeddedServer
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.embedded import EmbeddedServer
 
 from .world import make_log
 

@@ -10,8 +10,8 @@ from typing import Any, LiteralString
 
 import psycopg
 
-from projections.database.cypher import connect_for_cypher
-from projections.model.view import MapView
+from projections.map.view import MapView
+from projections.postgres.cypher import connect_for_cypher
 
 GRAPH: LiteralString = "tuned_map"
 

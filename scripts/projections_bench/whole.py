@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 from eventsrc.log import LogReader
-from projections.database.embedded import EmbeddedServer
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.postgres.embedded import EmbeddedServer
 
 from .naive import write_naively
 from .tuned import write_tuned
@@ -24,7 +24,12 @@ def command_seconds(*arguments: str, home: Path | None = None) -> float:
 
     With a ``home`` of its own it has to start and stop the server as well.
     """
-    command = [sys.executable, "-c", "from projections.cli import main; main()", *arguments]
+    command = [
+        sys.executable,
+        "-c",
+        "from projections.surfaces.cli import main; main()",
+        *arguments,
+    ]
     # As installed: pip compiles modules once, some environments forbid Python to.
     compiled = Path(tempfile.gettempdir()) / "mapfold-bench-compiled"
     environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(compiled)}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
+from eventsrc.record.append import append_payload
 
 MODEL = "ViT-B-32/laion2b_s34b_b79k"
 CLASSES = 40

@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
+from eventsrc.envelope.system_events import COMMAND_KEY, MAP_KEY
 from eventsrc.log import LogReader
-from eventsrc.system_events import COMMAND_KEY, MAP_KEY
-from projections.cli.options import settings_from
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.surfaces.cli.options import settings_from
 from tests.commands import Commands, Said
 from tests.docs.console import ROOT, Command, matches, read
 from tests.prefork import folder_with_mapfold

@@ -8,7 +8,7 @@ import numpy as np
 import psycopg
 import pytest
 
-from eventsrc.ingest import Accepted, ingest
+from eventsrc.envelope.ingest import Accepted, ingest
 from tests.acceptance.awkward_run import CLASSES, RUNS, awkward_payloads
 from tests.commands import Commands
 

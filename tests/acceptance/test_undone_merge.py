@@ -7,8 +7,8 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from eventsrc.append import append_payload
 from eventsrc.log import NEVER, LogWriter
+from eventsrc.record.append import append_payload
 from tests.commands import Commands
 from tests.servers import furnish
 from tests.shared_data import shared_run

@@ -21,7 +21,7 @@ _MAPFOLD = """
 import atexit, pathlib, sys
 peak = pathlib.Path(sys.argv.pop(1))
 atexit.register(lambda: peak.write_bytes(pathlib.Path("/proc/self/status").read_bytes()))
-from projections.cli import main
+from projections.surfaces.cli import main
 main()
 """
 """`mapfold`, which leaves its memory's numbers behind: a parent is told none, only its own."""

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.envelope.system_events import is_system_key
 from eventsrc.log import LogReader
 from eventsrc.log.segment import Unreadable
-from eventsrc.system_events import is_system_key
 
 
 def digest(payload: bytes) -> bytes:

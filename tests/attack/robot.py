@@ -4,8 +4,8 @@ import json
 import threading
 from pathlib import Path
 
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import ZenohOptions
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import ZenohOptions
 from tests.envelopes import envelope
 
 from .oracle import Oracle, digest

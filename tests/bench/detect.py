@@ -15,19 +15,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from eventsrc.detector import encoder as encoder_module
-from eventsrc.detector import files, finder, keyframes
-from eventsrc.detector.encoder import Encoder, read_preparation
-from eventsrc.detector.files import Timing, open_images
-from eventsrc.detector.finder import Finder, FinderOptions
-from eventsrc.detector.gate import GateLimits, KeyframeGate
-from eventsrc.detector.keyframes import Keyframes
-from eventsrc.detector.onnx_model import OnnxModel
-from eventsrc.detector.outputs import FileOutput
-from eventsrc.detector.poses import poses_of_file
-from eventsrc.envelope import RunId
-from eventsrc.sim import build_house
-from eventsrc.sim.pictures import camera_pictures, write_pictures
+from eventsrc.adapters.detector import encoder as encoder_module
+from eventsrc.adapters.detector import files, finder, keyframes
+from eventsrc.adapters.detector.encoder import Encoder, read_preparation
+from eventsrc.adapters.detector.files import Timing, open_images
+from eventsrc.adapters.detector.finder import Finder, FinderOptions
+from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate
+from eventsrc.adapters.detector.keyframes import Keyframes
+from eventsrc.adapters.detector.onnx_model import OnnxModel
+from eventsrc.adapters.detector.outputs import FileOutput
+from eventsrc.adapters.detector.poses import poses_of_file
+from eventsrc.adapters.sim import build_house
+from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
+from eventsrc.envelope.model import RunId
 from tests.tiny_models import models_for
 
 MOST_ADDED_MS = 8.0

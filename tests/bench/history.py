@@ -17,15 +17,15 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogWriter, parse_fsync
 from projections.history import Timeline
 from projections.history.diff import difference_of
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document
-from projections.model.digest import map_digest
-from projections.model.export import state_text
-from projections.model.view import MapView
+from projections.map.digest import map_digest
+from projections.map.export import state_text
+from projections.map.view import MapView
 from tests.bench.timetravel import RULES, make_log, payloads, say, timed
 from tests.history_answers import MemoryHistory
 
@@ -116,7 +116,7 @@ def _memory() -> str:
 
 def command(log: Path, *words: str) -> None:
     """The time and the memory of a whole command."""
-    program = [sys.executable, "-m", "projections.cli", words[0], str(log), *words[1:]]
+    program = [sys.executable, "-m", "projections.surfaces.cli", words[0], str(log), *words[1:]]
     program += ["--set", f"eps_m={RULES.eps_m}", "--set", f"min_samples={RULES.min_samples}"]
     seconds, _ = timed(lambda: subprocess.run(program, check=True, capture_output=True))
     say(f"mapfold {' '.join(words)}", f"{seconds:.2f} s")

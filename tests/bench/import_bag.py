@@ -11,9 +11,9 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from eventsrc.importers import BagOptions, import_files
-from eventsrc.importers.ros_bags import RosBag
 from eventsrc.log import LogWriter
+from eventsrc.record.importers import BagOptions, import_files
+from eventsrc.record.importers.ros_bags import RosBag
 from tests.ros_bags import STORAGES, Drive, write_bag
 
 GOAL = 5_000

@@ -21,16 +21,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.append import check_payloads
-from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import GROUP_COMMIT, Event, LogReader, LogWriter, NewEvent
-from eventsrc.robot.acks import payload_sha256
-from projections.database import rebuild, tail
-from projections.database.connection import Targets, connect
-from projections.database.embedded import EmbeddedServer
-from projections.model.fold import fold_log, parse_events
-from projections.serve import Answerer, Pools
-from projections.settings import Settings
+from eventsrc.record.append import check_payloads
+from eventsrc.record.robot.acks import payload_sha256
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log, parse_events
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets, connect
+from projections.postgres.embedded import EmbeddedServer
+from projections.surfaces.serve import Answerer, Pools
 from scripts.projections_bench.world import KEY, World
 from tests.cpu_time import family_cpu_seconds
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.ingest import Accepted, ingest_all
+from eventsrc.envelope.ingest import Accepted, ingest_all
 from eventsrc.log import LogReader
-from projections.calibrate.rounds import calibrate
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.localize.calibrate.rounds import calibrate
 from tests.bench.truth.calibrating import calibrated_settings, calibration_table
 from tests.bench.truth.scoring import ObjectScores
 from tests.bench.truth.tables import Row

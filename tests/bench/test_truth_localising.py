@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from projections import relocalize
-from projections.evaluate.questions import Question, spread
-from projections.evaluate.trials import Trial
-from projections.relocalize import Answer, PoseHypothesis
+from projections.localize import relocalize
+from projections.localize.evaluate.questions import Question, spread
+from projections.localize.evaluate.trials import Trial
+from projections.localize.relocalize import Answer, PoseHypothesis
 from tests.bench.truth.localising import (
     LocaliseRow,
     Scores,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from projections.deltas import ObjectMissing, ObjectOrdinal, ObjectRelocated, RunOrdinal
+from projections.fold.deltas import ObjectMissing, ObjectOrdinal, ObjectRelocated, RunOrdinal
 from tests.bench.truth.moving import MovedScores, score_moved
 from tests.bench.truth.scoring import ObjectScores
 from tests.bench.truth.tables import Row, moved_table

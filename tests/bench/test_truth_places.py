@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from projections.deltas import (
+from projections.fold.deltas import (
     KeyframeOrdinal,
     KeyframePlaced,
     PlaceFormed,
@@ -12,8 +12,8 @@ from projections.deltas import (
     PlaceOrdinal,
     PlacesMerged,
 )
-from projections.evaluate.truth import Truth
-from projections.model.view import MapView
+from projections.localize.evaluate.truth import Truth
+from projections.map.view import MapView
 from tests.bench.truth.places import PlaceScores, PlacesRow, places_table, score_places
 from tests.bench.truth_cases import hand_made
 

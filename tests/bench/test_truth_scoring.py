@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import ObjectEstimated, ObjectOrdinal, Pose
+from projections.fold.deltas import ObjectEstimated, ObjectOrdinal, Pose
 from tests.bench.truth.scoring import (
     ObjectScores,
     count_spots,

@@ -1,7 +1,7 @@
 """Scores of places' types in ``scripts/bench_truth --types``."""
 
-from projections.evaluate.truth import Truth, read_truth
-from projections.model.view import MapView
+from projections.localize.evaluate.truth import Truth, read_truth
+from projections.map.view import MapView
 from tests.bench.truth.place_types import TypedPlace, TypesRow, typed_places, types_table
 from tests.envelopes import detection, envelope
 from tests.folds import fold

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from projections.evaluate.truth import TrueKeyframe, Truth
-from projections.settings import Camera, Settings
+from projections.fold.settings import Camera, Settings
+from projections.localize.evaluate.truth import TrueKeyframe, Truth
 from tests.bench.truth.folding import fold_timed
 from tests.bench.truth.places import places_row, places_table
 from tests.bench.truth.walls import Walls, _walled, world_names, world_walls

@@ -4,7 +4,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from projections.settings import Camera, Settings
+from projections.fold.settings import Camera, Settings
 from tests.bench.truth.folding import fold_timed
 from tests.bench.truth.worlds import NoWorldsError, load_generator, make_case, pairs
 from tests.bench.truth_cases import trial_generator

@@ -22,11 +22,11 @@ from typing import TypeVar
 import numpy as np
 
 from eventsrc.log import LogReader, LogWriter, parse_fsync
+from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.whatif import what_if
-from projections.model.fold import fold_log
-from projections.model.snapshot_cache import SnapshotCache
-from projections.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.snapshot_cache import SnapshotCache
 
 ROOMS = [(4.0 * column, 3.5 * row) for row in range(4) for column in range(5)]
 CLASSES = ["chair", "cup", "lamp", "desk", "picture", "tv", "couch", "plant"]

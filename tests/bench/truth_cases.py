@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from types import ModuleType
 
-from eventsrc.envelope import DetId
-from projections.deltas import (
+from eventsrc.envelope.model import DetId
+from projections.fold.deltas import (
     Delta,
     KeyframeAdded,
     KeyframeOrdinal,
@@ -17,9 +17,9 @@ from projections.deltas import (
     RunOrdinal,
     RunSeen,
 )
-from projections.evaluate.truth import TrueKeyframe, Truth
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.localize.evaluate.truth import TrueKeyframe, Truth
+from projections.map.view import MapView
 from tests.bench.truth.worlds import load_generator
 from tests.shared_data import WORLDS, skip_without
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import psycopg
 
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
 from tests.rows import all_rows
 from tests.thorough import stride
 

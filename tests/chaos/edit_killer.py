@@ -19,18 +19,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.commands import Command
-from eventsrc.envelope import Offset
-from eventsrc.errors import TransportError
+from eventsrc.base.errors import TransportError
+from eventsrc.envelope.commands import Command
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.recorder.edits import send_command
-from eventsrc.transport.session import Router, ZenohOptions, open_session
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.database.status import projection_status
-from projections.errors import DatabaseError
-from projections.model.log_commands import read_commands
-from projections.settings import Settings
+from eventsrc.record.recorder.edits import send_command
+from eventsrc.record.transport.session import Router, ZenohOptions, open_session
+from projections.fold.errors import DatabaseError
+from projections.fold.settings import Settings
+from projections.map.log_commands import read_commands
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.status import projection_status
 from tests.commands_in_logs import forget_keyframes, keep_apart, name_place, undo
 from tests.envelopes import payload
 from tests.fixtures_zenoh import LOOPBACK, MAPFOLD, Program

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from projections.database import rebuild
-from projections.database.connection import Targets
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
 from tests.chaos.crash_driver import SETTINGS, Bomb
 from tests.rows import all_rows
 from tests.thorough import stride

@@ -33,18 +33,18 @@ from itertools import count
 from pathlib import Path
 from typing import Self
 
-from eventsrc.commands import Command, parse_command
-from eventsrc.envelope import Offset
-from eventsrc.errors import TransportError
+from eventsrc.base.errors import TransportError
+from eventsrc.envelope.commands import Command, parse_command
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log.format import list_segments
-from eventsrc.recorder.edits import send_command
-from eventsrc.robot.acks import Ack, ack_key, payload_sha256
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.system_events import COMMAND_KEY
-from eventsrc.transport.session import Received, Router, ZenohOptions, open_session
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from eventsrc.record.recorder.edits import send_command
+from eventsrc.record.robot.acks import Ack, ack_key, payload_sha256
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, Router, ZenohOptions, open_session
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
 from tests.commands_in_logs import name_place
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import LOOPBACK, MAPFOLD, Program

@@ -11,8 +11,8 @@ import json
 import sys
 from pathlib import Path
 
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
 from tests.chaos.crash_driver import SETTINGS, killed_at
 from tests.chaos.rebuild_killer import torn
 from tests.rows import all_rows

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.database.connection import Targets
+from projections.postgres.connection import Targets
 
 from .edit_killer import Ordeal
 

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from projections.database.embedded import EmbeddedServer
-from projections.fleet.cluster import ClusterError, DaskCluster
-from projections.fleet.engine import RETRIES
-from projections.fleet.replaying import ReplayRequest, replay_site
-from projections.fleet.site_databases import SiteDatabases
-from projections.fleet.sites import Site
+from projections.adapters.fleet.cluster import ClusterError, DaskCluster
+from projections.adapters.fleet.engine import RETRIES
+from projections.adapters.fleet.replaying import ReplayRequest, replay_site
+from projections.adapters.fleet.site_databases import SiteDatabases
+from projections.adapters.fleet.sites import Site
+from projections.postgres.embedded import EmbeddedServer
 from scripts.fleet_bench.killing import killed
 from scripts.fleet_bench.speed import dask_cluster, make_sites
 from tests.envelopes import envelope

@@ -15,13 +15,13 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.database import RebuildProgress, rebuild
-from projections.database.connection import Targets, connect, describe_target
-from projections.database.embedded import EmbeddedServer
-from projections.database.loader import CopyLoader, Load, TypeName
-from projections.database.vector_sink import VectorShadow
-from projections.errors import DatabaseError, DatabaseUnavailable
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError, DatabaseUnavailable
+from projections.fold.settings import Settings
+from projections.postgres import RebuildProgress, rebuild
+from projections.postgres.connection import Targets, connect, describe_target
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.loader import CopyLoader, Load, TypeName
+from projections.postgres.vector_sink import VectorShadow
 from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
@@ -48,8 +48,8 @@ def log(tmp_path: Path) -> Path:
 def in_small_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread write while the fold goes on, also for a small log."""
     # The package's name for it is the function.
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "STREAM_ROWS", 20)
-    monkeypatch.setattr(sys.modules["projections.database.rebuild"], "TICK_EVENTS", 8)
+    monkeypatch.setattr(sys.modules["projections.postgres.shadows"], "STREAM_ROWS", 20)
+    monkeypatch.setattr(sys.modules["projections.postgres.rebuild"], "TICK_EVENTS", 8)
 
 
 def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress], None]:

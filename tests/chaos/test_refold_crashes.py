@@ -8,11 +8,11 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.database.embedded import EmbeddedServer
-from projections.errors import DatabaseUnavailable
-from projections.settings import Settings
+from projections.fold.errors import DatabaseUnavailable
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.embedded import EmbeddedServer
 from tests import prefork
 from tests.commands_in_logs import (
     append_command,

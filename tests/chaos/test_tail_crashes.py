@@ -12,12 +12,12 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.database import TailProgress, TailReport, checkpoints, rebuild, tail
-from projections.database.connection import Connection, Targets, connect
-from projections.database.embedded import EmbeddedServer
-from projections.database.sink import Checkpoint, SinkName
-from projections.errors import CheckpointMoved, DatabaseUnavailable
-from projections.settings import Settings
+from projections.fold.errors import CheckpointMoved, DatabaseUnavailable
+from projections.fold.settings import Settings
+from projections.postgres import TailProgress, TailReport, checkpoints, rebuild, tail
+from projections.postgres.connection import Connection, Targets, connect
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.sink import Checkpoint, SinkName
 from tests import prefork
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
@@ -155,7 +155,7 @@ def test_commits_lost_while_no_event_comes_are_written_again(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The heartbeat finds the connection lost; there is no batch to compare with."""
-    monkeypatch.setattr(sys.modules["projections.database.tail_pass"], "HEARTBEAT_S", 0.0)
+    monkeypatch.setattr(sys.modules["projections.postgres.tail_pass"], "HEARTBEAT_S", 0.0)
     log = write_log(tmp_path / "log", walk(40))
     progress, stop, lost = TailProgress(), threading.Event(), threading.Event()
 
@@ -200,7 +200,7 @@ def test_a_connection_cut_again_while_the_checkpoint_is_read(
             cuts.append(None)
             cut_connections(one_database.graph_url)
 
-    monkeypatch.setattr("projections.database.checkpoints.load", cut_first)
+    monkeypatch.setattr("projections.postgres.checkpoints.load", cut_first)
     report = tail(log, one_database, SETTINGS, once=True, batch_events=10, on_batch=cut)
     assert (report.next_offset, len(cuts)) == (40, again + 1)
 
@@ -215,7 +215,7 @@ def test_a_new_pass_waits_for_a_database_that_is_away(
         if report.next_offset == 30 and not report.restarts:
             cut_connections(one_database.graph_url)
             rebuild(log, one_database, SETTINGS, until=13)
-            monkeypatch.setattr("projections.database.checkpoints.create", cut_first)
+            monkeypatch.setattr("projections.postgres.checkpoints.create", cut_first)
 
     def cut_first(*args: Any) -> None:
         if len(cuts) < 2:

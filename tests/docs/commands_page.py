@@ -10,10 +10,10 @@ from typing import Any
 
 import typer
 
-from projections.cli import command_line
+from projections.surfaces.cli import command_line
 
 PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
-MAN_PAGE = Path(__file__).parents[2] / "projections" / "cli" / "mapfold.1"
+MAN_PAGE = Path(__file__).parents[2] / "projections" / "surfaces" / "cli" / "mapfold.1"
 
 HEAD = """\
 # Commands

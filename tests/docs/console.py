@@ -29,7 +29,7 @@ from tests.servers import furnish
 ROOT: Final = Path(__file__).resolve().parents[2]
 HOME_OF_DOCS: Final = "/home/you/mapfold"
 _DEMO: Final = """#!/usr/bin/env bash
-PATH=/usr/bin:/bin exec .venv/bin/python -m projections.cli demo "$@"
+PATH=/usr/bin:/bin exec .venv/bin/python -m projections.surfaces.cli demo "$@"
 """
 _MARK: Final = "@@ command ended with"
 _TIMEOUT_S: Final = 240

@@ -5,10 +5,10 @@ python -m tests.docs.places_picture        draws it again
 
 from pathlib import Path
 
-from projections.deltas import PlacesMerged
-from projections.reducers.core_index import CoreIndex, cell_side_um
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.places import Places
+from projections.fold.core_index import CoreIndex, cell_side_um
+from projections.fold.deltas import PlacesMerged
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.places import Places
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "place-merge.svg"
 EPS_UM, LEAST = 1_500_000, 3

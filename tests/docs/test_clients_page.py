@@ -12,15 +12,15 @@ from typing import Any
 
 import pytest
 
-from eventsrc.transport.config import DEFAULT_ENDPOINT
-from eventsrc.transport.session import Session
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools, ZenohService
-from projections.serve.guard import Guard
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
-from projections.serve.metrics import ServiceMetrics
-from projections.serve.states import DEFAULT_PAGE, MAX_PAGE
+from eventsrc.record.transport.config import DEFAULT_ENDPOINT
+from eventsrc.record.transport.session import Session
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.surfaces.serve.guard import Guard
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
+from projections.surfaces.serve.metrics import ServiceMetrics
+from projections.surfaces.serve.states import DEFAULT_PAGE, MAX_PAGE
 from tests.described_maps import RUN
 from tests.docs.console import ROOT
 

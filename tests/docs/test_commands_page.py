@@ -10,8 +10,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from eventsrc.transport.config import DEFAULT_ENDPOINT
-from projections.cli import command_line
+from eventsrc.record.transport.config import DEFAULT_ENDPOINT
+from projections.surfaces.cli import command_line
 from tests.docs.commands_page import MAN_PAGE, PAGE, commands, man_page, page
 
 

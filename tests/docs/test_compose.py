@@ -8,7 +8,7 @@ import pytest
 import typer
 import yaml
 
-from projections.cli import command_line
+from projections.surfaces.cli import command_line
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE = ROOT / "docker" / "compose.yaml"

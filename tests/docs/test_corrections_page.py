@@ -3,8 +3,8 @@ documents."""
 
 import re
 
-from eventsrc.commands import KINDS, MAX_COMMAND_BYTES, MAX_REASON
-from eventsrc.trajectory import MAX_POSES
+from eventsrc.envelope.commands import KINDS, MAX_COMMAND_BYTES, MAX_REASON
+from eventsrc.envelope.trajectory import MAX_POSES
 from projections.edit.poses import DEFAULT_SLACK_S
 from tests.docs.console import ROOT
 

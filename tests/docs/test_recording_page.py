@@ -6,24 +6,18 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from eventsrc.envelope import (
-    MAX_DEPTH_M,
-    MAX_POSITION_M,
-    Detection,
-    Envelope,
-    EnvelopeCamera,
-)
-from eventsrc.grid_messages import is_grid_message, read_grid_message
-from eventsrc.ingest import Accepted, ingest
-from eventsrc.metrics import serving_metrics
-from eventsrc.occupancy_map import decode_map
-from eventsrc.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
-from eventsrc.recorder.queue import DEFAULT_QUEUE_BYTES
-from eventsrc.robot.sender import WINDOW
-from eventsrc.robot.spool import DEFAULT_SPOOL_BYTES
+from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.envelope.model import MAX_DEPTH_M, MAX_POSITION_M, Detection, Envelope, EnvelopeCamera
+from eventsrc.envelope.occupancy_map import decode_map
+from eventsrc.record.metrics import serving_metrics
+from eventsrc.record.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
+from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES
+from eventsrc.record.robot.sender import WINDOW
+from eventsrc.record.robot.spool import DEFAULT_SPOOL_BYTES
+from eventsrc.record.transport.config import DEFAULT_ENDPOINT
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from eventsrc.ros.stream import Counts
-from eventsrc.transport.config import DEFAULT_ENDPOINT
-from eventsrc.transport.session import ZenohOptions, open_session
 from tests.fixtures_zenoh import Program, scrape
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogReader, verify_log
-from eventsrc.robot.acks import payload_sha256
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
+from eventsrc.record.robot.acks import payload_sha256
 
 Keyframe = tuple[str, int]
 """Run and keyframe id."""

@@ -19,9 +19,9 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from eventsrc.robot.acks import Ack, payload_sha256
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, ZenohOptions, open_session
+from eventsrc.record.robot.acks import Ack, payload_sha256
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, ZenohOptions, open_session
 from tests.envelopes import detection, envelope
 
 DIM = 512

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from eventsrc.robot.acks import payload_sha256
+from eventsrc.record.robot.acks import payload_sha256
 from tests.envelopes import envelope, payload
 
 from .comparison import compare, read_published

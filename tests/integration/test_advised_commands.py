@@ -13,11 +13,11 @@ import pytest
 import typer
 from psycopg.conninfo import conninfo_to_dict
 
-from eventsrc.advised import advised, complete_by
+from eventsrc.base.advised import advised, complete_by
 from eventsrc.log import LogWriter
-from projections.cli import COMMANDS, command_line
-from projections.cli.in_force import _command
-from projections.database.connection import Targets, check_url, url_without_secrets
+from projections.postgres.connection import Targets, check_url, url_without_secrets
+from projections.surfaces.cli import COMMANDS, command_line
+from projections.surfaces.cli.in_force import _command
 from tests.commands import Commands, Said
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import flip
@@ -57,8 +57,8 @@ def test_no_message_has_a_command_line_of_its_own() -> None:
         if ADVICE.search(text)
     ]
     named = {
-        "projections/cli/recording.py": 1,  # "taking commands of `mapfold edit`"
-        "projections/demo/report.py": 1,  # what the demo ran
+        "projections/surfaces/cli/recording.py": 1,  # "taking commands of `mapfold edit`"
+        "projections/surfaces/demo/report.py": 1,  # what the demo ran
     }
     others = [each for each in found if each.split(":")[0] not in named]
     assert not others, "\n".join(others)

@@ -12,11 +12,11 @@ from pathlib import Path
 import mapfold as public
 import pytest
 
-from eventsrc.errors import LogNotFound, MisuseError
-from projections import api
-from projections.api import Map, Timeline, fold, open_log, relocalize
-from projections.errors import QuestionError, SettingsError
+from eventsrc.base.errors import LogNotFound, MisuseError
+from projections.fold.errors import QuestionError, SettingsError
 from projections.history import NoSuchThing
+from projections.surfaces import python as api
+from projections.surfaces.python import Map, Timeline, fold, open_log, relocalize
 from tests import prefork
 from tests.commands import TIMEOUT_S, Commands
 from tests.envelopes import detection, envelope
@@ -44,7 +44,7 @@ def test_examples_of_docstrings_give_what_they_show(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    module = import_module(f"projections.api.{name}")
+    module = import_module(f"projections.surfaces.python.{name}")
     names = {each: getattr(api, each) for each in api.__all__}
     found = doctest.testmod(module, extraglobs=names)
     assert (found.failed, found.attempted > 0) == (0, True)

@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
+from eventsrc.envelope.system_events import EXCERPT_BYTES, RejectedPayload
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.mcap_records import MAGIC
-from eventsrc.system_events import EXCERPT_BYTES, RejectedPayload
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log
 from tests.memory import MOST_MIB, run_measured

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
 from eventsrc.log import LogReader, LogWriter, recover_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal as _seal

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader, LogWriter
-from projections.calibrate.rounds import calibrate
-from projections.evidence import EvidenceConstants
-from projections.model.log_commands import read_corrections
-from projections.settings import Settings
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import Settings
+from projections.localize.calibrate.rounds import calibrate
+from projections.map.log_commands import read_corrections
 from tests.commands import Commands
 from tests.envelopes import envelope
 from tests.fixtures_zenoh import Program

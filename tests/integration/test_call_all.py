@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from projections.evaluate import parallel
-from projections.evaluate.parallel import call_all
-from projections.worker_process import ProcessGone
+from eventsrc.base.worker_process import ProcessGone
+from projections.localize.evaluate import parallel
+from projections.localize.evaluate.parallel import call_all
 from tests.thorough import mostly_slow
 
 COUNT = 400

@@ -6,14 +6,14 @@ from typing import Any
 import psycopg
 import pytest
 
-from eventsrc.commands import UseSettings
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.errors import ProjectionMismatch, QuestionError
-from projections.queries.relocalize import CandidateReader
-from projections.relocalize import Crop, ExactIndex, MapConstants, read_crops
-from projections.relocalize import candidates as candidates_module
-from projections.settings import Settings
+from eventsrc.envelope.commands import UseSettings
+from projections.fold.errors import ProjectionMismatch, QuestionError
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Crop, ExactIndex, MapConstants, read_crops
+from projections.localize.relocalize import candidates as candidates_module
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.queries.relocalize import CandidateReader
 from tests.candidates import assert_equal, view_under_commands
 from tests.commands_in_logs import append_command, command, forget_keyframes
 from tests.flickering_house import flickering_house
@@ -85,8 +85,8 @@ def test_a_sample_of_a_large_map_is_the_same_in_both(
     targets: Targets,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("projections.relocalize.constants.SAMPLED", 64)
-    monkeypatch.setattr("projections.queries.known_constants.SAMPLED", 64)
+    monkeypatch.setattr("projections.localize.relocalize.constants.SAMPLED", 64)
+    monkeypatch.setattr("projections.postgres.queries.known_constants.SAMPLED", 64)
     log = tmp_path / "log"
     with_new = []
     for start in range(0, 200, 50):
@@ -126,7 +126,7 @@ class TestClasses:
         value: int,
     ) -> None:
         monkeypatch.setattr(candidates_module, bound, value)
-        for module in (candidates_module.__name__, "projections.queries.candidates"):
+        for module in (candidates_module.__name__, "projections.postgres.queries.candidates"):
             monkeypatch.setattr(f"{module}.OBSERVATIONS_OF_EACH", 3)
         rebuild(log, targets, Settings())
         view = view_under_commands(log)

@@ -9,18 +9,18 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from eventsrc.errors import MisuseError
-from projections.database.connection import (
+from eventsrc.base.errors import MisuseError
+from projections.fold.errors import DatabaseUnavailable, ExtensionMissing
+from projections.postgres.connection import (
     Targets,
     connect,
     describe_target,
     ensure_extension,
     open_targets,
 )
-from projections.database.cypher import connect_for_cypher
-from projections.database.embedded import EmbeddedServer
-from projections.errors import DatabaseUnavailable, ExtensionMissing
-from projections.queries.relocalize import CandidateReader
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.queries.relocalize import CandidateReader
 
 
 @pytest.fixture(autouse=True)
@@ -88,8 +88,8 @@ def test_errors_of_the_embedded_server_do_not_mention_urls(
 
 CUT = """
 import sys
-from projections.database.connection import connect, database_errors
-from projections.errors import DatabaseUnavailable
+from projections.postgres.connection import connect, database_errors
+from projections.fold.errors import DatabaseUnavailable
 url = sys.argv[1]
 with connect(url, autocommit=True) as killer, connect(url) as connection:
     try:

@@ -16,7 +16,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.embedded import EmbeddedServer
 from tests.commands import PROGRAM, Commands
 from tests.envelopes import MODEL, detection, envelope
 from tests.logs import append_raw, walk, write_log

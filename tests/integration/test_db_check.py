@@ -7,14 +7,14 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from eventsrc.progress import send_progress_to
-from projections.database import checkpoints, rebuild, tail
-from projections.database.check import NAMED, check
-from projections.database.connection import Connection, Targets
-from projections.database.sink import Checkpoint, SinkName
-from projections.database.status import projection_status
-from projections.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
-from projections.settings import Settings
+from eventsrc.base.progress import send_progress_to
+from projections.fold.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
+from projections.fold.settings import Settings
+from projections.postgres import checkpoints, rebuild, tail
+from projections.postgres.check import NAMED, check
+from projections.postgres.connection import Connection, Targets
+from projections.postgres.sink import Checkpoint, SinkName
+from projections.postgres.status import projection_status
 from tests.commands import Commands
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.thorough import every_other, mostly_slow
@@ -186,7 +186,7 @@ def test_a_rebuild_beside_a_check_makes_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:
     """To the check's snapshot the tables of such a rebuild would be empty."""
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "LOCK_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.postgres.shadows"], "LOCK_TIMEOUT_S", 0.3)
     rebuild(log, one_database, SETTINGS)
     load = checkpoints.load
 

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogBusy, MapfoldError
+from eventsrc.base.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
-from eventsrc.transport.session import Router, ZenohOptions
-from projections.demo import progress
-from projections.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
-from projections.demo.recording import Children
+from eventsrc.record.transport.session import Router, ZenohOptions
+from projections.surfaces.demo import progress
+from projections.surfaces.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
+from projections.surfaces.demo.recording import Children
 from tests.fixtures_zenoh import Program
 
 STARTER = """
 import signal, sys
 from pathlib import Path
-from projections.demo.recording import Children
+from projections.surfaces.demo.recording import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))

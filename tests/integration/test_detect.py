@@ -12,26 +12,26 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from eventsrc.crops import MAX_CROP_BYTES, decode_crop
-from eventsrc.detector.encoder import Encoder, read_preparation
-from eventsrc.detector.finder import Finder, FinderOptions
-from eventsrc.detector.gate import GateLimits, KeyframeGate
-from eventsrc.detector.keyframes import CROP_SIDE, Keyframes
-from eventsrc.detector.live import LivePictures
-from eventsrc.detector.onnx_model import OnnxModel
-from eventsrc.detector.outputs import FileOutput
-from eventsrc.detector.poses import NoPoses
-from eventsrc.detector.service import Detection
-from eventsrc.detector.vision import decode, encode_jpeg, shrunk
-from eventsrc.envelope import RunId
-from eventsrc.ingest import Accepted, ingest
+from eventsrc.adapters.detector.encoder import Encoder, read_preparation
+from eventsrc.adapters.detector.finder import Finder, FinderOptions
+from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate
+from eventsrc.adapters.detector.keyframes import CROP_SIDE, Keyframes
+from eventsrc.adapters.detector.live import LivePictures
+from eventsrc.adapters.detector.onnx_model import OnnxModel
+from eventsrc.adapters.detector.outputs import FileOutput
+from eventsrc.adapters.detector.poses import NoPoses
+from eventsrc.adapters.detector.service import Detection
+from eventsrc.adapters.detector.vision import decode, encode_jpeg, shrunk
+from eventsrc.adapters.sim import build_house
+from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
+from eventsrc.envelope.crops import MAX_CROP_BYTES, decode_crop
+from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
-from eventsrc.sim import build_house
-from eventsrc.sim.pictures import camera_pictures, write_pictures
-from eventsrc.transport.session import Received, Session
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from eventsrc.record.transport.session import Received, Session
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
 from tests.camera_truth import truth_of
 from tests.commands import Commands
 from tests.fixtures_zenoh import DEADLINE_S, Program

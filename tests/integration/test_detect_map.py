@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.sim import build_house
+from eventsrc.adapters.sim import build_house
 from tests.camera_truth import truth_of
 from tests.commands import Commands
 from tests.tiny_models import models_for

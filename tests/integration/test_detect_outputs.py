@@ -4,11 +4,11 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from eventsrc.detector.keyframes import Crop, Keyframe
-from eventsrc.detector.outputs import CropSender, ZenohOutput
-from eventsrc.envelope import DetId
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, Session, ZenohOptions
+from eventsrc.adapters.detector.keyframes import Crop, Keyframe
+from eventsrc.adapters.detector.outputs import CropSender, ZenohOutput
+from eventsrc.envelope.model import DetId
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, Session, ZenohOptions
 
 NOBODY = ZenohOptions(connect=("tcp/127.0.0.1:9",))
 

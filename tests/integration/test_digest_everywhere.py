@@ -28,13 +28,13 @@ FOLD = """
 import hashlib, sys
 from pathlib import Path
 import numpy as np
-from eventsrc.ingest import ingest
+from eventsrc.envelope.ingest import ingest
 from eventsrc.log import Event
-from projections.model.digest import map_digest
-from projections.model.fold import READ_AHEAD, fold_events
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
-from projections.model.view import MapView
+from projections.map.digest import map_digest
+from projections.map.fold import READ_AHEAD, fold_events
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 from tests.thorough import stride
 
 settings = Settings(eps_m=0.75, min_samples=8, fusion=sys.argv[2], places=sys.argv[3])

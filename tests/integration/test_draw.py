@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
+from eventsrc.record.append import append_payload
 from tests.commands import Commands, Said
 from tests.simulated import simulated
 from tests.thorough import mostly_slow

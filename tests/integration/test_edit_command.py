@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import Command, NamePlace, parse_command
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.commands import Command, NamePlace, parse_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from projections.edit.current import CurrentMap
 from projections.edit.effect import Change, Effect, EffectCache, effect_of
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
 from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
 from tests.fixtures_log import flip, read_log

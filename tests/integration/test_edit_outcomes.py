@@ -6,16 +6,16 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     CorrectPoses,
     InvalidCommand,
     RigidTransform,
     Undo,
     parse_command,
 )
-from eventsrc.envelope import KeyframeId, RunId
+from eventsrc.envelope.model import KeyframeId, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
 from tests.fixtures_log import read_log

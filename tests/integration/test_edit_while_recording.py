@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.commands import Command, parse_command
+from eventsrc.envelope.commands import Command, parse_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from tests.commands import Commands
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, write_rooms
 from tests.envelopes import envelope, payload

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.commands import (
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.commands import (
     MAX_COMMAND_BYTES,
     Command,
     ForgetRun,
@@ -19,12 +20,17 @@ from eventsrc.commands import (
     encode_command,
     parse_command,
 )
-from eventsrc.envelope import RunId
-from eventsrc.errors import LogDamaged
+from eventsrc.envelope.model import RunId
+from eventsrc.envelope.system_events import COMMAND_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import Event, LogReader, LogWriter
-from eventsrc.recorder import Recorder
-from eventsrc.recorder.edit_requests import MAX_EDITS_WAITING, EditRequest, Edits, KnownCommands
-from eventsrc.recorder.edits import (
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.edit_requests import (
+    MAX_EDITS_WAITING,
+    EditRequest,
+    Edits,
+    KnownCommands,
+)
+from eventsrc.record.recorder.edits import (
     CommandRefused,
     NewerCommand,
     NoAnswer,
@@ -32,10 +38,9 @@ from eventsrc.recorder.edits import (
     edit_key,
     send_command,
 )
-from eventsrc.recorder.queue import MessageQueue
-from eventsrc.system_events import COMMAND_KEY, REJECTED_KEY, RejectedPayload
-from eventsrc.transport.session import Received, Session
-from projections.corrections import check_settings
+from eventsrc.record.recorder.queue import MessageQueue
+from eventsrc.record.transport.session import Received, Session
+from projections.fold.corrections import check_settings
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, Program
 

@@ -11,9 +11,9 @@ from typing import IO
 import psycopg
 import pytest
 
-from projections.database.connection import connect, database_errors
-from projections.database.embedded import EmbeddedServer
-from projections.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.postgres.connection import connect, database_errors
+from projections.postgres.embedded import EmbeddedServer
 from tests.prefork import Process, start
 from tests.servers import furnish
 from tests.thorough import mostly_slow
@@ -24,7 +24,7 @@ HOLDER = """
 import sys, signal
 # A shell that runs the tests in its background has its children ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from projections.cli.options import databases
+from projections.surfaces.cli.options import databases
 with databases(None, None) as targets:
     print(targets.graph_url, flush=True)
     sys.stdin.read()

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from eventsrc.ingest import Accepted
-from projections.cli.evaluate import evaluate as command
-from projections.errors import QuestionError
-from projections.evaluate import evaluate, parallel, read_truth
-from projections.settings import Settings
+from eventsrc.envelope.ingest import Accepted
+from projections.fold.errors import QuestionError
+from projections.fold.settings import Settings
+from projections.localize.evaluate import evaluate, parallel, read_truth
+from projections.surfaces.cli.evaluate import evaluate as command
 from tests.commands import Commands
 from tests.integration.test_evaluate_command import save
 from tests.relocalization.buildings import Building, Keyframe

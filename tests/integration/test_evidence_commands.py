@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from projections.settings import Settings
+from projections.fold.settings import Settings
 from tests.commands import Commands
 from tests.fixtures_timetravel import write_log
 from tests.rooms_with_things import drive

@@ -7,22 +7,22 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import DifferentObjects, SameObject
-from eventsrc.envelope import FIRST_OFFSET, Offset
+from eventsrc.envelope.commands import DifferentObjects, SameObject
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from projections import deltas as d
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.database.graph_render import expected_rows
-from projections.database.labels import LABELS
-from projections.database.loader import LoaderName
-from projections.model.fold import fold_events, fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.snapshot_cache import SnapshotCache
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold import deltas as d
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.fold import fold_events, fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.snapshot_cache import SnapshotCache
+from projections.map.view import MapView
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
+from projections.postgres.graph_render import expected_rows
+from projections.postgres.labels import LABELS
+from projections.postgres.loader import LoaderName
 from tests.commands_in_logs import append_command, command, forget_keyframes, undo
 from tests.flickering_house import flickering_house
 from tests.integration.test_projections import parsed

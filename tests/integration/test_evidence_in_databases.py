@@ -10,20 +10,20 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections import deltas as d
-from projections.database.checkpoints import ensure_schema
-from projections.database.connection import Connection, Targets, connect, pin_session_settings
-from projections.database.graph_sink import GraphSink
-from projections.database.loader import LoaderName
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.database.vector_sink import VectorSink
-from projections.model.changes import ChangeTracker
-from projections.model.records import ObjectRecord
-from projections.model.view import MapView
-from projections.queries.graph_reads import objects_near
-from projections.queries.map_queries import FoldedMap, LiveMap
-from projections.queries.relocalize import prepare_graph
-from projections.settings import Settings
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
+from projections.map.changes import ChangeTracker
+from projections.map.records import ObjectRecord
+from projections.map.view import MapView
+from projections.postgres.checkpoints import ensure_schema
+from projections.postgres.connection import Connection, Targets, connect, pin_session_settings
+from projections.postgres.graph_sink import GraphSink
+from projections.postgres.loader import LoaderName
+from projections.postgres.memory_sink import MemorySink, MemoryTables
+from projections.postgres.queries.graph_reads import objects_near
+from projections.postgres.queries.map_queries import FoldedMap, LiveMap
+from projections.postgres.queries.relocalize import prepare_graph
+from projections.postgres.vector_sink import VectorSink
 from tests.integration.test_projections import parsed
 from tests.rows import all_rows, expected_graph
 from tests.synthetic_objects import SyntheticDeltas, expected_rows, random_steps, without_sigma

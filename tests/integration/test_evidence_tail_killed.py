@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from projections.database import tail
-from projections.database.check import check
-from projections.database.checkpoints import has_schema, load
-from projections.database.connection import Targets, connect
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import tail
+from projections.postgres.check import check
+from projections.postgres.checkpoints import has_schema, load
+from projections.postgres.connection import Targets, connect
 from tests.commands import PROGRAM
 from tests.logs import write_log
 from tests.property.test_hostile_evidence import hostile_drive

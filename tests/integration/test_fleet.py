@@ -15,14 +15,14 @@ import pytest
 from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 
-from projections.database.connection import connect
-from projections.database.embedded import EmbeddedServer
-from projections.fleet.asking import ask_sites
-from projections.fleet.engine import Ended, Progress, Task
-from projections.fleet.replaying import ChosenSettings, ReplayRequest, replay_site
-from projections.fleet.site_databases import SiteDatabases, exists
-from projections.fleet.sites import Site
-from projections.relocalize import read_question
+from projections.adapters.fleet.asking import ask_sites
+from projections.adapters.fleet.engine import Ended, Progress, Task
+from projections.adapters.fleet.replaying import ChosenSettings, ReplayRequest, replay_site
+from projections.adapters.fleet.site_databases import SiteDatabases, exists
+from projections.adapters.fleet.sites import Site
+from projections.localize.relocalize import read_question
+from projections.postgres.connection import connect
+from projections.postgres.embedded import EmbeddedServer
 from tests.commands import Commands
 from tests.fleets import extend, fleet_databases, write_sites, wrong_rows
 from tests.integration.test_time_travel_commands import InProcess
@@ -84,7 +84,9 @@ def in_process(
     Under scripts/test_slow workers of `LocalPool` run the tasks.
     """
     if not THOROUGH:
-        monkeypatch.setattr("projections.cli.fleet_options.LocalPool", lambda _: OneProcess())
+        monkeypatch.setattr(
+            "projections.surfaces.cli.fleet_options.LocalPool", lambda _: OneProcess()
+        )
     monkeypatch.setenv("MAPFOLD_DB", fleet.template)
     return InProcess(fleet.sites.parent, capfd)
 

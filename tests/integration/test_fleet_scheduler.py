@@ -9,8 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from projections.fleet import cluster
-from projections.fleet.cluster import ClusterError, DaskCluster
+from projections.adapters.fleet import cluster
+from projections.adapters.fleet.cluster import ClusterError, DaskCluster
 
 FRAME = (17).to_bytes(8, "little") + (1).to_bytes(8, "little") + (1).to_bytes(8, "little")
 OTHERS = {

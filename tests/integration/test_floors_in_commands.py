@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from projections.edit import make as m
 from projections.edit.conflicts import EditRefused
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.settings import Settings
 from tests.commands import Commands
 from tests.corrected_logs import make
 from tests.logs import write_log

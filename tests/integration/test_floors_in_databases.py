@@ -6,11 +6,11 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.errors import ProjectionMismatch
-from projections.settings import Settings
+from projections.fold.errors import ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
 from tests.integration.test_projections import parsed, view_of
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows, expected_graph, graph_rows

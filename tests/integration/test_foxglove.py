@@ -16,12 +16,12 @@ from mcap.reader import make_reader
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.corrections import NO_CORRECTIONS
-from projections.foxglove.playback import PastMaps, Playback
-from projections.model.moments import Moments
-from projections.settings import Settings
+from projections.adapters.foxglove.playback import PastMaps, Playback
+from projections.fold.corrections import NO_CORRECTIONS
+from projections.fold.settings import Settings
+from projections.map.moments import Moments
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.logs import write_log

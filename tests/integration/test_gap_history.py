@@ -7,22 +7,22 @@ from typing import Any
 
 import pytest
 
-from eventsrc import gap_history as ledger_module
-from eventsrc.append import append_payload
-from eventsrc.errors import LogDamaged
-from eventsrc.gap_history import (
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.gaps import Gap, GapLedger
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
+from eventsrc.log import NEVER, Event, LogReader, LogWriter, recover, recover_log
+from eventsrc.log import seal as _parts
+from eventsrc.log.format import LEDGER
+from eventsrc.record import gap_history as ledger_module
+from eventsrc.record.append import append_payload
+from eventsrc.record.gap_history import (
     fold_and_save_ledger,
     fold_ledger,
     ledger_of,
     save_ledger,
     unread_events,
 )
-from eventsrc.gaps import Gap, GapLedger
-from eventsrc.log import NEVER, Event, LogReader, LogWriter, recover, recover_log
-from eventsrc.log import seal as _parts
-from eventsrc.log.format import LEDGER
-from eventsrc.log_info import log_info
-from eventsrc.system_events import LOSS_KEY, Loss
+from eventsrc.record.log_info import log_info
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import BY_HAND, flip
 

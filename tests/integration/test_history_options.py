@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.history.timeline_cache import MIN_EVENTS
+from projections.store.timeline_cache import MIN_EVENTS
 from tests.commands import Commands
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.append import append_payload
-from eventsrc.errors import TransportError
-from eventsrc.ingest import DEFAULT_MAX_PAYLOAD_BYTES
+from eventsrc.base.errors import TransportError
+from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from eventsrc.log import LogReader, LogWriter, verify_log
-from eventsrc.log_info import log_info
-from eventsrc.recorder import Recorder
-from eventsrc.robot.acks import Refusals, refusal_key
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
-from eventsrc.transport.session import Received, Session
+from eventsrc.record.append import append_payload
+from eventsrc.record.log_info import log_info
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.robot.acks import Refusals, refusal_key
+from eventsrc.record.transport.session import Received, Session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S
 from tests.thorough import rounds
@@ -27,9 +27,9 @@ LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
 
 PANIC = """
 import sys
-from eventsrc.transport.session import ZenohOptions, open_session
-from eventsrc.transport.errors import transport_errors
-from eventsrc.errors import TransportError
+from eventsrc.record.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.errors import transport_errors
+from eventsrc.base.errors import TransportError
 
 session = open_session(ZenohOptions(connect=(sys.argv[1],)), mode="client")
 for _ in range(2):  # from the second on a lock of Zenoh's is poisoned

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
+from eventsrc.record.append import append_payload
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope, payload
 from tests.unit.test_text_escaping import control_characters

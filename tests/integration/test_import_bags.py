@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogReader
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
 from tests import ros_messages as ros
 from tests.commands import Commands
 from tests.fixtures_log import read_log

@@ -10,8 +10,13 @@ from typing import Any
 import pytest
 import zstandard
 
-from eventsrc.errors import MapfoldError, MisuseError
-from eventsrc.system_events import EXCERPT_BYTES, MAX_KEPT_BYTES, REJECTED_KEY, RejectedPayload
+from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.envelope.system_events import (
+    EXCERPT_BYTES,
+    MAX_KEPT_BYTES,
+    REJECTED_KEY,
+    RejectedPayload,
+)
 from tests import ros_messages as ros
 from tests.fixtures_log import read_log
 from tests.imported_bags import DRIVE, envelopes, imported

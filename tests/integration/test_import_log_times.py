@@ -6,10 +6,10 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.importers.log_times import CLOCK_SET_NS, TOGETHER_NS, LogTimes
+from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import verify_log
-from eventsrc.log_info import log_info
-from eventsrc.system_events import REJECTED_KEY
+from eventsrc.record.importers.log_times import CLOCK_SET_NS, TOGETHER_NS, LogTimes
+from eventsrc.record.log_info import log_info
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from eventsrc.envelope.occupancy_map import decode_map
+from eventsrc.envelope.system_events import (
+    MAP_KEY,
+    REJECTED_KEY,
+    OccupancyMapEvent,
+    RejectedPayload,
+)
 from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
-from eventsrc.occupancy_map import decode_map
-from eventsrc.system_events import MAP_KEY, REJECTED_KEY, OccupancyMapEvent, RejectedPayload
-from eventsrc.transport.session import Session
+from eventsrc.record.transport.session import Session
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY, flip, read_log

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.importers import ImportInterrupted, ImportReport, import_files
 from eventsrc.log import LogWriter
-from projections.cli.signals import ctrl_c_between_steps
+from eventsrc.record.importers import ImportInterrupted, ImportReport, import_files
+from projections.surfaces.cli.signals import ctrl_c_between_steps
 from tests.commands import PROGRAM, TIMEOUT_S, Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

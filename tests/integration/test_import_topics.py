@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from eventsrc.importers.topics import TopicChoice, looks_like_envelope
+from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import Event, LogWriter
-from eventsrc.system_events import REJECTED_KEY
+from eventsrc.record.importers.topics import TopicChoice, looks_like_envelope
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

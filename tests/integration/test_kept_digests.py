@@ -10,13 +10,13 @@ from unittest.mock import patch
 import pytest
 
 from eventsrc.log import LogReader
-from projections.corrections import NO_CORRECTIONS
+from projections.fold.corrections import NO_CORRECTIONS
 from projections.history import Timeline
-from projections.history.timeline_cache import MOST_DIGESTS
-from projections.model.digest import map_digest
-from projections.model.fold import fold_events, fold_log
-from projections.model.space_vectors import new_map
-from projections.model.view import MapView
+from projections.map.digest import map_digest
+from projections.map.fold import fold_events, fold_log
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+from projections.store.timeline_cache import MOST_DIGESTS
 from tests.fixtures_timetravel import write_log
 from tests.history_process import RULES
 from tests.integration.test_timeline_cache_attacked import EVENTS, drive
@@ -49,7 +49,7 @@ def test_the_second_who_asks_gets_the_digest_that_was_kept(log: Path) -> None:
     assert not files(log)
     assert digests(log, ENDS) == right
     assert len(files(log)) == len(ENDS)
-    with patch("projections.model.digest._computed", none_is_computed):
+    with patch("projections.map.digest._computed", none_is_computed):
         assert digests(log, ENDS) == right
         with pytest.raises(AssertionError, match="a digest is computed"):
             digests(log, [51])
@@ -65,7 +65,7 @@ def test_a_map_that_was_folded_on_has_a_digest_of_its_own(log: Path) -> None:
                 view.apply_event(folded.offset, folded.deltas)
         with (
             pytest.raises(AssertionError),
-            patch("projections.model.digest._computed", none_is_computed),
+            patch("projections.map.digest._computed", none_is_computed),
         ):
             map_digest(view)
         assert map_digest(view) == map_digest(fold_log(reader, RULES)[1])
@@ -88,5 +88,5 @@ def test_a_damaged_digest_is_named_and_computed_again(log: Path) -> None:
     with kept_early(), Timeline(log, RULES, note=notes.append) as timeline:
         assert map_digest(timeline.at(50)) == right[0]
     assert notes == [f"{path} is not used: its checksum does not match"]
-    with patch("projections.model.digest._computed", none_is_computed):
+    with patch("projections.map.digest._computed", none_is_computed):
         assert digests(log, [50]) == right

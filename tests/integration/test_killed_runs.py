@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.database.embedded import EmbeddedServer
+from projections.postgres.embedded import EmbeddedServer
 from tests.killed_runs import hold_run, remove_killed_runs
 from tests.servers import furnish
 

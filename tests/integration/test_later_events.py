@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import Reembed, UseSettings
-from eventsrc.envelope import DetId
+from eventsrc.envelope.commands import Reembed, UseSettings
+from eventsrc.envelope.model import DetId
+from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
-from projections.reducers.objects import object_id
+from projections.fold.objects import object_id
 from tests.commands import Commands
 from tests.commands_in_logs import append_command, command, forget_run, keep_apart
 from tests.corrected_logs import EVENTS, LEFT, documents

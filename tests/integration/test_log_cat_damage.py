@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import LogReader, LogWriter
-from projections.cli.event_text import iso_time
+from projections.surfaces.cli.event_text import iso_time
 from tests.commands import Commands
 from tests.fixtures_log import BY_HAND, KEY, envelope, flip
 

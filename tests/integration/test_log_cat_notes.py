@@ -4,7 +4,7 @@ keys without events."""
 import pytest
 
 from eventsrc.log import LogWriter
-from projections.cli.event_text import iso_time
+from projections.surfaces.cli.event_text import iso_time
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope
 

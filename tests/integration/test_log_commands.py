@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import recover_log
 from tests.commands import Commands
 from tests.envelopes import envelope, payload

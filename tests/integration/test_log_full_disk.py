@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import LogWriter
 from tests.fixtures_log import read_log
 from tests.thorough import mostly_slow
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 FILL = """
 import resource, sys
 from pathlib import Path
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import LogWriter, parse_fsync
 
 resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
@@ -91,7 +91,7 @@ def test_a_failed_seal_loses_nothing(log_path: Path) -> None:
     program = """
 import random, resource, sys
 from pathlib import Path
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import LogWriter
 
 writer = LogWriter(Path(sys.argv[1]), rotate_events=50)

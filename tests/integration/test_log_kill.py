@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.envelope.model import FIRST_OFFSET
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import Event, LogReader, LogWriter, NewEvent, follow, recover_log, verify_log
 from eventsrc.log.format import list_segments
-from eventsrc.system_events import LOSS_KEY
-from projections.model.digest import map_digest
-from projections.model.fold import fold_event, fold_log
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_event, fold_log
+from projections.map.view import MapView
 from tests.chaos.log_killer import LONGEST_LIFE_S, lives
 from tests.fixtures_log import flip
 from tests.thorough import THOROUGH

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
 from eventsrc.log import ALWAYS, LogWriter, seal_worker, verify_log
 from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.mcap_records import MARK_BYTES

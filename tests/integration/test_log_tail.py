@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, LogError, LogNotFound
+from eventsrc.base.errors import LogDamaged, LogError, LogNotFound
 from eventsrc.log import Event, LogReader, LogWriter, follow
 from eventsrc.log.format import SEALED_END
 from eventsrc.log.mcap_records import MARK_BYTES

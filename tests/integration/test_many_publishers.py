@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from eventsrc.robot.acks import ack_key
-from eventsrc.transport.session import Received, Session, ZenohOptions, open_session
+from eventsrc.record.robot.acks import ack_key
+from eventsrc.record.transport.session import Received, Session, ZenohOptions, open_session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.thorough import mostly_slow

@@ -10,17 +10,17 @@ import numpy as np
 import psycopg
 import pytest
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.occupancy_map import OccupancyMap
-from eventsrc.system_events import MAP_KEY
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.errors import DatabaseError
-from projections.model.fold import fold_log
-from projections.queries.relocalize import CandidateReader
-from projections.relocalize import Candidates, Crop
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Candidates, Crop
+from projections.map.fold import fold_log
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
+from projections.postgres.queries.relocalize import CandidateReader
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.occupancy_map import OccupancyMap
-from eventsrc.system_events import MAP_KEY
-from projections.errors import FoldError
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.model.digest import map_digest
-from projections.model.fold import fold_events, fold_log
-from projections.model.one_floor import view_of_floor
-from projections.model.snapshot import restore, snapshot
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_events, fold_log
+from projections.map.one_floor import view_of_floor
+from projections.map.snapshot import restore, snapshot
+from projections.map.view import MapView
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import TransportError
-from eventsrc.metrics import MAX_CONNECTIONS, serving_metrics
-from eventsrc.recorder import RecorderReport
+from eventsrc.base.errors import TransportError
+from eventsrc.record.metrics import MAX_CONNECTIONS, serving_metrics
+from eventsrc.record.recorder import RecorderReport
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import Program, scrape
 from tests.http_attacks import answer, ask, connect
@@ -66,7 +66,7 @@ def test_open_connections_block_no_scrape_and_the_oldest_are_closed(tmp_path: Pa
 
 
 def test_a_silent_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("eventsrc.metrics._Handler.timeout", 0.2)
+    monkeypatch.setattr("eventsrc.record.metrics._Handler.timeout", 0.2)
     with serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
         assert ask(port, b"GET /metrics HTTP/1.1\r\n") == b""
 

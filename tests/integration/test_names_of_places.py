@@ -7,12 +7,14 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.queries.map_queries import (
+from projections.fold.settings import Settings
+from projections.localize.relocalize import ExactIndex, rank, read_crops
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.queries.map_queries import (
     FoldedMap,
     LiveMap,
     objects_of,
@@ -21,10 +23,8 @@ from projections.queries.map_queries import (
     similar_objects,
     where_is,
 )
-from projections.queries.relocalize import CandidateReader, prepare_graph
-from projections.relocalize import ExactIndex, rank, read_crops
-from projections.serve import Answerer, Pools
-from projections.settings import Settings
+from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
+from projections.surfaces.serve import Answerer, Pools
 from tests.commands_in_logs import append_command, name_place
 from tests.logs import walk, write_log
 

@@ -4,19 +4,19 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.commands import SameObject
-from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.envelope.commands import SameObject
+from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import LogReader
-from projections.corrections import Corrections
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.database.graph_render import expected_rows
-from projections.database.live_fold import LiveFold, batches
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.graph_render import expected_rows
+from projections.postgres.live_fold import LiveFold, batches
+from projections.postgres.memory_sink import MemorySink, MemoryTables
 from tests.commands_in_logs import append_command, command
 from tests.envelopes import detection, envelope
 from tests.live_rows import followed_and_rebuilt

@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter
-from projections.model import parsed_log, parsing_process
-from projections.model.parsed_log import ParsedLog, default_workers
-from projections.model.parsing import parsed_stretches
+from projections.map import parsed_log, parsing_process
+from projections.map.parsed_log import ParsedLog, default_workers
+from projections.map.parsing import parsed_stretches
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import BY_HAND, KEY, flip
 from tests.property.test_parsed_bytes import comparable
@@ -213,8 +213,8 @@ def test_events_that_no_slot_has_room_for(
         parsing_process,
         "_PROGRAM",
         parsing_process._PROGRAM.replace("main(", "m.SLOT_BYTES = 65536; m.main(").replace(
-            "from projections.model.parsing_process import main",
-            "import projections.model.parsing_process as m",
+            "from projections.map.parsing_process import main",
+            "import projections.map.parsing_process as m",
         ),
     )
     path, vector = tmp_path / "log", [1.0] * 8000
@@ -272,7 +272,7 @@ def test_a_killed_parent_leaves_no_process(log: Path) -> None:
         "import sys, time\n"
         "from pathlib import Path\n"
         "from eventsrc.log import LogReader\n"
-        "from projections.model import parsed_log\n"
+        "from projections.map import parsed_log\n"
         "parsed_log.MIN_EVENTS = parsed_log.EVENTS_PER_WORKER = 1\n"
         "with LogReader(Path(sys.argv[1])) as reader:\n"
         "    with parsed_log.ParsedLog(reader, reader.next_offset, 2) as parsed:\n"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.settings import PRESETS, Settings
+from projections.fold.settings import PRESETS, Settings
 from tests.commands import Commands
 from tests.docs.commands_page import commands
 from tests.envelopes import envelope

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
+from projections.surfaces.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
 from tests.commands import TIMEOUT_S, Commands
 from tests.docs.console import ROOT
 from tests.fixtures_timetravel import write_damaged_log, write_log
@@ -27,7 +27,7 @@ class CtrlC:
             _signal.raise_signal(_signal.SIGINT)
 
 sys.meta_path.insert(0, CtrlC())
-from projections.cli import main
+from projections.surfaces.cli import main
 main()
 """
 _CTRL_C_IN_A_WORKER = """
@@ -52,9 +52,11 @@ def mapfold(tmp_path: Path, written: Path) -> Commands:
     ("module", "args"),
     [
         ("contextlib", ("log", "info", "log")),  # the first thing that is imported
-        ("projections.demo", ("demo",)),  # imported when the command runs already
-        pytest.param("projections.cli.maps", ("state", "log"), marks=pytest.mark.slow),
-        pytest.param("projections.cli.program", ("log", "info", "log"), marks=pytest.mark.slow),
+        ("projections.surfaces.demo", ("demo",)),  # imported when the command runs already
+        pytest.param("projections.surfaces.cli.maps", ("state", "log"), marks=pytest.mark.slow),
+        pytest.param(
+            "projections.surfaces.cli.program", ("log", "info", "log"), marks=pytest.mark.slow
+        ),
         pytest.param("typer", ("state", "log"), marks=pytest.mark.slow),
         pytest.param("numpy", ("state", "log"), marks=pytest.mark.slow),
     ],
@@ -161,7 +163,8 @@ def test_stderr_on_a_full_disk_changes_nothing(mapfold: Commands) -> None:
 
 def test_numbers_of_closed_streams_are_not_reused(mapfold: Commands) -> None:
     program = (
-        "import os; from pathlib import Path; from projections.cli.program import run_app\n"
+        "import os; from pathlib import Path\n"
+        "from projections.surfaces.cli.program import run_app\n"
         "def app():\n"
         "    fds = [os.readlink(f'/proc/self/fd/{number}') for number in range(3)]\n"
         "    Path('fds').write_text(str([*fds, os.open('first', os.O_CREAT) > 2]))\n"

@@ -14,12 +14,12 @@ import pytest
 import typer
 from rich.console import Console
 
-from eventsrc.errors import MapfoldError
+from eventsrc.base.errors import MapfoldError
+from eventsrc.base.progress import report_progress, reported, send_progress_to, working
 from eventsrc.log import verify_log
-from eventsrc.progress import report_progress, reported, send_progress_to, working
-from projections.cli import COMMANDS, command_line, reading_bar, terminal
-from projections.cli.reading_bar import ReadingBar
-from projections.cli.terminal import Bar, FileBars, output_begins
+from projections.surfaces.cli import COMMANDS, command_line, reading_bar, terminal
+from projections.surfaces.cli.reading_bar import ReadingBar
+from projections.surfaces.cli.terminal import Bar, FileBars, output_begins
 from tests.commands_in_logs import append_command, name_place
 from tests.docs.commands_page import commands
 from tests.logs import walk, write_log

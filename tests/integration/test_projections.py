@@ -9,14 +9,14 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.database.loader import LoaderName
-from projections.errors import DatabaseError, FoldError, ProjectionMismatch
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError, FoldError, ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.map.view import MapView
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.loader import LoaderName
 from tests.drops import wait_for_drops
 from tests.envelopes import detection, envelope
 from tests.logs import WEIRD, append_raw, bridge, walk, write_log

@@ -10,15 +10,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from eventsrc.robot.acks import (
-    Ack,
-    Sent,
-    ack_key,
-    payload_sha256,
-    sent_key,
-)
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, Router, Session, ZenohOptions
+from eventsrc.record.robot.acks import Ack, Sent, ack_key, payload_sha256, sent_key
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, Router, Session, ZenohOptions
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program

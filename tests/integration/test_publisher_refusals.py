@@ -7,18 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
+from eventsrc.base.errors import InvalidEnvelope, MisuseError, SpoolFull, TransportError
+from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import LogReader
-from eventsrc.robot.acks import (
-    Refusal,
-    Refusals,
-    ack_key,
-    refusal_key,
-)
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.robot.sender import Sender
-from eventsrc.system_events import REJECTED_KEY
-from eventsrc.transport.session import Session, ZenohOptions
+from eventsrc.record.robot.acks import Refusal, Refusals, ack_key, refusal_key
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.robot.sender import Sender
+from eventsrc.record.transport.session import Session, ZenohOptions
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
 from tests.fixtures_zenoh import DEADLINE_S, Program

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from projections.database import rebuild
-from projections.database.connection import Targets, connect
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.queries.map_queries import (
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.view import MapView
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets, connect
+from projections.postgres.queries.map_queries import (
     FoldedMap,
     LiveMap,
     MapSource,
@@ -19,8 +20,7 @@ from projections.queries.map_queries import (
     places_holding,
     where_is,
 )
-from projections.queries.relocalize import prepare_graph
-from projections.settings import Settings
+from projections.postgres.queries.relocalize import prepare_graph
 from tests.commands import Commands
 from tests.logs import walk, write_log
 

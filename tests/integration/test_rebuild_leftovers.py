@@ -8,13 +8,13 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.database import RebuildProgress, rebuild
-from projections.database.check import check
-from projections.database.connection import Connection, Targets, connect
-from projections.database.replaced_tables import try_drop_lock
-from projections.database.vector_table import build_hnsw
-from projections.errors import DatabaseError
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError
+from projections.fold.settings import Settings
+from projections.postgres import RebuildProgress, rebuild
+from projections.postgres.check import check
+from projections.postgres.connection import Connection, Targets, connect
+from projections.postgres.replaced_tables import try_drop_lock
+from projections.postgres.vector_table import build_hnsw
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows
@@ -56,7 +56,7 @@ def test_the_next_rebuild_drops_what_the_server_did_not(
 ) -> None:
     rebuild(log, one_database, SETTINGS, until=30)
     with monkeypatch.context() as patched:
-        patched.setattr("projections.database.replaced_tables.send_and_close", skip_the_drop)
+        patched.setattr("projections.postgres.replaced_tables.send_and_close", skip_the_drop)
         rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     assert left_over(pg) == {"semantic_map_old", "mapfold_old"}
@@ -101,7 +101,7 @@ def test_an_error_after_the_swap_says_that_the_new_map_is_in_place(
     pg.execute("CREATE TABLE public.taken (n int)")
     pg.execute("CREATE INDEX detection_embeddings_hnsw ON public.taken (n)")
     for_any_table = partial(build_hnsw, threshold=1)
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "build_hnsw", for_any_table)
+    monkeypatch.setattr(sys.modules["projections.postgres.shadows"], "build_hnsw", for_any_table)
     with pytest.raises(DatabaseError, match="already exists; the new map is in place"):
         rebuild(log, one_database, SETTINGS)
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]

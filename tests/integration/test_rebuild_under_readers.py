@@ -9,12 +9,12 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.database import RebuildProgress, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.database.vector_sink import VectorShadow
-from projections.errors import DatabaseError, ProjectionBusy
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError, ProjectionBusy
+from projections.fold.settings import Settings
+from projections.postgres import RebuildProgress, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.vector_sink import VectorShadow
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.rows import all_rows
@@ -113,7 +113,7 @@ def test_a_long_transaction_keeps_its_graph_and_the_next_rebuild_drops_it(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has read only the table so far; the graph it reads later must still be whole."""
-    monkeypatch.setattr("projections.database.replaced_tables.WAIT_SECONDS", 0.2)
+    monkeypatch.setattr("projections.postgres.replaced_tables.WAIT_SECONDS", 0.2)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS)
     with connect_for_cypher(one_database.graph_url) as reader:
@@ -238,7 +238,7 @@ def test_between_swap_and_commit_a_reader_waits_at_its_first_table(
 def test_a_reader_that_keeps_its_lock_stops_the_swap_with_a_message(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["projections.database.shadows"], "LOCK_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(sys.modules["projections.postgres.shadows"], "LOCK_TIMEOUT_S", 0.3)
     log = write_log(tmp_path / "log", walk(60))
     rebuild(log, one_database, SETTINGS, until=30)
     old = all_rows(one_database)

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.append import append_payload
-from eventsrc.gap_history import unread_events
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.robot.acks import ack_key
-from eventsrc.transport.session import Router, Session
+from eventsrc.record.append import append_payload
+from eventsrc.record.gap_history import unread_events
+from eventsrc.record.robot.acks import ack_key
+from eventsrc.record.transport.session import Router, Session
 from tests.commands import PROGRAM
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY, read_log

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.log.format import LEDGER, SEALED_END
-from eventsrc.robot.acks import Ack, ack_key, payload_sha256
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, Session, ZenohOptions
+from eventsrc.record.append import append_payload
+from eventsrc.record.robot.acks import Ack, ack_key, payload_sha256
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, Session, ZenohOptions
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY, read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program
@@ -29,7 +29,7 @@ Sessions = Callable[[], Session]
 
 _ON_A_SMALL_DISK = """
 import resource, sys
-from projections.cli import main
+from projections.surfaces.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 main()
 """

@@ -9,22 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.importers import import_files
-from eventsrc.importers.bag_streams import BagOptions
-from eventsrc.log import (
-    LogReader,
-    LogWriter,
-    MessageFormat,
-    NewEvent,
-    verify_log,
-)
-from eventsrc.recorder.queue import BridgedMessage
+from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, ROS_KEY
+from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, verify_log
+from eventsrc.record.importers import import_files
+from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.recorder.queue import BridgedMessage
+from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 from eventsrc.ros.bridge_keys import topic_of
 from eventsrc.ros.derivation import read_recording
-from eventsrc.system_events import MAP_KEY, REJECTED_KEY, ROS_KEY
-from eventsrc.transport.session import Session, ZenohOptions, open_session
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
 from tests import ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import LONG_LEASE

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
-from eventsrc.clock import system_clock
-from eventsrc.errors import LogDamaged, LogError, MisuseError
-from eventsrc.gap_history import ledger_of, save_ledger
+from eventsrc.base.clock import system_clock
+from eventsrc.base.errors import LogDamaged, LogError, MisuseError
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.recorder import Recorder
-from eventsrc.recorder.checking import Batch, Checker
-from eventsrc.recorder.queue import MessageQueue
-from eventsrc.recorder.writer_thread import WriterThread
-from eventsrc.robot.acks import (
+from eventsrc.record.append import append_payload
+from eventsrc.record.gap_history import ledger_of, save_ledger
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.checking import Batch, Checker
+from eventsrc.record.recorder.queue import MessageQueue
+from eventsrc.record.recorder.writer_thread import WriterThread
+from eventsrc.record.robot.acks import (
     MAX_PER_ACK,
     Ack,
     Refusal,
@@ -27,8 +28,7 @@ from eventsrc.robot.acks import (
     payload_sha256,
     refusal_key,
 )
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
-from eventsrc.transport.session import Received, Router, Session, ZenohOptions, open_session
+from eventsrc.record.transport.session import Received, Router, Session, ZenohOptions, open_session
 from tests.envelopes import detection, envelope, keyframe_payloads, payload
 from tests.fixtures_log import KEY, flip, read_log
 from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program

@@ -7,19 +7,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.clock import system_clock
-from eventsrc.gap_history import ledger_of
-from eventsrc.gaps import DEFAULT_SETTLE_NS, Gap
+from eventsrc.base.clock import system_clock
+from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS, Gap
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import FsyncPolicy, LogReader, LogWriter
-from eventsrc.recorder import Recorder, RecorderReport
-from eventsrc.recorder.queue import SequenceGaps
-from eventsrc.robot.acks import (
-    MAX_SENT_BYTES,
-    Sent,
-    sent_key,
-)
-from eventsrc.system_events import LOSS_KEY, Loss
-from eventsrc.transport.session import Session
+from eventsrc.record.gap_history import ledger_of
+from eventsrc.record.recorder import Recorder, RecorderReport
+from eventsrc.record.recorder.queue import SequenceGaps
+from eventsrc.record.robot.acks import MAX_SENT_BYTES, Sent, sent_key
+from eventsrc.record.transport.session import Session
 from tests.envelopes import envelope, keyframe_payloads, payload
 from tests.fixtures_log import KEY, read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program

@@ -12,23 +12,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.commands import Reembed, UseSettings
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogBusy, LogDamaged, MisuseError
+from eventsrc.adapters.reembedding import Reembedding, reembed
+from eventsrc.base.errors import LogBusy, LogDamaged, MisuseError
+from eventsrc.envelope.commands import Reembed, UseSettings
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.system_events import EMBEDDINGS_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.reembedding import Reembedding, reembed
-from eventsrc.system_events import EMBEDDINGS_KEY
-from projections.corrections import Corrections, map_fingerprint
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.errors import FoldError
-from projections.evaluate.questions import read_keyframes
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections, map_fingerprint
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
+from projections.localize.evaluate.questions import read_keyframes
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
 from tests.commands import Commands
 from tests.commands_in_logs import append_command, command
 from tests.crops import Encoder, add_crop, drive, jpeg, write
@@ -118,7 +118,7 @@ def test_a_detection_keeps_the_vector_that_it_was_recorded_with(tmp_path: Path) 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from eventsrc.reembedding import reembed
+from eventsrc.adapters.reembedding import reembed
 from tests.crops import Encoder
 class Dies(Encoder):
     def encode(self, jpegs):

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.crops import (
+from eventsrc.adapters.detector.vision import encode_jpeg
+from eventsrc.envelope.crops import (
     MAX_CROP_BYTES,
     Crop,
     InvalidCrop,
@@ -21,12 +22,11 @@ from eventsrc.crops import (
     encode_crop,
     received_crop,
 )
-from eventsrc.detector.vision import encode_jpeg
-from eventsrc.envelope import DetId
+from eventsrc.envelope.model import DetId
 from eventsrc.log import LogReader, VerbatimEvent
+from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import MessageTypes
-from eventsrc.transport.session import Session
-from projections.cli.reembed import CropModel, weight_files
+from projections.surfaces.cli.reembed import CropModel, weight_files
 from tests.commands import Commands
 from tests.crops import FORMAT
 from tests.envelopes import detection, envelope

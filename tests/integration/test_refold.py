@@ -10,18 +10,18 @@ from typing import Any
 import psycopg
 import pytest
 
-from eventsrc.commands import Command, UseSettings
-from eventsrc.envelope import Offset
+from eventsrc.envelope.commands import Command, UseSettings
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.cli.db import _sink_line
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.database.status import SinkStatus, projection_status
-from projections.errors import ProjectionMismatch
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.errors import ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
+from projections.postgres.status import SinkStatus, projection_status
+from projections.surfaces.cli.db import _sink_line
 from tests.commands import Commands
 from tests.commands_in_logs import (
     append_command,
@@ -154,8 +154,8 @@ def test_a_command_during_a_refold_is_not_lost(
     second: Command,
     refolds: int,
 ) -> None:
-    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
-    monkeypatch.setattr("projections.database.refold.LOOK_S", 0.0)
+    monkeypatch.setattr("projections.postgres.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.postgres.refold.LOOK_S", 0.0)
     tail(log, targets, SETTINGS, once=True)
     append_command(log, forget_run("run-b"))
     given: list[int] = []
@@ -173,8 +173,8 @@ def test_a_command_during_a_refold_is_not_lost(
 def test_commands_that_keep_coming_do_not_keep_the_map_from_changing(
     log: Path, one_database: Targets, third_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
-    monkeypatch.setattr("projections.database.refold.LOOK_S", 0.0)
+    monkeypatch.setattr("projections.postgres.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.postgres.refold.LOOK_S", 0.0)
     tail(log, one_database, SETTINGS, once=True)
     append_command(log, forget_run("run-b"))
     seen: list[tuple[int, int]] = []
@@ -275,8 +275,8 @@ def test_settings_of_fusion_by_evidence_keep_the_vectors(
 def test_status_tells_how_far_a_refold_is(
     log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
-    monkeypatch.setattr("projections.database.refold.BEAT_S", 0.01)
+    monkeypatch.setattr("projections.postgres.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.postgres.refold.BEAT_S", 0.01)
     tail(log, targets, SETTINGS, once=True)
     append_command(log, forget_run("run-b"))
     seen: list[tuple[SinkStatus, ...]] = []

@@ -6,15 +6,15 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from eventsrc import commands
-from eventsrc.commands import Command
-from eventsrc.envelope import Offset
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.database.statements import statements
-from projections.database.status import projection_status
-from projections.errors import DatabaseError, FoldError, ImpossibleCommand
+from eventsrc.envelope import commands
+from eventsrc.envelope.commands import Command
+from eventsrc.envelope.model import Offset
+from projections.fold.errors import DatabaseError, FoldError, ImpossibleCommand
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
+from projections.postgres.statements import statements
+from projections.postgres.status import projection_status
 from tests.commands_in_logs import (
     append_command,
     command,
@@ -120,7 +120,7 @@ def test_a_live_tail_tries_an_impossible_command_again_when_another_comes(
 def test_a_stopped_refold_leaves_the_old_map(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, third_database: Targets
 ) -> None:
-    monkeypatch.setattr("projections.database.refold.TICK_EVENTS", 10)
+    monkeypatch.setattr("projections.postgres.refold.TICK_EVENTS", 10)
     tail(log, one_database, SETTINGS, once=True)
     before = all_rows(one_database)
     append_command(log, forget_run("run-b"))

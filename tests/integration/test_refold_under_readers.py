@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import Offset
-from projections.database import TailProgress, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.cypher import connect_for_cypher
-from projections.serve import Answerer, Pools
-from projections.settings import Settings
+from eventsrc.envelope.model import Offset
+from projections.fold.settings import Settings
+from projections.postgres import TailProgress, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.surfaces.serve import Answerer, Pools
 from tests.commands_in_logs import append_command, forget_keyframes, keep_apart, name_place, undo
 from tests.integration.test_rebuild_under_readers import (
     COUNT_LABELS,

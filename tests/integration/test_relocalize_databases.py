@@ -8,14 +8,14 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.errors import ProjectionMismatch, ProjectionMissing, QuestionError
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.queries.relocalize import CandidateReader, relocalize
-from projections.relocalize import Crop, ExactIndex, Track, rank, read_crops
-from projections.settings import Settings
+from projections.fold.errors import ProjectionMismatch, ProjectionMissing, QuestionError
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Crop, ExactIndex, Track, rank, read_crops
+from projections.map.fold import fold_log
+from projections.map.view import MapView
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.queries.relocalize import CandidateReader, relocalize
 from tests.candidates import assert_equal, found
 from tests.commands import Commands
 from tests.envelopes import detection

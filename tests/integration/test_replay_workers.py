@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, MapfoldError
+from eventsrc.base.errors import LogDamaged, MapfoldError
 from eventsrc.log import LogReader
-from projections.database import RebuildReport, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.rebuild import RebuildProgress
-from projections.errors import FoldError
-from projections.model import parsed_log
-from projections.model.parsed_log import ParsedLog
-from projections.settings import Settings
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
+from projections.map import parsed_log
+from projections.map.parsed_log import ParsedLog
+from projections.postgres import RebuildReport, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.rebuild import RebuildProgress
 from tests.fixtures_log import flip
 from tests.integration.test_parsed_log import pids
 from tests.logs import append_raw, walk, write_log

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.cli.export import _recorder
-from projections.model.scenes import RecordedFold
-from projections.palette import place_colour
-from projections.settings import Settings
+from projections.adapters.palette import place_colour
+from projections.fold.settings import Settings
+from projections.map.scenes import RecordedFold
+from projections.surfaces.cli.export import _recorder
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.logs import write_log
@@ -68,7 +68,9 @@ def rrd(command: str, *arguments: str | Path, home: Path) -> "subprocess.Complet
 
 
 def record(log: Path, path: Path, *, every: int | None = None, end: int | None = None) -> int:
-    from projections.rerun.recording import write_recording  # takes half a second to import
+    from projections.adapters.rerun.recording import (
+        write_recording,  # takes half a second to import
+    )
 
     with LogReader(log) as reader:
         until = reader.next_offset if end is None else Offset(end)
@@ -218,7 +220,7 @@ def test_what_cannot_be_recorded_is_said(
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "projections.rerun.recording", raising=False)
-    monkeypatch.delattr("projections.rerun.recording", raising=False)
+    monkeypatch.delitem(sys.modules, "projections.adapters.rerun.recording", raising=False)
+    monkeypatch.delattr("projections.adapters.rerun.recording", raising=False)
     with pytest.raises(MisuseError, match=r"--rerun needs rerun.*pip install 'mapfold\[rerun\]'"):
         _recorder("rerun", "")

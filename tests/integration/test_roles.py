@@ -6,16 +6,16 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
-from eventsrc.system_events import MAP_KEY
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets, connect, extension_version
-from projections.database.cypher import connect_for_cypher, enforces_row_security
-from projections.database.grants import roles_sql
-from projections.database.status import projection_status
-from projections.errors import DatabaseError, ExtensionMissing
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError, ExtensionMissing
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets, connect, extension_version
+from projections.postgres.cypher import connect_for_cypher, enforces_row_security
+from projections.postgres.grants import roles_sql
+from projections.postgres.status import projection_status
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
 from tests.maps import drawn_map

@@ -10,16 +10,14 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.envelope import FIRST_OFFSET
-from eventsrc.errors import MisuseError
-from eventsrc.log import (
-    follow,
-)
-from eventsrc.recorder.bridged import HOLD_MESSAGES
-from eventsrc.recorder.queue import BridgedMessage, MessageQueue
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import FIRST_OFFSET
+from eventsrc.log import follow
+from eventsrc.record.recorder.bridged import HOLD_MESSAGES
+from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
+from eventsrc.record.transport.session import Session
 from eventsrc.ros.bridge_keys import token_selectors, topic_of, type_of_token
-from eventsrc.transport.session import Session
-from projections.cli.bridged import recording_of
+from projections.surfaces.cli.bridged import recording_of
 from tests import ros2dds
 from tests.commands import Commands
 from tests.fixtures_log import read_log

@@ -6,26 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged
-from eventsrc.gap_history import ledger_of
-from eventsrc.importers import import_files
-from eventsrc.log import (
-    LogReader,
-    LogWriter,
-    MessageFormat,
-    NewEvent,
-    VerbatimEvent,
-    verify_log,
-)
-from eventsrc.recorder import Recorder
-from eventsrc.recorder.bridged import Bridge
-from eventsrc.recorder.checking import Checker
-from eventsrc.recorder.queue import BridgedMessage, MessageQueue
-from eventsrc.recorder.unfinished import append_missing, message_of
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
+from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, VerbatimEvent, verify_log
+from eventsrc.record.gap_history import ledger_of
+from eventsrc.record.importers import import_files
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.bridged import Bridge
+from eventsrc.record.recorder.checking import Checker
+from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
+from eventsrc.record.recorder.unfinished import append_missing, message_of
+from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording, derive, read_recording
-from eventsrc.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
-from eventsrc.transport.session import Session
-from projections.cli.bridged import recording_of
+from projections.surfaces.cli.bridged import recording_of
 from tests import ros2dds
 from tests.fixtures_log import KEY, read_log
 from tests.recorders import Running

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import VerbatimEvent
-from eventsrc.transport.session import Session
+from eventsrc.record.transport.session import Session
 from tests import ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S, Program

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.docs.console import ROOT
 from tests.fixtures_zenoh import DEADLINE_S, Program
 
@@ -26,7 +26,7 @@ def test_it_says_where_it_listens_and_ends_cleanly(start: Start, number: int) ->
 
 _SIGNAL_IN_ANOTHER_THREAD = """
 import signal, threading
-from projections.cli.signals import stop_on_signals
+from projections.surfaces.cli.signals import stop_on_signals
 
 def hit(stop):
     while not stop._cond._waiters:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from eventsrc.log import LogReader
-from eventsrc.log_info import log_info
+from eventsrc.record.log_info import log_info
 from tests.simulated import simulated
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.transport.session import ZenohOptions, open_session
-from projections.database import rebuild
-from projections.database.connection import Connection, Targets, connect
-from projections.database.embedded import EmbeddedServer
-from projections.errors import DatabaseUnavailable, ProjectionMissing
-from projections.serve import Answerer, FairQueue, Pools
-from projections.serve.answering import HEALTH_S, TokenBucket, TooMuchError
-from projections.settings import Settings
+from eventsrc.record.transport.session import ZenohOptions, open_session
+from projections.fold.errors import DatabaseUnavailable, ProjectionMissing
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Connection, Targets, connect
+from projections.postgres.embedded import EmbeddedServer
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.answering import HEALTH_S, TokenBucket, TooMuchError
 from tests.commands import Commands
 from tests.logs import walk, write_log
 from tests.ready_program import ReadyProgram
@@ -90,7 +90,7 @@ class TestKilledServer:
     def test_questions_wait_for_another_server_at_first_and_fail_at_once_later(
         self, server: EmbeddedServer, queue: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("projections.serve.pools.OUTAGE_TIMEOUT_S", 0.5)
+        monkeypatch.setattr("projections.surfaces.serve.pools.OUTAGE_TIMEOUT_S", 0.5)
         notes: list[str] = []
         with Pools(Targets(server.url, server.url), 4, notes.append) as pools:
             answerer = Answerer(pools, per_second=10_000.0)
@@ -100,7 +100,7 @@ class TestKilledServer:
                 for path, data in (("relocalize", question()), ("health", None)):
                     status, document = fetch(f"http://127.0.0.1:{port}/{path}", data)
                     assert (status, document["error"]["kind"]) == (503, "database")
-            monkeypatch.setattr("projections.serve.pools.OUTAGE_TIMEOUT_S", 2 * DEADLINE_S)
+            monkeypatch.setattr("projections.surfaces.serve.pools.OUTAGE_TIMEOUT_S", 2 * DEADLINE_S)
             assert not answerer.database_up
             begun = time.monotonic()
             with pytest.raises(DatabaseUnavailable, match="start the server"):
@@ -117,7 +117,7 @@ def test_a_full_pool_is_not_reported_as_an_outage(
     walked_map: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("FIRST_WAIT_S", "LAST_WAIT_S"):
-        monkeypatch.setattr(f"projections.serve.pools.{name}", 0.5)
+        monkeypatch.setattr(f"projections.surfaces.serve.pools.{name}", 0.5)
     notes: list[str] = []
     with Pools(walked_map, 1, notes.append) as pools:
 
@@ -173,7 +173,7 @@ def test_health_is_at_most_a_second_old_and_fresh_after_a_question_that_failed(
 def test_a_cut_connection_is_reported_in_one_line_of_ours(walked_map: Targets) -> None:
     program = subprocess.Popen(
         [
-            *(sys.executable, "-m", "projections.cli", "serve", "--no-zenoh"),
+            *(sys.executable, "-m", "projections.surfaces.cli", "serve", "--no-zenoh"),
             *("--http", "127.0.0.1:0", "--db", walked_map.graph_url),
         ],
         stderr=subprocess.PIPE,

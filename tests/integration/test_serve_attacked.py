@@ -12,15 +12,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.transport.session import Session
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.database.connection import connect as connect_database
-from projections.database.embedded import EmbeddedServer
-from projections.errors import QuestionError
-from projections.serve import Answerer, FairQueue, Pools, ZenohService
-from projections.serve.answering import encode
-from projections.settings import Settings
+from eventsrc.record.transport.session import Session
+from projections.fold.errors import QuestionError
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.connection import connect as connect_database
+from projections.postgres.embedded import EmbeddedServer
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.surfaces.serve.answering import encode
 from tests.http_attacks import DEADLINE_S, Served, ask, connect, request, served, status
 from tests.logs import walk, write_log
 

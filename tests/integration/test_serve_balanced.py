@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
 from eventsrc.log import LogWriter
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools
-from projections.serve.guard import Guard
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.guard import Guard
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
 from tests.envelopes import payload
 from tests.logs import walk, write_log
 from tests.round_robin import round_robin

@@ -17,8 +17,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from projections.serve import connections
-from projections.serve.listening import accept_pending, bind, serving, tls_context
+from projections.surfaces.serve import connections
+from projections.surfaces.serve.listening import accept_pending, bind, serving, tls_context
 from tests.fixtures_tls import Certificate
 from tests.http_attacks import DEADLINE_S, answer, ask, connect, request, status
 
@@ -58,8 +58,8 @@ def start(monkeypatch: pytest.MonkeyPatch, notes: list[str]) -> Iterator[START]:
         def start(most: int = 8, seconds: float = SECONDS, **options: Any) -> int:
             monkeypatch.setattr(connections, "REQUEST_S", seconds)
             monkeypatch.setattr(connections, "ANSWER_S", seconds)
-            monkeypatch.setattr("projections.serve.listening.REQUEST_S", seconds)
-            monkeypatch.setattr("projections.serve.listening.MAX_CONNECTIONS", most)
+            monkeypatch.setattr("projections.surfaces.serve.listening.REQUEST_S", seconds)
+            monkeypatch.setattr("projections.surfaces.serve.listening.MAX_CONNECTIONS", most)
             listener = bind("127.0.0.1", 0)
             return servers.enter_context(
                 serving(application, listener, note=notes.append, **options)

@@ -12,9 +12,9 @@ from urllib.parse import urlencode
 import pytest
 from pydantic import TypeAdapter
 
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.serve import Answerer, Pools, models
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, Pools, models
 from tests import described_maps
 from tests.described_maps import documents
 from tests.described_service import Service

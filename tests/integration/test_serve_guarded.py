@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.serve.guard import read_origin, read_token
-from projections.settings import Settings
+from eventsrc.base.errors import MisuseError
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.surfaces.serve.guard import read_origin, read_token
 from tests.commands import Commands
 from tests.fixtures_tls import Certificate
 from tests.http_attacks import answer, ask, connect, request, served, status

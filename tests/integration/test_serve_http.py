@@ -11,11 +11,11 @@ from http.client import HTTPConnection
 
 import pytest
 
-from eventsrc.errors import TransportError
-from projections.database.connection import Targets
-from projections.queries.relocalize import relocalize
-from projections.relocalize import parse_question, question_schema
-from projections.serve import Answerer, FairQueue, Pools
+from eventsrc.base.errors import TransportError
+from projections.localize.relocalize import parse_question, question_schema
+from projections.postgres.connection import Targets
+from projections.postgres.queries.relocalize import relocalize
+from projections.surfaces.serve import Answerer, FairQueue, Pools
 from tests.serve_questions import DEADLINE_S, FORMS, fetch, http_at, question, tracked_question
 
 

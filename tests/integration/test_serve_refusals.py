@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from projections.errors import DatabaseError
-from projections.serve import models
-from projections.serve.answering import BusyError, TooMuchError
+from projections.fold.errors import DatabaseError
+from projections.surfaces.serve import models
+from projections.surfaces.serve.answering import BusyError, TooMuchError
 from tests.described_service import FRIEND, PATHS, Service
 
 REFUSED = [

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from eventsrc.transport.session import Session
-from projections.database.connection import Targets, connect
-from projections.queries.relocalize import relocalize
-from projections.relocalize import Track, parse_question
-from projections.serve import Answerer, FairQueue, Pools, ZenohService
+from eventsrc.record.transport.session import Session
+from projections.localize.relocalize import Track, parse_question
+from projections.postgres.connection import Targets, connect
+from projections.postgres.queries.relocalize import relocalize
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from tests.serve_questions import (
     DEADLINE_S,
     FORMS,

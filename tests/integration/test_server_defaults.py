@@ -10,16 +10,16 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.database import RebuildProgress, rebuild, tail
-from projections.database import cluster as _cluster
-from projections.database.check import check
-from projections.database.connection import Targets, connect, pin_session_settings
-from projections.database.embedded import EmbeddedServer
-from projections.database.grants import roles_sql
-from projections.database.loader import LoaderName
-from projections.database.status import projection_status
-from projections.errors import DatabaseError
-from projections.settings import Settings
+from projections.fold.errors import DatabaseError
+from projections.fold.settings import Settings
+from projections.postgres import RebuildProgress, rebuild, tail
+from projections.postgres import cluster as _cluster
+from projections.postgres.check import check
+from projections.postgres.connection import Targets, connect, pin_session_settings
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.grants import roles_sql
+from projections.postgres.loader import LoaderName
+from projections.postgres.status import projection_status
 from tests.drops import wait_for_drops
 from tests.logs import walk, write_log
 from tests.rows import all_rows

@@ -2,10 +2,10 @@
 
 import pytest
 
-from eventsrc.ingest import Accepted, ingest
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from eventsrc.envelope.ingest import Accepted, ingest
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 from tests.folds import recounted_adjacency, recounted_locations, recounted_places
 from tests.shared_data import shared_run
 

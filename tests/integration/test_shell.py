@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from projections.cli import SECTIONS, command_line
-from projections.cli.program import Program, _needed
+from projections.surfaces.cli import SECTIONS, command_line
+from projections.surfaces.cli.program import Program, _needed
 from tests.commands import Commands
 from tests.prefork import folder_with_mapfold
 from tests.thorough import rounds

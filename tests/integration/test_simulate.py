@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.transport.session import Received, Session
+from eventsrc.record.transport.session import Received, Session
 from tests.commands import Commands, Said
 from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.simulated import simulated

@@ -16,9 +16,9 @@ from urllib.parse import parse_qs, urlsplit
 import psycopg
 import pytest
 
-from projections.database.connection import connect
-from projections.database.embedded import EmbeddedServer
-from projections.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.postgres.connection import connect
+from projections.postgres.embedded import EmbeddedServer
 from tests.servers import furnish
 
 NOBODY = 65534

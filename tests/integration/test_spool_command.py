@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import KeyframeId, RunId
-from eventsrc.robot.acks import Refusal, Refusals
-from eventsrc.robot.spool import Spool
+from eventsrc.envelope.model import KeyframeId, RunId
+from eventsrc.record.robot.acks import Refusal, Refusals
+from eventsrc.record.robot.spool import Spool
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 

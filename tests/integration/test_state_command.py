@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import LogWriter
-from eventsrc.system_events import LOSS_KEY, Loss
-from projections.place_types import place_type
-from projections.settings import Settings
+from projections.fold.place_types import place_type
+from projections.fold.settings import Settings
 from tests.commands import Commands
 from tests.envelopes import detection, envelope, payload
 from tests.folds import fold
@@ -96,7 +96,7 @@ def test_the_document_says_what_was_seen(mapfold: Commands, log: Path) -> None:
 
 
 def test_the_digest_is_that_of_the_same_envelopes_folded_here(mapfold: Commands, log: Path) -> None:
-    from projections.model.digest import map_digest
+    from projections.map.digest import map_digest
 
     said = mapfold("state", log, "--digest").out
     assert said == map_digest(fold(DOCUMENTS).view) + "\n"
@@ -112,7 +112,7 @@ def test_at_counts_events_and_includes_a_time_or_a_keyframe(mapfold: Commands, l
 
 
 def test_state_at_n_is_a_log_of_the_first_n_events(mapfold: Commands, tmp_path: Path) -> None:
-    from projections.model.digest import map_digest
+    from projections.map.digest import map_digest
 
     path = tmp_path / "plain"
     with LogWriter(path) as writer:

@@ -9,16 +9,16 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from eventsrc.append import append_payload
+from eventsrc.envelope.upcast import read_envelope
 from eventsrc.log import ALWAYS, Event, LogWriter
-from eventsrc.upcast import read_envelope
-from projections.database import RebuildProgress, TailProgress, TailReport, rebuild, tail
-from projections.database.connection import Targets
-from projections.database.retry import retry
-from projections.database.status import projection_status
-from projections.database.tail_metrics import serving_tail_metrics
-from projections.errors import ProjectionBusy, ProjectionMismatch
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from projections.fold.errors import ProjectionBusy, ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.postgres import RebuildProgress, TailProgress, TailReport, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.retry import retry
+from projections.postgres.status import projection_status
+from projections.postgres.tail_metrics import serving_tail_metrics
 from tests.envelopes import envelope, payload
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import all_rows
@@ -204,9 +204,9 @@ def test_parked_events_are_tried_again(
         mended = replace(event, payload=event.payload.replace(b'"none"', b"[]"))
         return read_envelope(mended, max_bytes=max_bytes)
 
-    monkeypatch.setattr("projections.database.retry.read_envelope", lenient)
+    monkeypatch.setattr("projections.postgres.retry.read_envelope", lenient)
     monkeypatch.setattr(
-        "projections.model.parsing.read_fields",
+        "projections.map.parsing.read_fields",
         lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
     )
     reports = retry(log, one_database, SETTINGS)

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from eventsrc.log import Event, LogReader
-from projections.database import rebuild, tail
-from projections.database.connection import Targets
-from projections.database.live_fold import LiveFold
-from projections.model.fold import fold_log
-from projections.model.snapshot_cache import SnapshotCache
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.snapshot_cache import SnapshotCache
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.live_fold import LiveFold
 from tests.logs import append_raw, bridge, walk, write_log
 from tests.rows import all_rows
 
@@ -108,7 +108,7 @@ def test_no_snapshot_after_a_parked_event_is_used(
 def test_a_tail_saves_a_snapshot_if_it_folded_much(
     log: Path, one_database: Targets, folded: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["projections.database.tail_pass"], "SNAPSHOT_MIN_EVENTS", 50)
+    monkeypatch.setattr(sys.modules["projections.postgres.tail_pass"], "SNAPSHOT_MIN_EVENTS", 50)
     report = tail(log, one_database, SETTINGS, once=True)
     assert cache_of(log).offsets() == [report.next_offset]
     write_log(log, walk(10, run_id="run-d"))

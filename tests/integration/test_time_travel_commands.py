@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from projections.cli import main
-from projections.reducers.semantic_map import SemanticMap
+from projections.fold.semantic_map import SemanticMap
+from projections.surfaces.cli import main
 from tests.commands import Commands, Said
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_damaged_log, write_log

@@ -12,13 +12,13 @@ from unittest.mock import patch
 
 import pytest
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.corrections import NO_CORRECTIONS
+from projections.fold.corrections import NO_CORRECTIONS
 from projections.history import Timeline
 from projections.history.known import map_after
-from projections.history.timeline_cache import TimelineCache
-from projections.model.fold import fold_log
+from projections.map.fold import fold_log
+from projections.store.timeline_cache import TimelineCache
 from tests import prefork
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import VECTORS, write_log
@@ -150,7 +150,7 @@ def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: i
     notes: list[str] = []
     with kept_early(), Timeline(log, RULES, note=notes.append) as timeline:
         cache = TimelineCache(timeline.reader, RULES, NO_CORRECTIONS, notes.append)
-        with patch("projections.history.timeline_cache.Part", side_effect=OSError(number, why)):
+        with patch("projections.store.timeline_cache.Part", side_effect=OSError(number, why)):
             assert not cache.stripes(timeline.end)
         assert [(path, path.stat().st_ino) for path in kept(log)] == before
         assert notes
@@ -197,7 +197,7 @@ def test_damage_in_the_log_behind_the_events_asked_for(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_histories_are_few_and_small(log: Path) -> None:
     """Four choices of settings are kept: those used last."""
-    from projections.history.timeline_cache import MOST_KEPT
+    from projections.store.timeline_cache import MOST_KEPT
 
     with kept_early():
         for number in range(MOST_KEPT + 3):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-import projections.cli
-from projections.database.connection import Targets
+import projections.surfaces.cli
+from projections.postgres.connection import Targets
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
@@ -72,7 +72,7 @@ def test_a_replay_tells_it_too(mapfold: Commands, one_database: Targets) -> None
 
 def test_no_command_takes_a_point_of_a_log_in_its_own_way() -> None:
     """One function does, which tells; a command with another would forget to."""
-    modules = list(Path(projections.cli.__file__).parent.glob("*.py"))
+    modules = list(Path(projections.surfaces.cli.__file__).parent.glob("*.py"))
     taking = {
         module.name
         for module in modules

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from projections.database import rebuild, tail
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.integration.test_projections import parsed
@@ -138,7 +138,7 @@ def test_a_live_tail_keeps_types_up_to_date(
 
 def view_of(log: Path, settings: Settings) -> Any:
     from eventsrc.log import LogReader
-    from projections.model.fold import fold_log
+    from projections.map.fold import fold_log
 
     with LogReader(log) as reader:
         return fold_log(reader, settings)[1]

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY
-from eventsrc.text import visible
-from projections.ui.live import MOST_STREAMS
+from eventsrc.base.text import visible
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
+from projections.surfaces.ui.live import MOST_STREAMS
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.http_attacks import answer, request, status

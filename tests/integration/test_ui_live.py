@@ -5,7 +5,7 @@ import shutil
 import time
 from pathlib import Path
 
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
 from tests.commands import Commands
 from tests.envelopes import payload
 from tests.http_attacks import connect, request

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import BY_HAND, KEY, flip

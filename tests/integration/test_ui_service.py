@@ -10,21 +10,21 @@ from pathlib import Path
 import pytest
 from starlette.datastructures import QueryParams
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogError, MapfoldError
+from eventsrc.base.errors import LogError, MapfoldError
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.corrections import Corrections
+from projections.fold.corrections import Corrections
+from projections.fold.settings import Settings
 from projections.history import parallel
 from projections.history.parallel import Rules, fold_all
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
-from projections.ui.comparisons import whatif_answer
-from projections.ui.edits import Edit, Editor
-from projections.ui.live import LiveWatch
-from projections.ui.log_map import MOST_ALTERNATIVES, LogMap
-from projections.ui.opened import Opened
-from projections.ui.service import GivenUp, UiService
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.surfaces.ui.comparisons import whatif_answer
+from projections.surfaces.ui.edits import Edit, Editor
+from projections.surfaces.ui.live import LiveWatch
+from projections.surfaces.ui.log_map import MOST_ALTERNATIVES, LogMap
+from projections.surfaces.ui.opened import Opened
+from projections.surfaces.ui.service import GivenUp, UiService
 from tests.logs import walk, write_log
 
 WAIT_S = 60.0

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
 from tests.commands import Commands
 from tests.logs import walk, write_log
 from tests.ui_server import showing

@@ -8,11 +8,9 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogError
-from eventsrc.gap_history import fold_ledger
-from eventsrc.gaps import GapLedger
-from eventsrc.importers import import_files
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.model import Offset
 from eventsrc.log import (
     Event,
     LogReader,
@@ -26,10 +24,12 @@ from eventsrc.log import (
 )
 from eventsrc.log.format import list_segments
 from eventsrc.log.seek import resolve, resolve_start
-from eventsrc.log_info import log_info
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from eventsrc.record.gap_history import fold_ledger
+from eventsrc.record.importers import import_files
+from eventsrc.record.log_info import log_info
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
 from tests.commands import Commands
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
 from tests.rewriting import rewrite

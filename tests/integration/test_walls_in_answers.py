@@ -15,24 +15,24 @@ import numpy as np
 import psycopg
 import pytest
 
+from eventsrc.adapters.sim import build_house
+from eventsrc.adapters.sim.house import occupancy_map
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter
-from eventsrc.occupancy_map import OccupancyMap
-from eventsrc.sim import build_house
-from eventsrc.sim.house import occupancy_map
-from eventsrc.system_events import MAP_KEY
-from eventsrc.transport.session import Session
-from projections.database import TailProgress, rebuild, tail
-from projections.database.connection import Targets
-from projections.errors import ProjectionMismatch
-from projections.model.fold import fold_log
-from projections.queries.relocalize import CandidateReader, relocalize
-from projections.relocalize import ExactIndex, parse_question, rank
-from projections.relocalize.ranking import Answer
-from projections.serve import Answerer, FairQueue, Pools, ZenohService
-from projections.serve.guard import Guard
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
-from projections.settings import Settings
+from eventsrc.record.transport.session import Session
+from projections.fold.errors import ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.localize.relocalize import ExactIndex, parse_question, rank
+from projections.localize.relocalize.ranking import Answer
+from projections.map.fold import fold_log
+from projections.postgres import TailProgress, rebuild, tail
+from projections.postgres.connection import Targets
+from projections.postgres.queries.relocalize import CandidateReader, relocalize
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.surfaces.serve.guard import Guard
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
 from tests.candidates import assert_equal
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY

@@ -10,9 +10,9 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from eventsrc.errors import MapfoldError, MisuseError, TransportError
-from eventsrc.transport.declarations import CHANNEL_SIZE, _receive_batches
-from eventsrc.transport.session import (
+from eventsrc.base.errors import MapfoldError, MisuseError, TransportError
+from eventsrc.record.transport.declarations import CHANNEL_SIZE, _receive_batches
+from eventsrc.record.transport.session import (
     Query,
     Received,
     Router,

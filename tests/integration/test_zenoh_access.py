@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import TransportError
-from eventsrc.robot.acks import ACK_PREFIX, sent_key
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import Received, Session, ZenohOptions, open_session
+from eventsrc.base.errors import TransportError
+from eventsrc.record.robot.acks import ACK_PREFIX, sent_key
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Received, Session, ZenohOptions, open_session
 from tests.docs.console import ROOT
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import read_log

@@ -15,12 +15,12 @@ from pgvector.sqlalchemy import Vector
 from psycopg.conninfo import conninfo_to_dict
 
 from eventsrc.log import LogReader
-from projections.database import rebuild
-from projections.database.check import check
-from projections.database.connection import Targets
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.view import MapView
+from projections.postgres import rebuild
+from projections.postgres.check import check
+from projections.postgres.connection import Targets
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 SETTINGS = Settings(eps_m=0.75, min_samples=8)

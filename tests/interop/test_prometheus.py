@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.metrics import serving_metrics
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools
-from projections.serve.http import create_app
-from projections.serve.listening import bind, serving
+from eventsrc.record.metrics import serving_metrics
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.http import create_app
+from projections.surfaces.serve.listening import bind, serving
 from tests.described_maps import build
 from tests.integration.test_metrics import REPORT
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.database.connection import Targets
+from projections.postgres.connection import Targets
 from tests.described_maps import MODEL
 from tests.http_attacks import served
 

@@ -69,7 +69,7 @@ def check(programs: Path, folder: Path) -> None:
 
 HELP_OF_ALL = """
 from typer.testing import CliRunner
-from projections.cli import COMMANDS, command_line
+from projections.surfaces.cli import COMMANDS, command_line
 program = command_line()
 for name in ["", *COMMANDS, "log cat", "db check", "query path", "edit join"]:
     done = CliRunner().invoke(program, [*name.split(), "--help"])
@@ -77,7 +77,7 @@ for name in ["", *COMMANDS, "log cat", "db check", "query path", "edit join"]:
 """
 
 DESCRIBED = """
-from projections.serve.http import create_app
+from projections.surfaces.serve.http import create_app
 shapes = create_app(None, None).openapi()["components"]["schemas"]
 assert "place_id" in shapes["Place"]["properties"], shapes
 """

@@ -20,11 +20,11 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogReader
-from eventsrc.transport.session import Session, ZenohOptions, open_session
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.serve import Answerer, FairQueue, Pools, ZenohService
-from projections.settings import Settings
+from eventsrc.record.transport.session import Session, ZenohOptions, open_session
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from tests.envelopes import payload
 from tests.logs import walk, write_log
 
@@ -98,8 +98,8 @@ class Recording:
     def __init__(self, log: Path, endpoint: str, env: dict[str, str]) -> None:
         self.log = log
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "projections.cli", "record", log, "--connect", endpoint],
-            env=env, stderr=subprocess.PIPE, text=True,
+            [sys.executable, "-m", "projections.surfaces.cli", "record", log, "--connect",
+            endpoint], env=env, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self.process.stderr is not None
         timer = threading.Timer(DEADLINE_S, self.process.kill)
@@ -191,8 +191,8 @@ ROBOT = """
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from eventsrc.robot.publisher import EnvelopePublisher
-from eventsrc.transport.session import ZenohOptions
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import ZenohOptions
 
 endpoint, spool = sys.argv[1:]
 with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), Path(spool)) as publisher:
@@ -312,7 +312,7 @@ print(seen[0])
 
 
 def test_the_version_before_the_lowest_lacks_what_recording_needs(tmp_path: Path) -> None:
-    """`sequence_number` in eventsrc/transport/declarations.py tells messages without a number by
+    """`sequence_number` in record/transport/declarations.py tells messages without a number by
     their source_info, None since 1.7; before, mapfold's recorder and publisher fail at each."""
     major, minor, _ = lowest().split(".")
     before = Other(tmp_path / "before", f"{major}.{int(minor) - 1}.1")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from projections.database import graph_render as agtype
-from projections.database.loader import CopyLoader, InsertLoader, Loader
+from projections.postgres import graph_render as agtype
+from projections.postgres.loader import CopyLoader, InsertLoader, Loader
 from tests.thorough import examples
 
 ODD = ["\\", "\\\\n", '"', "'", "\t", "\\.", "\\N", "$$", "\u2028", "\x7f", "\x85", "😀"]

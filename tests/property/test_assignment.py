@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.deltas import ObjectOrdinal
-from projections.reducers import evidence_matching
-from projections.reducers.evidence_matching import Match, assign
+from projections.fold import evidence_matching
+from projections.fold.deltas import ObjectOrdinal
+from projections.fold.evidence_matching import Match, assign
 
 _VALUES = st.one_of(st.sampled_from([1.0, 2.0, 3.0]), st.floats(1e-6, 30.0))
 _WANTED = st.lists(st.dictionaries(st.integers(0, 5), _VALUES, max_size=5), max_size=5)

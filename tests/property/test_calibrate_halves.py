@@ -6,13 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from projections.calibrate.halves import inflation
-from projections.calibrate.rounds import read
-from projections.calibrate.sightings import Row, sightings_of
-from projections.calibrate.things import qualified
-from projections.deltas import Pose
-from projections.evidence import EvidenceConstants
-from projections.exact import metres_to_um
+from projections.fold.deltas import Pose
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.exact import metres_to_um
+from projections.localize.calibrate.halves import inflation
+from projections.localize.calibrate.rounds import read
+from projections.localize.calibrate.sightings import Row, sightings_of
+from projections.localize.calibrate.things import qualified
 from tests.known_worlds import Known, rows_of
 from tests.thorough import stride
 

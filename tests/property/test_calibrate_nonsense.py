@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from projections.calibrate.rounds import _bounded, read
-from projections.calibrate.shrinking import Reading
-from projections.calibrate.sightings import Row, sightings_of
-from projections.deltas import Pose
-from projections.evidence import EvidenceConstants
-from projections.exact import quantise
-from projections.settings import Camera
+from projections.fold.deltas import Pose
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.exact import quantise
+from projections.fold.settings import Camera
+from projections.localize.calibrate.rounds import _bounded, read
+from projections.localize.calibrate.shrinking import Reading
+from projections.localize.calibrate.sightings import Row, sightings_of
 from tests.thorough import examples
 
 FAR_UM = 10**13

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from projections.calibrate.rounds import Round, read
-from projections.calibrate.shrinking import Reading
-from projections.calibrate.sightings import sightings_of
-from projections.evidence import EvidenceConstants
-from projections.settings import Camera
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import Camera
+from projections.localize.calibrate.rounds import Round, read
+from projections.localize.calibrate.shrinking import Reading
+from projections.localize.calibrate.sightings import sightings_of
 from tests.known_worlds import CAMERA, Known, rows_of
 from tests.thorough import mostly_slow, rounds
 

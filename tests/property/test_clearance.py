@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.clearance import MIN_WIDTH_M, NOWHERE, PASSAGE, Labels, Walls, clearance, regions
+from projections.fold.clearance import (
+    MIN_WIDTH_M,
+    NOWHERE,
+    PASSAGE,
+    Labels,
+    Walls,
+    clearance,
+    regions,
+)
 from tests.thorough import examples
 
 grids = st.builds(

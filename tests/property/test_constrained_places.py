@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.corrections import Keyframe
-from projections.deltas import MergeRefused, PlaceFormed, PlacesMerged
-from projections.pair_groups import PairGroups, without_contradictions
-from projections.reducers.constrained_places import ConstrainedPlaces
-from projections.reducers.core_index import CoreIndex, cell_side_um
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.places import Places
+from projections.fold.constrained_places import ConstrainedPlaces
+from projections.fold.core_index import CoreIndex, cell_side_um
+from projections.fold.corrections import Keyframe
+from projections.fold.deltas import MergeRefused, PlaceFormed, PlacesMerged
+from projections.fold.pair_groups import PairGroups, without_contradictions
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.places import Places
 from tests.folds import near_matrix
 from tests.naive_constrained import NaiveConstrainedPlaces
 from tests.property.test_places_are_dbscan import EPS_UM, Point

@@ -13,10 +13,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from psycopg.conninfo import conninfo_to_dict
 
-from eventsrc.errors import MapfoldError
-from projections.database.connection import Targets, connect, describe_target, open_targets
-from projections.database.status import projection_status
-from projections.settings import Settings
+from eventsrc.base.errors import MapfoldError
+from projections.fold.settings import Settings
+from projections.postgres.connection import Targets, connect, describe_target, open_targets
+from projections.postgres.status import projection_status
 from tests.commands import Commands
 from tests.logs import walk, write_log
 from tests.thorough import examples

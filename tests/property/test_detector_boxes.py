@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.detector.boxes import suppress
-from eventsrc.detector.gate import GateLimits, KeyframeGate, Pose
-from eventsrc.detector.poses import NEAR_S, PoseTrack
-from eventsrc.detector.vision import Letterbox
+from eventsrc.adapters.detector.boxes import suppress
+from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate, Pose
+from eventsrc.adapters.detector.poses import NEAR_S, PoseTrack
+from eventsrc.adapters.detector.vision import Letterbox
 
 EDGE = st.integers(0, 40)
 BOX = st.tuples(EDGE, EDGE, st.integers(0, 20), st.integers(0, 20)).map(

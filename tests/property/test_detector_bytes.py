@@ -9,11 +9,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.detector.messages import MessageError, picture_of, pose_of
-from eventsrc.detector.picture import PictureError, check_picture, split_stream
-from eventsrc.detector.vision import encode_jpeg
-from eventsrc.grey_images import encode_png
-from eventsrc.sim.pictures import compressed_image
+from eventsrc.adapters.detector.messages import MessageError, picture_of, pose_of
+from eventsrc.adapters.detector.picture import PictureError, check_picture, split_stream
+from eventsrc.adapters.detector.vision import encode_jpeg
+from eventsrc.adapters.sim.pictures import compressed_image
+from eventsrc.envelope.grey_images import encode_png
 
 _PIXELS = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
 JPEG, PNG = encode_jpeg(_PIXELS), encode_png(_PIXELS[:, :, 0])

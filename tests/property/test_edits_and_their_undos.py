@@ -9,20 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.commands import Command
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
-from projections.corrections import Corrections
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import CurrentMap
 from projections.edit.effect import Change, effect_of
 from projections.edit.make import Stamp
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
 from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, make, write_rooms
 from tests.thorough import examples
 

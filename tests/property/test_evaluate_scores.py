@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.evaluate.scores import (
+from projections.localize.evaluate.scores import (
     agreement,
     auroc,
     calibration_floor,

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from projections.reducers import agreement
-from projections.reducers.agreement import LEAST_AGREEMENT, Agreement, Pairs
-from projections.reducers.sights import Sight
-from projections.reducers.spots import COMMON_M2, LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
+from projections.fold import agreement
+from projections.fold.agreement import LEAST_AGREEMENT, Agreement, Pairs
+from projections.fold.sights import Sight
+from projections.fold.spots import COMMON_M2, LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 
 RANGE_M, RANGE_SPREAD, REACH_M = 3.0, 0.55, 8.3
 AGREEMENT = Agreement(RANGE_M, RANGE_SPREAD, REACH_M)

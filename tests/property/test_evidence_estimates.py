@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.reducers.class_heights import UNKNOWN_CLASS, HeightPrior
-from projections.reducers.sights import Sight
-from projections.reducers.spots import (
+from projections.fold.class_heights import UNKNOWN_CLASS, HeightPrior
+from projections.fold.sights import Sight
+from projections.fold.spots import (
     COMMON_M2,
     LEAST_ELEVATION_M2,
     SIZE,

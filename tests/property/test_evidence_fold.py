@@ -9,18 +9,18 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from eventsrc.commands import Command, SameObject
-from eventsrc.envelope import Offset
+from eventsrc.envelope.commands import Command, SameObject
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections import deltas as d
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.explanation import explain_object
-from projections.model.digest import map_digest
-from projections.model.export import state_document
-from projections.model.fold import fold_log
-from projections.model.snapshot import restore, snapshot
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.export import state_document
+from projections.map.fold import fold_log
+from projections.map.snapshot import restore, snapshot
+from projections.map.view import MapView
 from tests.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
 from tests.fixtures_timetravel import write_log
 from tests.folds import Folded
@@ -32,7 +32,7 @@ from tests.thorough import mostly_slow
 
 
 def check_order(deltas: list[d.Delta]) -> None:
-    """The order that `projections.deltas` states."""
+    """The order that `projections.fold.deltas` states."""
     kinds = (d.ObjectFound, d.ObjectsMerged, d.ObjectRelocated, d.ObjectClassified)
     ranks = {kind: rank for rank, kind in enumerate((*kinds, d.ObjectEstimated, d.ObjectMissing))}
     ranks[d.ObjectSeen] = ranks[d.ObjectFound]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     CorrectPoses,
     DifferentObjects,
     DropDetection,
@@ -16,10 +16,10 @@ from eventsrc.commands import (
     RigidTransform,
     SameObject,
 )
-from projections import deltas as d
-from projections.exact import metres_to_um
-from projections.model.export import state_document
-from projections.model.view import MapView
+from projections.fold import deltas as d
+from projections.fold.exact import metres_to_um
+from projections.map.export import state_document
+from projections.map.view import MapView
 from tests.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
 from tests.folds import Folded
 from tests.rooms_with_things import drives

@@ -13,16 +13,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.envelope import Offset
-from projections import deltas as d
+from eventsrc.envelope.model import Offset
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
 from projections.history.bisect import CountIndex, HistoryFacts
 from projections.history.diff import difference_of, rows_of
-from projections.model.digest import map_digest
-from projections.model.export import state_document, state_text
-from projections.model.records import Estimate, ObjectRecord, Relocation
-from projections.model.snapshot import dump_view, load_view, pack, unpack
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.export import state_document, state_text
+from projections.map.records import Estimate, ObjectRecord, Relocation
+from projections.map.snapshot import dump_view, load_view, pack, unpack
+from projections.map.view import MapView
 from tests.memory_history import MemoryHistory
 from tests.past_view import view_at
 from tests.synthetic_objects import STEPS, Step, SyntheticDeltas, random_steps

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projections.evidence import EvidenceConstants
-from projections.reducers.evidence_objects import EvidenceObjects
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.evidence_objects import EvidenceObjects
 from tests.evidence_pictures import a_room, fold_all, fold_one, pictures_of
 
 _OF_MATH = (
@@ -53,13 +53,13 @@ def test_no_float_is_raised_to_a_power() -> None:
     import ast
     import inspect
 
-    from projections import exact_functions
-    from projections.reducers import (
+    from projections.fold import (
         agreement,
         class_heights,
         evidence_matching,
         evidence_merging,
         evidence_objects,
+        exact_functions,
         label_counts,
         looks,
         presence,

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from eventsrc.envelope import DetId, Offset
-from projections.deltas import (
+from eventsrc.envelope.model import DetId, Offset
+from projections.fold import State
+from projections.fold.deltas import (
     ObjectClassified,
     ObjectEstimated,
     ObjectFound,
@@ -20,11 +21,10 @@ from projections.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.evidence import EvidenceConstants
-from projections.pair_groups import PairGroups
-from projections.reducers import State
-from projections.reducers.evidence_objects import EvidenceObjects, ObjectDelta
-from projections.reducers.thing_index import ThingIndex
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
+from projections.fold.pair_groups import PairGroups
+from projections.fold.thing_index import ThingIndex
 from tests.evidence_pictures import (
     DIM,
     Picture,

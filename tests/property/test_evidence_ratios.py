@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.evidence import EvidenceConstants
-from projections.exact_functions import cos_sin
-from projections.reducers.agreement import log_of, logs
-from projections.reducers.evidence_objects import EvidenceObjects
-from projections.reducers.label_counts import LabelCounts
-from projections.reducers.looks import LookRatios
-from projections.reducers.spots import Spots
-from projections.reducers.things import Thing
+from projections.fold.agreement import log_of, logs
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.evidence_objects import EvidenceObjects
+from projections.fold.exact_functions import cos_sin
+from projections.fold.label_counts import LabelCounts
+from projections.fold.looks import LookRatios
+from projections.fold.spots import Spots
+from projections.fold.things import Thing
 from tests.evidence_pictures import a_room, fold_one, pictures_of
 from tests.thorough import examples
 

@@ -15,9 +15,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.export import Origin, dot, geojson, graphml, nav2_waypoints, tables
-from projections.export.waypoints import NEAR_M
-from projections.model.view import MapView
+from projections.adapters.export import Origin, dot, geojson, graphml, nav2_waypoints, tables
+from projections.adapters.export.waypoints import NEAR_M
+from projections.map.view import MapView
 from tests.envelopes import detection, envelope
 from tests.folds import fold
 

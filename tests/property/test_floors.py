@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.corrections import Corrections, Keyframe
-from projections.deltas import PlacesMerged
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.corrections import Corrections, Keyframe
+from projections.fold.deltas import PlacesMerged
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot
+from projections.map.view import MapView
 from tests.envelopes import detection, envelope
 from tests.evidence_folds import recounted_votes
 from tests.folds import (

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.view import MapView
 from tests.live_rows import followed_and_rebuilt
 from tests.logs import write_log
 from tests.property.test_floors import buildings, drive

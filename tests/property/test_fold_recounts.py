@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import KeyframeAdded, ObjectFound, ObjectSeen, ObservationAdded
-from projections.model.digest import map_digest
-from projections.model.view import MapView
+from projections.fold.deltas import KeyframeAdded, ObjectFound, ObjectSeen, ObservationAdded
+from projections.map.digest import map_digest
+from projections.map.view import MapView
 from tests.envelopes import detection, envelope
 from tests.folds import (
     Folded,

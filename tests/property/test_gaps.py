@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.gaps import Gap, GapLedger
+from eventsrc.envelope.gaps import Gap, GapLedger
 
 SETTLE_NS = 5
 

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.format import (
@@ -24,7 +25,6 @@ from eventsrc.log.format import (
     mark_seed,
     read_head,
 )
-from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import BY_HAND, KEY, MEMORY_DISK, read_log
 from tests.thorough import examples
 

@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.commands import SameObject
-from eventsrc.envelope import Offset
-from eventsrc.ingest import Rejected, ingest
-from projections.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
-from projections.model.digest import map_digest
-from projections.model.export import state_document
-from projections.model.snapshot import restore, snapshot
-from projections.reducers.envelope_evidence import MOST_OF_A_PICTURE
-from projections.reducers.spots import Spots
-from projections.reducers.things import Thing
-from projections.settings import Settings
+from eventsrc.envelope.commands import SameObject
+from eventsrc.envelope.ingest import Rejected, ingest
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
+from projections.fold.envelope_evidence import MOST_OF_A_PICTURE
+from projections.fold.settings import Settings
+from projections.fold.spots import Spots
+from projections.fold.things import Thing
+from projections.map.digest import map_digest
+from projections.map.export import state_document
+from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope, payload
 from tests.folds import Folded
 from tests.thorough import examples

@@ -6,8 +6,8 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, Rejected, ingest, ingest_all
-from eventsrc.text import visible
+from eventsrc.base.text import visible
+from eventsrc.envelope.ingest import Accepted, Rejected, ingest, ingest_all
 from tests.envelopes import detection, envelope, payload
 
 TEXT = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=256)

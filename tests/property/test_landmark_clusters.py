@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.evidence import EvidenceConstants
-from projections.relocalize import Camera
-from projections.relocalize.camera import box_rows, views
-from projections.relocalize.triangulation import (
+from projections.fold.evidence import EvidenceConstants
+from projections.localize.relocalize import Camera
+from projections.localize.relocalize.camera import box_rows, views
+from projections.localize.relocalize.triangulation import (
     Points,
     cluster_points,
     estimate_positions,

@@ -6,16 +6,16 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import ObservationOrdinal
-from projections.relocalize import Crop, Match
-from projections.relocalize.decision import (
+from projections.fold.deltas import ObservationOrdinal
+from projections.localize.relocalize import Crop, Match
+from projections.localize.relocalize.decision import (
     MAX_ERROR_M,
     PLAIN_NEAREST,
     PLAIN_SHARE,
     least_error,
     stood_at,
 )
-from projections.relocalize.question import View
+from projections.localize.relocalize.question import View
 
 Place = tuple[float, float]
 PLACES = st.tuples(st.integers(-40, 40), st.integers(-40, 40)).map(

@@ -7,20 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.evidence import EvidenceConstants
-from projections.relocalize import Camera, MapConstants
-from projections.relocalize.appearance import DIRECTIONS, appearance_tables
-from projections.relocalize.camera import Sights, box_rows, sights
-from projections.relocalize.cues import Cue
-from projections.relocalize.landmarks import CropGroup, Landmarks
-from projections.relocalize.likelihood import (
+from projections.fold.evidence import EvidenceConstants
+from projections.localize.relocalize import Camera, MapConstants
+from projections.localize.relocalize.appearance import DIRECTIONS, appearance_tables
+from projections.localize.relocalize.camera import Sights, box_rows, sights
+from projections.localize.relocalize.cues import Cue
+from projections.localize.relocalize.landmarks import CropGroup, Landmarks
+from projections.localize.relocalize.likelihood import (
     Scene,
     log_likelihood,
     log_likelihood_of_place,
     log_likelihood_unaimed,
     terms_at,
 )
-from projections.relocalize.model import MODEL, Model
+from projections.localize.relocalize.model import MODEL, Model
 from tests.thorough import examples
 
 TURN = 2.0 * math.pi

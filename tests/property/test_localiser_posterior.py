@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.relocalize import Candidates, MapConstants, Match, Question, View, rank
-from projections.relocalize.grid import cells_near, distinct, log_prior
-from projections.relocalize.likelihood import Scene as Shared
-from projections.relocalize.likelihood import log_likelihood, terms_at
-from projections.relocalize.model import MODEL
-from projections.relocalize.movements import poses_at_views
-from projections.relocalize.pose import CELL_M, Posterior, _sighted, locate
+from projections.localize.relocalize import Candidates, MapConstants, Match, Question, View, rank
+from projections.localize.relocalize.grid import cells_near, distinct, log_prior
+from projections.localize.relocalize.likelihood import Scene as Shared
+from projections.localize.relocalize.likelihood import log_likelihood, terms_at
+from projections.localize.relocalize.model import MODEL
+from projections.localize.relocalize.movements import poses_at_views
+from projections.localize.relocalize.pose import CELL_M, Posterior, _sighted, locate
 from tests.relocalization.scenes import CONSTANTS, Pose, Scene, Thing, around, movement
 from tests.thorough import examples, rounds
 

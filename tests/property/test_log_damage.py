@@ -4,7 +4,7 @@ import contextlib
 import shutil
 from pathlib import Path
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import Event, LogWriter
 from eventsrc.log.durable_files import ALWAYS
 from eventsrc.log.mcap_records import MARK_BYTES

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
-from eventsrc.system_events import LOSS_KEY
 from tests.attack.corruption import corrupt_log
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
 from tests.thorough import stride

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from eventsrc.grey_images import BadImage, decode_grey_png, decode_rgba, encode_png
+from eventsrc.envelope.grey_images import BadImage, decode_grey_png, decode_rgba, encode_png
 
 
 def _saved(mode: str, kind: str) -> bytes:

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot
-from projections.reducers import current_map
-from projections.relocalize import CandidatePlace, Candidates, Match
-from projections.relocalize.floors import STEP_M, Layout
-from projections.relocalize.walls import WallMap
-from projections.settings import Settings
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold import current_map
+from projections.fold.settings import Settings
+from projections.localize.relocalize import CandidatePlace, Candidates, Match
+from projections.localize.relocalize.floors import STEP_M, Layout
+from projections.localize.relocalize.walls import WallMap
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot
 from tests.envelopes import envelope
 from tests.folds import Folded
 from tests.thorough import examples

@@ -10,16 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, file_head, head_metadata, segment_path
-from eventsrc.log.mcap_records import (
-    encode_mark,
-    encode_message_head,
-    encode_plain_chunk_head,
-)
+from eventsrc.log.mcap_records import encode_mark, encode_message_head, encode_plain_chunk_head
 from eventsrc.log.recover import TooManyLosses
-from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log, read_with_gaps, write_log
 from tests.thorough import stride

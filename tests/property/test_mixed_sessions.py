@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-from projections.relocalize import Answer, rank
+from projections.localize.relocalize import Answer, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of

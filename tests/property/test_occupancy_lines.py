@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.occupancy import OccupancyGrid, Point
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.occupancy import OccupancyGrid, Point
 from tests.thorough import examples
 
 ROWS, COLUMNS, SIDE_UM = 7, 9, 100_000

@@ -6,9 +6,9 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, ingest
+from eventsrc.envelope.ingest import Accepted, CheckedEnvelope, Rejected, ingest
+from eventsrc.envelope.upcast import check_envelopes, read_envelope, read_envelopes, read_fields
 from eventsrc.log import Event
-from eventsrc.upcast import check_envelopes, read_envelope, read_envelopes, read_fields
 from tests.envelopes import detection, envelope, fields_of
 
 KEY = "tb/detections"

@@ -5,7 +5,7 @@ from itertools import product
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.pair_groups import PairGroups, without_contradictions
+from projections.fold.pair_groups import PairGroups, without_contradictions
 
 Statement = tuple[tuple[str, str], bool]
 NAMES = "abcde"

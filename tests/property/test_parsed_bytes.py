@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, Rejected
+from eventsrc.envelope.ingest import Accepted, Rejected
+from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, LogReader
-from eventsrc.occupancy_map import OccupancyMap
-from projections.model.parsed_bytes import NoRoom, pack, unpack
-from projections.model.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
-from projections.reducers.folded_ids import content_digest
+from projections.fold.folded_ids import content_digest
+from projections.map.parsed_bytes import NoRoom, pack, unpack
+from projections.map.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from tests.envelopes import fields_of
 from tests.random_logs import write_random_log
 from tests.thorough import examples

@@ -7,12 +7,12 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot
+from projections.map.view import MapView
 from tests.folds import Folded
 from tests.logs import write_log
 from tests.property.test_floors import buildings

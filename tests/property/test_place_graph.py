@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.errors import QuestionError
-from projections.queries.place_graph import PlaceGraph, PlaceNode
+from projections.fold.errors import QuestionError
+from projections.postgres.queries.place_graph import PlaceGraph, PlaceNode
 
 SIZE = 6
 EDGES = st.dictionaries(

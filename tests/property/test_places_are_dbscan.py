@@ -6,10 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import PlacesMerged
-from projections.reducers.core_index import CoreIndex
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.places import Places
+from projections.fold.core_index import CoreIndex
+from projections.fold.deltas import PlacesMerged
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.places import Places
 from tests.folds import NaivePlaces, batch_dbscan, near_matrix
 
 Point = tuple[int, int, float]

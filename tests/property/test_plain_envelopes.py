@@ -8,8 +8,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.envelope import Detection, Envelope, EnvelopeCamera
-from eventsrc.ingest import (
+from eventsrc.envelope.ingest import (
     Accepted,
     CheckedEnvelope,
     Rejected,
@@ -18,8 +17,9 @@ from eventsrc.ingest import (
     ingest_all,
     ingest_plain,
 )
-from eventsrc.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope, read_plain
-from projections.reducers.folded_ids import content_digest
+from eventsrc.envelope.model import Detection, Envelope, EnvelopeCamera
+from eventsrc.envelope.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope, read_plain
+from projections.fold.folded_ids import content_digest
 from tests.envelopes import detection, envelope, fields_of, payload
 from tests.thorough import examples
 
@@ -202,7 +202,7 @@ def test_only_what_must_be_looked_at_is_asked_of_pydantic(monkeypatch: pytest.Mo
         asked.append(raw)
         return ingest(raw, **options)
 
-    monkeypatch.setattr("eventsrc.ingest.ingest", asking)
+    monkeypatch.setattr("eventsrc.envelope.ingest.ingest", asking)
     assert check_all(sound) == [checked(raw) for raw in sound]
     assert asked == []
     assert check_all([*sound, bad, *sound]) == [checked(raw) for raw in [*sound, bad, *sound]]

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from projections.deltas import EventSkipped, Pose
-from projections.evidence import EvidenceConstants
-from projections.model.digest import map_digest
-from projections.reducers.edited_events import _turned_covariance
-from projections.reducers.envelope_evidence import pose_error_of
-from projections.reducers.sights import PoseError, Sights
-from projections.settings import Settings
+from projections.fold.deltas import EventSkipped, Pose
+from projections.fold.edited_events import _turned_covariance
+from projections.fold.envelope_evidence import pose_error_of
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import Settings
+from projections.fold.sights import PoseError, Sights
+from projections.map.digest import map_digest
 from tests.envelopes import detection, envelope
 from tests.evidence_pictures import CAMERA, DIM, FOCAL, a_sighting
 from tests.folds import Folded, accepted

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import Offset
-from projections.deltas import (
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import (
     Delta,
     ObjectEstimated,
     ObjectFound,
@@ -29,9 +29,9 @@ from projections.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.exact_functions import cos_sin
-from projections.reducers.presence import Presence
-from projections.settings import Camera
+from projections.fold.exact_functions import cos_sin
+from projections.fold.presence import Presence
+from projections.fold.settings import Camera
 
 CAMERA = Camera(hfov_deg=70.0)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.relocalize import Answer, Candidates, Crop, rank
+from projections.localize.relocalize import Answer, Candidates, Crop, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of

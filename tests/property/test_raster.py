@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.drawing.base_layers import FAR_M, REACH_M, Raster
+from projections.adapters.drawing.base_layers import FAR_M, REACH_M, Raster
 
 BOUNDS = (-3.0, -2.0, 4.0, 3.0)
 COORDINATE = st.floats(-6.0, 6.0)

@@ -5,8 +5,8 @@ from decimal import Decimal, localcontext
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from projections.reducers.core_index import NEIGHBOUR_CELLS, cell_side_um
-from projections.reducers.reach_index import ReachIndex, from_side
+from projections.fold.core_index import NEIGHBOUR_CELLS, cell_side_um
+from projections.fold.reach_index import ReachIndex, from_side
 from tests.thorough import examples
 
 EPS_UM = 1_500_000

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from projections.relocalize import rank
+from projections.localize.relocalize import rank
 from tests.relocalization.recorded import FILE, numbers, questions
 
 

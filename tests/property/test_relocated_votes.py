@@ -5,9 +5,9 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import Offset
-from projections.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceOrdinal
-from projections.reducers.located_in import LocatedIn
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceOrdinal
+from projections.fold.located_in import LocatedIn
 
 STEPS = st.lists(
     st.tuples(

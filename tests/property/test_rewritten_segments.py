@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from mcap.writer import CompressionType
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, segment_path
-from eventsrc.system_events import LOSS_KEY
 from tests.commands import Commands
 from tests.fixtures_log import KEY, envelope, read_log
 from tests.rewriting import plainly_read, rewrite

@@ -7,11 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.corrections import Keyframe
-from projections.deltas import KeyframePlaced, MergeRefused, PlaceChanged, PlaceFormed, PlacesMerged
-from projections.pair_groups import PairGroups, without_contradictions
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.rooms import Rooms
+from projections.fold.corrections import Keyframe
+from projections.fold.deltas import (
+    KeyframePlaced,
+    MergeRefused,
+    PlaceChanged,
+    PlaceFormed,
+    PlacesMerged,
+)
+from projections.fold.pair_groups import PairGroups, without_contradictions
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.rooms import Rooms
 from tests.naive_rooms import NaiveRooms
 from tests.thorough import stride
 

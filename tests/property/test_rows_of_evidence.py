@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections import deltas as d
-from projections.corrections import NO_CORRECTIONS, Corrections
-from projections.database.graph_render import object_rows
-from projections.database.labels import COUNT_KEYS, LABELS, TABLE
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.model.changes import ChangeTracker
-from projections.model.records import Estimate
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.fold import deltas as d
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.settings import Settings
+from projections.map.changes import ChangeTracker
+from projections.map.records import Estimate
+from projections.map.view import MapView
+from projections.postgres.graph_render import object_rows
+from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
+from projections.postgres.memory_sink import MemorySink, MemoryTables
 from tests.rows import memory_rows
 from tests.synthetic_objects import (
     STEPS,

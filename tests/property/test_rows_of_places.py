@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.commands import Join
-from projections.database.memory_sink import MemoryTables
-from projections.deltas import KeyframePlaced, PlaceFormed, PlacesMerged
-from projections.settings import Settings
+from eventsrc.envelope.commands import Join
+from projections.fold.deltas import KeyframePlaced, PlaceFormed, PlacesMerged
+from projections.fold.settings import Settings
+from projections.postgres.memory_sink import MemoryTables
 from tests.envelopes import envelope
 from tests.fixtures_corrections import anchor
 from tests.folds import Folded

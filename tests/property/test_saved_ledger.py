@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc import gap_history as _ledger_cache
-from eventsrc.append import append_payload
-from eventsrc.gap_history import MAX_BYTES, encode, fold_and_save_ledger, ledger_of
-from eventsrc.gaps import GapLedger, RunState, is_consistent
+from eventsrc.envelope.gaps import GapLedger, RunState, is_consistent
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.log.format import LEDGER
+from eventsrc.record import gap_history as _ledger_cache
+from eventsrc.record.append import append_payload
+from eventsrc.record.gap_history import MAX_BYTES, encode, fold_and_save_ledger, ledger_of
 from tests.envelopes import envelope, payload
 
 KEYFRAMES = (1, 2, 5, 6, 9)

@@ -9,15 +9,15 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import FIRST_OFFSET
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.envelope.model import FIRST_OFFSET
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss
 from eventsrc.log import ALWAYS, Event, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal as _parts
 from eventsrc.log.format import SEALED_END
 from eventsrc.log.sealed_segment import SealedFile
-from eventsrc.log_info import log_info
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, Loss
+from eventsrc.record.log_info import log_info
 from tests.fixtures_log import (
     BY_HAND,
     KEY,

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import Offset
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, Event, Finding, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import seal as _seal
 from eventsrc.log.format import SEALED_END
 from eventsrc.log.sealed_end import sealed_end
 from eventsrc.log.sealed_segment import SealedFile
-from eventsrc.log_info import log_info
-from eventsrc.system_events import LOSS_KEY
+from eventsrc.record.log_info import log_info
 from tests.fixtures_log import envelope, read_log, write_log
 from tests.thorough import stride
 

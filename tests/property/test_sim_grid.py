@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from eventsrc.errors import MapfoldError
-from eventsrc.sim.grid import DriveGrid
-from eventsrc.sim.shapes import Point, Rect, Segment, Walls
-from eventsrc.sim.tour import nearest_by_route
+from eventsrc.adapters.sim.grid import DriveGrid
+from eventsrc.adapters.sim.shapes import Point, Rect, Segment, Walls
+from eventsrc.adapters.sim.tour import nearest_by_route
+from eventsrc.base.errors import MapfoldError
 
 OUTLINE = Rect(0.0, 0.0, 6.0, 4.0)
 SPOTS: list[Point] = [(1.0, 1.0), (5.0, 1.0), (5.0, 3.0), (1.0, 3.0)]

@@ -6,11 +6,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.deltas import Delta
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot, unpack
-from projections.reducers.adjacency import Adjacency
-from projections.settings import Settings
+from projections.fold.adjacency import Adjacency
+from projections.fold.deltas import Delta
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot, unpack
 from tests.folds import Folded, fold
 from tests.property.test_fold_recounts import SETTINGS, runs
 

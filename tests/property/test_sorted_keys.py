@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.reducers import adjacency as _sorted_keys
-from projections.reducers.adjacency import SortedKeys
+from projections.fold import adjacency as _sorted_keys
+from projections.fold.adjacency import SortedKeys
 
 
 def _check(order: list[int]) -> None:

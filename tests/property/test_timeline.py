@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
+from projections.fold.settings import Settings
 from projections.history import Expression, Timeline
 from projections.history.bisect import Search
 from projections.history.diff import rows_of
 from projections.history.merges import chains_of
-from projections.history.records import Merge
-from projections.model.digest import map_digest
-from projections.model.export import state_document
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.export import state_document
+from projections.map.fold import fold_log
+from projections.map.view import MapView
+from projections.store.records import Merge
 from tests.fixtures_timetravel import walks, write_log
 from tests.thorough import examples
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.append import append_payload
-from eventsrc.commands import Command
+from eventsrc.envelope.commands import Command
 from eventsrc.log import LogWriter, parse_fsync
+from eventsrc.record.append import append_payload
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.settings import Settings
 from tests.commands_in_logs import append_to
 from tests.envelopes import envelope, payload
 from tests.fixtures_corrections import corrected_walks
@@ -43,12 +43,12 @@ def quick(number: int) -> settings:
 @contextmanager
 def kept_early(stripe: int = 7) -> Iterator[None]:
     """Keep the history of a log of any length, in stripes of a few events."""
-    history = "projections.history"
+    store = "projections.store"
     with (
-        patch(f"{history}.timeline_cache.MIN_EVENTS", 1),
-        patch(f"{history}.column_rows.STRIPE_EVENTS", stripe),
-        patch(f"{history}.tables.STRIPE_EVENTS", 2 * stripe),
-        patch(f"{history}.columns.STRIPE_EVENTS", 4 * stripe),
+        patch(f"{store}.timeline_cache.MIN_EVENTS", 1),
+        patch(f"{store}.column_rows.STRIPE_EVENTS", stripe),
+        patch(f"{store}.tables.STRIPE_EVENTS", 2 * stripe),
+        patch(f"{store}.columns.STRIPE_EVENTS", 4 * stripe),
     ):
         yield
 
@@ -246,7 +246,7 @@ def test_a_history_of_another_version_is_not_used(tmp_path: Path, version: int) 
     log = tmp_path / "log"
     with kept_early():
         append(log, [_envelope(n) for n in range(12)])
-        with patch("projections.history.part_file.FORMAT", version):
+        with patch("projections.store.part_file.FORMAT", version):
             check(log, RULES, [12])
         notes: list[str] = []
         check(log, RULES, [12], notes)

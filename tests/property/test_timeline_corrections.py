@@ -10,19 +10,19 @@ from typing import Any
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.commands import Command, NamePlace
+from eventsrc.envelope.commands import Command, NamePlace
 from eventsrc.log import LogReader
-from projections.corrections import Corrections, compile_corrections
+from projections.fold.corrections import Corrections, compile_corrections
+from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.diff import rows_of
 from projections.history.parallel import Rules
 from projections.history.whatif import command_trials, what_if
-from projections.model.digest import map_digest
-from projections.model.export import state_document
-from projections.model.fold import fold_log
-from projections.model.log_commands import read_commands, read_corrections
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.export import state_document
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_commands, read_corrections
+from projections.map.view import MapView
 from tests.commands_in_logs import forget_keyframes, undo
 from tests.envelopes import envelope
 from tests.fixtures_corrections import anchor, corrected_walks, write_mixed_log

@@ -9,11 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.relocalize import Answer, PoseHypothesis, Question, Track, View, movement_of, rank
-from projections.relocalize.floors import Hypotheses
-from projections.relocalize.question import MAX_CROPS, Movement
-from projections.relocalize.reading import MAX_MOVED_M, MAX_TURNED_RAD
-from projections.relocalize.track import PARTICLES, _resampled
+from projections.localize.relocalize import (
+    Answer,
+    PoseHypothesis,
+    Question,
+    Track,
+    View,
+    movement_of,
+    rank,
+)
+from projections.localize.relocalize.floors import Hypotheses
+from projections.localize.relocalize.question import MAX_CROPS, Movement
+from projections.localize.relocalize.reading import MAX_MOVED_M, MAX_TURNED_RAD
+from projections.localize.relocalize.track import PARTICLES, _resampled
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of

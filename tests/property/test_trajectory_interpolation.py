@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import KeyframeId
-from eventsrc.trajectory import Trajectory, TrajectoryPose
+from eventsrc.envelope.model import KeyframeId
+from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
 from projections.edit.poses import RunKeyframe, lay
 
 MILLISECONDS = st.integers(0, 60_000)

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.evidence import EvidenceConstants
-from projections.reducers.looks import LookRatios, LookScale, looks_of
-from projections.reducers.spots import Spots
-from projections.reducers.things import Thing
-from projections.reducers.turned_looks import turned_looks
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.looks import LookRatios, LookScale, looks_of
+from projections.fold.spots import Spots
+from projections.fold.things import Thing
+from projections.fold.turned_looks import turned_looks
 from tests.thorough import examples
 
 DIM = 48

@@ -9,19 +9,19 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from eventsrc.commands import Command
+from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
-from projections.corrections import Corrections
-from projections.deltas import ObjectMissing, ObjectRelocated
-from projections.model.fold import fold_events, fold_log
-from projections.model.log_commands import read_corrections
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
-from projections.ui.binary import packed_arrays
-from projections.ui.columns import history_columns
-from projections.ui.log_map import LogMap
-from projections.ui.opened import Opened
+from projections.fold.corrections import Corrections
+from projections.fold.deltas import ObjectMissing, ObjectRelocated
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.fold import fold_events, fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
+from projections.surfaces.ui.binary import packed_arrays
+from projections.surfaces.ui.columns import history_columns
+from projections.surfaces.ui.log_map import LogMap
+from projections.surfaces.ui.opened import Opened
 from tests.fixtures_corrections import corrected_walks, write_mixed_log
 from tests.logs import write_log
 from tests.thorough import rounds

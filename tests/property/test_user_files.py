@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.detector.encoder import read_preparation
-from eventsrc.errors import MapfoldError, MisuseError
-from eventsrc.importers.map_yaml import read_map_yaml
-from eventsrc.label_files import read_label_file
-from eventsrc.trajectory import read_trajectory
-from eventsrc.user_files import MAX_DEPTH, FileFault, parse_json, read_file
-from projections.cli.options import question_from, settings_from
-from projections.errors import QuestionError, SettingsError
-from projections.evaluate.truth import read_truth
-from projections.fleet.sites import find_sites
-from projections.relocalize import parse_question
+from eventsrc.adapters.detector.encoder import read_preparation
+from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.base.label_files import read_label_file
+from eventsrc.base.user_files import MAX_DEPTH, FileFault, parse_json, read_file
+from eventsrc.envelope.trajectory import read_trajectory
+from eventsrc.record.importers.map_yaml import read_map_yaml
+from projections.adapters.fleet.sites import find_sites
+from projections.fold.errors import QuestionError, SettingsError
+from projections.localize.evaluate.truth import read_truth
+from projections.localize.relocalize import parse_question
+from projections.surfaces.cli.options import question_from, settings_from
 
 GOOD = """\
 image: map.pgm

@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
+from projections.fold.settings import Settings
 from projections.history.whatif import what_if
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log
+from projections.map.view import MapView
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import walks, write_log
 from tests.thorough import examples, rounds

@@ -6,9 +6,9 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.naive_map import NaiveMap

@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import event, given
 from hypothesis import strategies as st
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectedPose,
@@ -23,12 +23,12 @@ from eventsrc.commands import (
     Undo,
     UndoMerge,
 )
-from eventsrc.envelope import Offset
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.deltas import MergeRefused, ObjectsMerged, PlacesMerged
-from projections.model.digest import map_digest
-from projections.model.snapshot import restore, snapshot
-from projections.settings import Settings
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.deltas import MergeRefused, ObjectsMerged, PlacesMerged
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.naive_corrected import NaiveCorrectedMap, corrected

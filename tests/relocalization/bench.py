@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 from eventsrc.log import NEVER, LogWriter
-from eventsrc.transport.session import ZenohOptions, open_session
-from projections.database import rebuild
-from projections.database.connection import Targets
-from projections.database.embedded import EmbeddedServer
-from projections.queries.relocalize import CandidateReader
-from projections.relocalize import Crop, Question, View, rank
-from projections.settings import Settings
+from eventsrc.record.transport.session import ZenohOptions, open_session
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Crop, Question, View, rank
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.queries.relocalize import CandidateReader
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import crops_of
@@ -177,7 +177,7 @@ def payload(crops: Sequence[Crop]) -> bytes:
 
 def over_zenoh(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
     """One client, then eight, against ``mapfold serve`` in a process of its own."""
-    command = [sys.executable, "-m", "projections.cli", "serve", "--listen", ENDPOINT]
+    command = [sys.executable, "-m", "projections.surfaces.cli", "serve", "--listen", ENDPOINT]
     command += ["--db", targets.graph_url, "--rate", "100000"]
     service = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert service.stderr is not None

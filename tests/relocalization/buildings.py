@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.ingest import Accepted
+from eventsrc.envelope.ingest import Accepted
 
 WIDTH, HEIGHT, HALF_FOV = 640.0, 400.0, math.radians(69.4 / 2)
 FOCAL = WIDTH / 2 / math.tan(HALF_FOV)

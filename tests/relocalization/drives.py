@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from eventsrc.envelope import DetId, Envelope
-from eventsrc.ingest import Accepted
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import DetId, Envelope
 from tests.relocalization.buildings import (
     FOCAL,
     HALF_FOV,

@@ -23,20 +23,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.calibrate.localiser import Line, fit_line, logit
-from projections.evaluate.own_questions import ask_own_questions
-from projections.evaluate.scores import (
+from projections.localize.calibrate.localiser import Line, fit_line, logit
+from projections.localize.evaluate.own_questions import ask_own_questions
+from projections.localize.evaluate.scores import (
     auroc,
     calibration_floor,
     expected_calibration_error,
     instances_of,
 )
-from projections.evaluate.trials import RIGHT_WITHIN_M
-from projections.model.view import MapView
-from projections.relocalize import ExactIndex, certainty, features
-from projections.relocalize.likelihood import Scene
-from projections.relocalize.model import MODEL
-from projections.relocalize.pose import locate
+from projections.localize.evaluate.trials import RIGHT_WITHIN_M
+from projections.localize.relocalize import ExactIndex, certainty, features
+from projections.localize.relocalize.likelihood import Scene
+from projections.localize.relocalize.model import MODEL
+from projections.localize.relocalize.pose import locate
+from projections.map.view import MapView
 from tests.bench.truth.localising import asked, make_map, stranger_of
 from tests.bench.truth.worlds import CACHE, WORLDS, Case, load_generator, make_case, pairs
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from projections.relocalize import Answer, Candidates, Question, View, rank
+from projections.localize.relocalize import Answer, Candidates, Question, View, rank
 from tests.relocalization.buildings import Building, Keyframe
 from tests.relocalization.drives import drive
 from tests.relocalization.rooms import RoomMap, crops_of

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from projections.exact import quantise, to_float32
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.relocalize import CandidatePlace, Candidates, Crop, ExactIndex, Match
-from projections.settings import Settings
+from projections.fold.exact import quantise, to_float32
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.localize.relocalize import CandidatePlace, Candidates, Crop, ExactIndex, Match
+from projections.map.view import MapView
 from tests.relocalization.buildings import Keyframe
 
 

@@ -1,7 +1,7 @@
 """Small scenes for the localiser: things on a plane, mapped views of them, a question, candidates.
 
 No embeddings: a match's cosine is made from whether it shows the same thing and from the change of
-side, as `projections.evidence` describes it.
+side, as `projections.fold.evidence` describes it.
 """
 
 import math
@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from projections.evidence import EvidenceConstants
-from projections.relocalize import (
+from projections.fold.evidence import EvidenceConstants
+from projections.localize.relocalize import (
     Camera,
     Candidates,
     Crop,
@@ -21,7 +21,7 @@ from projections.relocalize import (
     Question,
     View,
 )
-from projections.relocalize.question import Box
+from projections.localize.relocalize.question import Box
 
 Pose = tuple[float, float, float]
 EVIDENCE = EvidenceConstants(range_m=2.5)

@@ -20,10 +20,10 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter, follow, recover_log, verify_log
 from eventsrc.log.mcap_records import MARK_BYTES
-from eventsrc.log_info import log_info
+from eventsrc.record.log_info import log_info
 from tests.fixtures_log import BY_HAND, MEMORY_DISK
 from tests.thorough import examples
 

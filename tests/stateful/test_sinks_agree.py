@@ -28,18 +28,18 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from eventsrc.commands import Command, SameObject, UseSettings
-from eventsrc.envelope import Offset
+from eventsrc.envelope.commands import Command, SameObject, UseSettings
+from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.corrections import Corrections
-from projections.database import rebuild, tail
-from projections.database.connection import Targets, connect
-from projections.database.live_fold import LiveFold
-from projections.database.loader import LoaderName
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.errors import FoldError
-from projections.model.log_commands import read_corrections
-from projections.settings import Settings
+from projections.fold.corrections import Corrections
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
+from projections.map.log_commands import read_corrections
+from projections.postgres import rebuild, tail
+from projections.postgres.connection import Targets, connect
+from projections.postgres.live_fold import LiveFold
+from projections.postgres.loader import LoaderName
+from projections.postgres.memory_sink import MemorySink, MemoryTables
 from tests.commands_in_logs import (
     append_command,
     command,

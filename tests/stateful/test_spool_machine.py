@@ -8,9 +8,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from eventsrc.errors import SpoolFull
-from eventsrc.robot.acks import Ack, Refusal, Refusals, payload_sha256
-from eventsrc.robot.spool import Refused, Spool, Spooled
+from eventsrc.base.errors import SpoolFull
+from eventsrc.record.robot.acks import Ack, Refusal, Refusals, payload_sha256
+from eventsrc.record.robot.spool import Refused, Spool, Spooled
 from tests.thorough import examples
 
 MAX_BYTES = 60

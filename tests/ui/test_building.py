@@ -13,11 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Page, expect
 
+from eventsrc.adapters.sim import simulate_run
+from eventsrc.adapters.sim.house import occupancy_map
+from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
+from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import NEVER, LogWriter
-from eventsrc.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
-from eventsrc.sim import simulate_run
-from eventsrc.sim.house import occupancy_map
-from eventsrc.system_events import MAP_KEY
 from tests.commands import Commands
 from tests.envelopes import payload
 from tests.logs import KEY, write_log

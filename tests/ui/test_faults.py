@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, Route, expect
 
-from projections.ui.live import MOST_STREAMS
+from projections.surfaces.ui.live import MOST_STREAMS
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.logs import write_log

@@ -9,11 +9,11 @@ from typing import Any
 from playwright.sync_api import Page, expect
 
 from eventsrc.log import LogReader
-from projections.model.digest import map_digest
-from projections.model.fold import fold_events
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_events
+from projections.map.view import MapView
 from tests.commands import Commands
 from tests.ui.browser import digest, pixels, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit

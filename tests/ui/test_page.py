@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 import pytest
 from playwright.sync_api import expect
 
-from eventsrc.commands import Anchor, NamePlace, encode_command
+from eventsrc.envelope.commands import Anchor, NamePlace, encode_command
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogWriter
-from eventsrc.system_events import COMMAND_KEY
 from tests.commands import Commands
 from tests.envelopes import detection, envelope
 from tests.logs import append_raw, write_log
@@ -20,8 +20,8 @@ from tests.shared_data import ROOT, shared_run
 from tests.ui.conftest import ALL, SAMPLE, WIDE, Visit
 from tests.ui_server import UiServer, showing
 
-WEB = ROOT / "projections" / "ui" / "web"
-STATIC = ROOT / "projections" / "ui" / "static"
+WEB = ROOT / "projections" / "surfaces" / "ui" / "web"
+STATIC = ROOT / "projections" / "surfaces" / "ui" / "static"
 MOST_SCRIPT = 80_000
 HOSTILE = (
     "<script>document.title='owned'</script>",

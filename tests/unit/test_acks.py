@@ -5,7 +5,7 @@ import hashlib
 import pytest
 from pydantic import ValidationError
 
-from eventsrc.robot.acks import (
+from eventsrc.record.robot.acks import (
     ACK_PREFIX,
     Ack,
     Refusal,

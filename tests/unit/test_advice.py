@@ -2,8 +2,8 @@
 
 import pytest
 
-from projections.model.advice import places_advice
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.advice import places_advice
 
 PAGE, ROOMS = Settings(), Settings(places="rooms")
 

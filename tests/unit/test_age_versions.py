@@ -2,7 +2,7 @@
 
 import pytest
 
-from projections.database.cypher import enforces_row_security
+from projections.postgres.cypher import enforces_row_security
 
 
 @pytest.mark.parametrize(

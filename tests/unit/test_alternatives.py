@@ -2,9 +2,9 @@
 
 import pytest
 
-from projections.errors import SettingsError
+from projections.fold.errors import SettingsError
+from projections.fold.settings import Settings
 from projections.history.whatif import alternatives, settings_name
-from projections.settings import Settings
 
 BASE = Settings()
 

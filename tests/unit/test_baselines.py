@@ -5,10 +5,10 @@ import statistics
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import RunId
-from projections.deltas import ObservationOrdinal
-from projections.evaluate.baselines import NEAREST, best_cosine, plain_position
-from projections.relocalize import Match
+from eventsrc.envelope.model import RunId
+from projections.fold.deltas import ObservationOrdinal
+from projections.localize.evaluate.baselines import NEAREST, best_cosine, plain_position
+from projections.localize.relocalize import Match
 
 Spot = tuple[float, float] | None
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import cache_folder, cache_sizes, make_cache_folder
-from projections.corrections import NO_CORRECTIONS
+from projections.fold.corrections import NO_CORRECTIONS
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.model.snapshot_cache import SnapshotCache
-from projections.settings import Settings
+from projections.map.snapshot_cache import SnapshotCache
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log
 from tests.property.test_timeline_cache import kept_early

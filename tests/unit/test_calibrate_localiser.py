@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.calibrate.localiser import (
+from projections.fold.settings import LocalizerConstants
+from projections.localize.calibrate.localiser import (
     CONFIDENCE_USUAL,
     KNOWN_USUAL,
     Line,
@@ -18,12 +19,11 @@ from projections.calibrate.localiser import (
     fit_line,
     logit,
 )
-from projections.calibrate.report import localiser_document, localiser_text
-from projections.evaluate.own_questions import OwnAnswer
-from projections.evaluate.own_scores import own_scores
-from projections.relocalize import Answer
-from projections.relocalize.certainty import probability
-from projections.settings import LocalizerConstants
+from projections.localize.calibrate.report import localiser_document, localiser_text
+from projections.localize.evaluate.own_questions import OwnAnswer
+from projections.localize.evaluate.own_scores import own_scores
+from projections.localize.relocalize import Answer
+from projections.localize.relocalize.certainty import probability
 
 
 def _answer(

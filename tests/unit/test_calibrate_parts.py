@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.calibrate import looks, shrinking, things
-from projections.calibrate.sightings import Row, Sightings, sightings_of
-from projections.deltas import Pose
-from projections.exact import metres_to_um, quantise
-from projections.settings import Camera
+from projections.fold.deltas import Pose
+from projections.fold.exact import metres_to_um, quantise
+from projections.fold.settings import Camera
+from projections.localize.calibrate import looks, shrinking, things
+from projections.localize.calibrate.sightings import Row, Sightings, sightings_of
 
 CAMERA = Camera(hfov_deg=90.0, width_px=800.0, height_px=600.0)
 FOCAL = 400.0

@@ -2,7 +2,7 @@
 
 import pytest
 
-from projections.deltas import (
+from projections.fold.deltas import (
     Delta,
     KeyframeAdded,
     KeyframePlaced,
@@ -12,12 +12,12 @@ from projections.deltas import (
     PlacesMerged,
     Pose,
 )
+from projections.fold.settings import Settings
 from projections.history.explanation import explain_place
 from projections.history.merges import merge_document
-from projections.history.records import Cause, cause_of
 from projections.history.rendering import explanation_text, merge_row, merge_text
 from projections.history.same_place import explain_same_place
-from projections.settings import Settings
+from projections.store.records import Cause, cause_of
 from tests.memory_history import MemoryHistory
 
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.grid_messages import is_grid_message, read_grid_message
-from eventsrc.occupancy_map import InvalidMap, OccupancyMap, decode_map
+from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from tests.envelopes import payload
 from tests.maps import cdr_message, drawn_map, grid_message
 from tests.thorough import examples, rounds

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope import RunId
-from projections.deltas import ObservationOrdinal
-from projections.relocalize import Crop, MapConstants, Match, rank
-from projections.relocalize.candidates import Candidates
-from projections.relocalize.certainty import known_features, known_probability
-from projections.settings import LocalizerConstants
+from eventsrc.envelope.model import RunId
+from projections.fold.deltas import ObservationOrdinal
+from projections.fold.settings import LocalizerConstants
+from projections.localize.relocalize import Crop, MapConstants, Match, rank
+from projections.localize.relocalize.candidates import Candidates
+from projections.localize.relocalize.certainty import known_features, known_probability
 
 CROP = Crop(np.ones(1, dtype=np.float32))
 NAMED = Crop(None, class_name="chair")

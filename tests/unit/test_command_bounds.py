@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     KINDS,
     MAX_COMMAND_BYTES,
     MAX_JSON_VALUES,

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     KINDS,
     Anchor,
     Command,
@@ -23,8 +23,8 @@ from eventsrc.commands import (
     encode_command,
     parse_command,
 )
-from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
-from projections.corrections import (
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from projections.fold.corrections import (
     NO_CORRECTIONS,
     Corrections,
     Keyframe,
@@ -32,7 +32,7 @@ from projections.corrections import (
     compile_corrections,
     map_fingerprint,
 )
-from projections.settings import Settings
+from projections.fold.settings import Settings
 
 A, B, C = (Anchor(run_id=RunId("r"), keyframe_id=KeyframeId(k)) for k in (1, 2, 3))
 KEY = [Keyframe(RunId("r"), KeyframeId(k)) for k in (1, 2, 3)]

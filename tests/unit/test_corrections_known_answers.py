@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import (
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectedPose,
@@ -17,13 +17,13 @@ from eventsrc.commands import (
     RigidTransform,
     SameObject,
 )
-from eventsrc.envelope import Offset
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.deltas import MergeRefused, ObjectsMerged, PlaceLink, PlacesMerged
-from projections.errors import ImpossibleCommand
-from projections.model.changes import ChangeTracker
-from projections.reducers.objects import object_id
-from projections.settings import Settings
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.deltas import MergeRefused, ObjectsMerged, PlaceLink, PlacesMerged
+from projections.fold.errors import ImpossibleCommand
+from projections.fold.objects import object_id
+from projections.fold.settings import Settings
+from projections.map.changes import ChangeTracker
 from tests.envelopes import detection, envelope
 from tests.folds import Folded, accepted
 

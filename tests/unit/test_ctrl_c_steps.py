@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from projections.cli.signals import ctrl_c_between_steps
+from projections.surfaces.cli.signals import ctrl_c_between_steps
 
 _HANDLER = signal.getsignal(signal.SIGINT)
 

@@ -7,7 +7,7 @@ from typing import get_args
 import msgspec
 import pytest
 
-from projections.deltas import (
+from projections.fold.deltas import (
     Delta,
     EventSkipped,
     KeyframePlaced,

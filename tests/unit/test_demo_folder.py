@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from projections.demo.folder import fresh_folder
+from eventsrc.base.errors import MisuseError
+from projections.surfaces.demo.folder import fresh_folder
 
 
 def test_a_second_demo_in_the_same_folder_is_refused(tmp_path: Path) -> None:

@@ -5,18 +5,18 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import Anchor, NamePlace, UndoMerge
-from eventsrc.envelope import KeyframeId, Offset, RunId
-from projections.corrections import RecordedCommand
-from projections.database import RebuildReport
-from projections.database.labels import LABELS, TABLE
-from projections.demo import report
-from projections.demo.correcting import Corrected
-from projections.demo.mapping import Folded, Part, RoomMerge, most_telling
-from projections.demo.recording import Followed, Recorded
-from projections.demo.report import DemoResult, type_lines
-from projections.model.view import MapView
-from projections.settings import Settings
+from eventsrc.envelope.commands import Anchor, NamePlace, UndoMerge
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
+from projections.fold.corrections import RecordedCommand
+from projections.fold.settings import Settings
+from projections.map.view import MapView
+from projections.postgres import RebuildReport
+from projections.postgres.labels import LABELS, TABLE
+from projections.surfaces.demo import report
+from projections.surfaces.demo.correcting import Corrected
+from projections.surfaces.demo.mapping import Folded, Part, RoomMerge, most_telling
+from projections.surfaces.demo.recording import Followed, Recorded
+from projections.surfaces.demo.report import DemoResult, type_lines
 from tests.envelopes import detection, envelope
 from tests.folds import fold
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eventsrc.detector.heads import HEADS, HeadError
+from eventsrc.adapters.detector.heads import HEADS, HeadError
 
 SIZE = (64, 32)
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from onnx import TensorProto
 
-from eventsrc.detector import vision
-from eventsrc.detector.encoder import Encoder, read_preparation
-from eventsrc.detector.finder import COCO, Finder, FinderOptions, read_labels
-from eventsrc.detector.onnx_model import ModelError, OnnxModel
-from eventsrc.detector.vision import Scaling, planes
-from eventsrc.errors import MisuseError
+from eventsrc.adapters.detector import vision
+from eventsrc.adapters.detector.encoder import Encoder, read_preparation
+from eventsrc.adapters.detector.finder import COCO, Finder, FinderOptions, read_labels
+from eventsrc.adapters.detector.onnx_model import ModelError, OnnxModel
+from eventsrc.adapters.detector.vision import Scaling, planes
+from eventsrc.base.errors import MisuseError
 from tests.tiny_models import DIMENSION, Graph, colour_detector, fixed_answer, mean_colour_encoder
 
 RED, BLUE = (255, 0, 0), (0, 64, 255)

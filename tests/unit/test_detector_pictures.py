@@ -8,9 +8,9 @@ import zlib
 import numpy as np
 import pytest
 
-from eventsrc.detector.picture import PictureError, check_picture, split_stream
-from eventsrc.detector.vision import decode, encode_jpeg, fitted
-from eventsrc.grey_images import encode_png
+from eventsrc.adapters.detector.picture import PictureError, check_picture, split_stream
+from eventsrc.adapters.detector.vision import decode, encode_jpeg, fitted
+from eventsrc.envelope.grey_images import encode_png
 
 
 def _noise(
@@ -83,7 +83,7 @@ def test_a_damaged_png_is_found_by_its_crc() -> None:
 def test_what_others_print_meanwhile_goes_on(capfd: pytest.CaptureFixture[str]) -> None:
     import os
 
-    from eventsrc.detector import vision
+    from eventsrc.adapters.detector import vision
 
     with vision._decoder_messages() as messages:
         os.write(2, b"a line of another thread\n")

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.detector.files import Timing, open_images
-from eventsrc.detector.gate import Pose
-from eventsrc.detector.live import NewestQueue
-from eventsrc.detector.messages import MessageError, picture_of, pose_of
-from eventsrc.detector.picture import Picture, PictureError
-from eventsrc.detector.poses import LivePoses, poses_of_file
-from eventsrc.detector.vision import encode_jpeg
-from eventsrc.errors import MisuseError
-from eventsrc.sim.pictures import compressed_image
-from eventsrc.transport.session import Received
+from eventsrc.adapters.detector.files import Timing, open_images
+from eventsrc.adapters.detector.gate import Pose
+from eventsrc.adapters.detector.live import NewestQueue
+from eventsrc.adapters.detector.messages import MessageError, picture_of, pose_of
+from eventsrc.adapters.detector.picture import Picture, PictureError
+from eventsrc.adapters.detector.poses import LivePoses, poses_of_file
+from eventsrc.adapters.detector.vision import encode_jpeg
+from eventsrc.adapters.sim.pictures import compressed_image
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.transport.session import Received
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 JPEG = encode_jpeg(PIXELS)

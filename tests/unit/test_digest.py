@@ -4,8 +4,8 @@ import hashlib
 import json
 from typing import Any
 
-from projections.model.digest import map_digest
-from projections.model.view import MapView
+from projections.map.digest import map_digest
+from projections.map.view import MapView
 from tests.envelopes import detection, envelope
 from tests.folds import Folded, fold
 

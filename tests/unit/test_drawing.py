@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.sim import build_house
-from projections import deltas as d
-from projections.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
-from projections.drawing.canvas import Canvas
-from projections.drawing.picture import compose, legend_lines
-from projections.model.view import MapView
-from projections.palette import place_colour
-from projections.settings import Settings
+from eventsrc.adapters.sim import build_house
+from eventsrc.base.errors import MisuseError
+from projections.adapters.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
+from projections.adapters.drawing.canvas import Canvas
+from projections.adapters.drawing.picture import compose, legend_lines
+from projections.adapters.palette import place_colour
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 
 pytestmark = pytest.mark.seconds
 

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.patches import Ellipse
 
-from projections import deltas as d
-from projections.drawing import Floor, draw_map
-from projections.drawing.canvas import Canvas
-from projections.drawing.picture import EVIDENCE_LEGEND, LEGEND, compose
-from projections.drawing.scene import two_sigma
-from projections.model.records import Estimate
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.adapters.drawing import Floor, draw_map
+from projections.adapters.drawing.canvas import Canvas
+from projections.adapters.drawing.picture import EVIDENCE_LEGEND, LEGEND, compose
+from projections.adapters.drawing.scene import two_sigma
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
+from projections.map.records import Estimate
+from projections.map.view import MapView
 
 pytestmark = pytest.mark.seconds
 

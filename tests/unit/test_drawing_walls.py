@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.deltas import MapGiven
-from projections.drawing import Floor
-from projections.drawing.base_layers import wall_spots
-from projections.drawing.picture import compose
-from projections.model.view import MapView
-from projections.settings import Settings
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.adapters.drawing import Floor
+from projections.adapters.drawing.base_layers import wall_spots
+from projections.adapters.drawing.picture import compose
+from projections.fold.deltas import MapGiven
+from projections.fold.settings import Settings
+from projections.map.view import MapView
 from tests.envelopes import envelope
 from tests.folds import fold
 from tests.maps import drawn_map

@@ -2,8 +2,13 @@
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.transport.config import check_endpoint, check_endpoints, is_loopback, parse_address
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.transport.config import (
+    check_endpoint,
+    check_endpoints,
+    is_loopback,
+    parse_address,
+)
 
 
 @pytest.mark.parametrize(

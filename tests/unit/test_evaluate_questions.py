@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.ingest import Accepted, ingest_all
-from projections.evaluate.questions import VIEW_CROPS, make_questions, make_view_questions
-from projections.evaluate.truth import TrueKeyframe, Truth
+from eventsrc.envelope.ingest import Accepted, ingest_all
+from projections.localize.evaluate.questions import VIEW_CROPS, make_questions, make_view_questions
+from projections.localize.evaluate.truth import TrueKeyframe, Truth
 from tests.envelopes import detection, envelope, payload
 
 

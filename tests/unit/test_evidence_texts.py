@@ -5,18 +5,14 @@ from itertools import pairwise
 
 import pytest
 
-from eventsrc.envelope import Offset
-from projections import deltas as d
+from eventsrc.envelope.model import Offset
+from projections.fold import deltas as d
+from projections.fold.settings import Settings
 from projections.history.diff import difference_of
 from projections.history.explanation import Explanation, explain_object
 from projections.history.merges import object_merge_document
-from projections.history.rendering import (
-    difference_text,
-    explanation_text,
-    object_merges_text,
-)
-from projections.model.view import MapView
-from projections.settings import Settings
+from projections.history.rendering import difference_text, explanation_text, object_merges_text
+from projections.map.view import MapView
 from tests.memory_history import MemoryHistory
 
 EVIDENCE = Settings(fusion="evidence")

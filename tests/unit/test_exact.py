@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from projections.exact import (
+from projections.fold.exact import (
     MAX_DIMENSION,
     Q40,
     UNIT,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from projections.exact import to_float32
-from projections.relocalize import Crop, ExactIndex
+from projections.fold.exact import to_float32
+from projections.localize.relocalize import Crop, ExactIndex
 from tests.folds import fold
 from tests.logs import walk
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.serve.answering import BusyError
-from projections.serve.fair_queue import FairQueue
+from projections.surfaces.serve.answering import BusyError
+from projections.surfaces.serve.fair_queue import FairQueue
 
 DEADLINE_S = 30.0
 

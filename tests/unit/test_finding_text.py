@@ -2,9 +2,9 @@
 
 import pytest
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import Finding
-from projections.cli.log import finding_text
+from projections.surfaces.cli.log import finding_text
 
 
 @pytest.mark.parametrize(("last", "where"), [(7, "offset 7"), (9, "offsets 7 to 9")])

@@ -8,9 +8,9 @@ import pytest
 from mcap.reader import make_reader
 from pydantic import create_model
 
-from eventsrc import system_events
-from eventsrc.commands import KINDS, KeepApart, encode_command
-from eventsrc.envelope import Envelope
+from eventsrc.envelope import system_events
+from eventsrc.envelope.commands import KINDS, KeepApart, encode_command
+from eventsrc.envelope.model import Envelope
 from eventsrc.log import LogWriter, verify_log
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.log.format import schema_of

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from projections.cli.fleet_options import open_engine
-from projections.fleet.engine import RETRIES, Ended
-from projections.fleet.local_pool import LocalPool
+from eventsrc.base.errors import MisuseError
+from projections.adapters.fleet.engine import RETRIES, Ended
+from projections.adapters.fleet.local_pool import LocalPool
+from projections.surfaces.cli.fleet_options import open_engine
 from tests.fleet_tasks import double, fails, killed
 
 WAIT_S = 60.0
@@ -53,7 +53,7 @@ def test_a_fault_is_an_error_of_its_site_alone() -> None:
 _PARENT = """
 import sys
 from pathlib import Path
-from projections.fleet.local_pool import LocalPool
+from projections.adapters.fleet.local_pool import LocalPool
 from tests.fleet_tasks import wait
 if __name__ == "__main__":
     with LocalPool(1) as pool:

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from psycopg.conninfo import conninfo_to_dict
 
-from eventsrc.errors import MisuseError
-from projections.fleet.site_databases import site_databases
-from projections.fleet.sites import MAX_LIST_BYTES, Site, find_sites
+from eventsrc.base.errors import MisuseError
+from projections.adapters.fleet.site_databases import site_databases
+from projections.adapters.fleet.sites import MAX_LIST_BYTES, Site, find_sites
 from tests.envelopes import envelope
 from tests.logs import write_log
 

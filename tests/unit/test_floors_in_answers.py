@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from projections.cli.relocalize import answer_text
-from projections.model.view import MapView
-from projections.relocalize import parse_question, rank
-from projections.relocalize.candidates import ExactIndex
-from projections.relocalize.ranking import Answer, Method
+from projections.localize.relocalize import parse_question, rank
+from projections.localize.relocalize.candidates import ExactIndex
+from projections.localize.relocalize.ranking import Answer, Method
+from projections.map.view import MapView
+from projections.surfaces.cli.relocalize import answer_text
 from tests.envelopes import detection, envelope, payload
 from tests.folds import fold
 

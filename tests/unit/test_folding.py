@@ -4,13 +4,13 @@ import gc
 
 import pytest
 
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import Event
-from eventsrc.system_events import LOSS_KEY
-from projections.deltas import KeyframeAdded
-from projections.errors import FoldError
-from projections.model.fold import fold_event, fold_events, gc_paused
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold.deltas import KeyframeAdded
+from projections.fold.errors import FoldError
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.fold import fold_event, fold_events, gc_paused
 from tests.envelopes import detection, envelope, payload
 
 

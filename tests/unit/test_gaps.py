@@ -2,7 +2,7 @@
 
 import pytest
 
-from eventsrc.gaps import Gap, GapLedger
+from eventsrc.envelope.gaps import Gap, GapLedger
 
 SETTLE_NS = 10
 

@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from projections.model.fold import gc_paused
+from projections.map.fold import gc_paused
 
 
 def _is_young(thing: object) -> bool:

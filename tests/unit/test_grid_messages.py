@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.grid_messages import is_grid_message, read_grid_message
-from eventsrc.occupancy_map import InvalidMap
+from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.occupancy_map import InvalidMap
 from tests.envelopes import envelope, payload
 from tests.maps import drawn_map, grid_message
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.envelope import has_evidence
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.envelope.ingest import Accepted, Rejected, ingest
+from eventsrc.envelope.model import has_evidence
 from tests.envelopes import detection, embedding, envelope, payload
 
 VECTOR = [0.6, 0.8, 0.0, 0.0]

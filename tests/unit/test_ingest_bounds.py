@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import MAX_DETECTIONS
-from eventsrc.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
-from eventsrc.upcast import PendingEvent, read_envelope
+from eventsrc.envelope.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
+from eventsrc.envelope.model import MAX_DETECTIONS
+from eventsrc.envelope.upcast import PendingEvent, read_envelope
 from tests.envelopes import detection, envelope, payload
 from tests.thorough import mostly_slow
 
@@ -22,9 +22,9 @@ PEAK_MB = 300
 HOSTILE = r"""
 import re, resource, sys
 from pathlib import Path
-from eventsrc.append import append_payload
+from eventsrc.record.append import append_payload
 from eventsrc.log import LogWriter
-from eventsrc.ingest import MAX_JSON_VALUES
+from eventsrc.envelope.ingest import MAX_JSON_VALUES
 
 resource.setrlimit(resource.RLIMIT_CPU, (int(sys.argv[2]), int(sys.argv[2])))
 SIZE = int(sys.argv[3]) << 20

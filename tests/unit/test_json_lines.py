@@ -5,9 +5,9 @@ import io
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.importers import json_lines
-from eventsrc.importers.json_lines import JsonLines
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.importers import json_lines
+from eventsrc.record.importers.json_lines import JsonLines
 
 
 def payloads(data: bytes) -> list[bytes]:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.transport.config import check_key
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.transport.config import check_key
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from eventsrc.errors import MisuseError
-from eventsrc.label_files import read_label_file
-from projections.cli.bag_text import labels_by_number
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.label_files import read_label_file
+from projections.surfaces.cli.bag_text import labels_by_number
 
 
 @pytest.mark.parametrize(

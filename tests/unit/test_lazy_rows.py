@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projections.history.lazy_rows import Chunks, Items, OrdinalsByName
+from projections.store.lazy_rows import Chunks, Items, OrdinalsByName
 
 
 class Making:

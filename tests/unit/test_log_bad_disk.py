@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged
 from eventsrc.log import FsyncPolicy, LogWriter, recover_log, verify_log
 from tests.fixtures_log import KEY, read_log, read_with_gaps
 

@@ -4,19 +4,19 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.commands import Anchor, ForgetRun, NamePlace, UseSettings, encode_command
-from eventsrc.envelope import KeyframeId, Offset, RunId
+from eventsrc.envelope.commands import Anchor, ForgetRun, NamePlace, UseSettings, encode_command
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.system_events import COMMAND_KEY
-from projections.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.database.live_fold import LiveFold
-from projections.deltas import PlaceNamed
-from projections.errors import FoldError
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log, fold_log_cached
-from projections.model.log_commands import read_commands, read_corrections
-from projections.model.snapshot import SnapshotRefused, restore, snapshot
-from projections.settings import Settings
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.deltas import PlaceNamed
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log, fold_log_cached
+from projections.map.log_commands import read_commands, read_corrections
+from projections.map.snapshot import SnapshotRefused, restore, snapshot
+from projections.postgres.live_fold import LiveFold
 from tests.envelopes import envelope, payload
 from tests.folds import Folded
 

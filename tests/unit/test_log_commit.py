@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.errors import LogError, MisuseError
+from eventsrc.base.errors import LogError, MisuseError
 from eventsrc.log import (
     ALWAYS,
     GROUP_COMMIT,
@@ -29,7 +29,7 @@ from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.seal import SegmentPlan, seal
-from eventsrc.log_info import log_info
+from eventsrc.record.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, read_log
 from tests.thorough import examples
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from mcap.reader import SeekingReader
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import active_segment as _active
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.format import ACTIVE, SEALED, head_of, mark_seed, schema_of, segment_path
-from eventsrc.system_events import LOSS_KEY
 from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
 BEFORE = 3

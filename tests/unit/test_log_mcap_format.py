@@ -10,12 +10,12 @@ import pytest
 from mcap.reader import SeekingReader
 from mcap.stream_reader import StreamReader
 
-from eventsrc.envelope import Envelope
-from eventsrc.errors import LogDamaged, NotALog
-from eventsrc.importers import import_files
+from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.envelope.model import Envelope
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
 from eventsrc.log.flat_schema import flat_schema
-from eventsrc.system_events import LOSS_KEY, Loss
+from eventsrc.record.importers import import_files
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
 from tests.rewriting import DuplicateMetadata, merge
 

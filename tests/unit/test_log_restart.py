@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, LogError
+from eventsrc.base.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal_worker as _sealer

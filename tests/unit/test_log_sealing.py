@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal as _seal

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import ALWAYS, LogWriter, active_segment
 from tests.fixtures_log import BY_HAND, KEY, read_log
 

@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from eventsrc.importers.json_lines import read_line
-from eventsrc.importers.source import ImportedMessage
+from eventsrc.record.importers.json_lines import read_line
+from eventsrc.record.importers.source import ImportedMessage
 
 TS = 1740000000.123
 TS_NS = 1740000000123000000

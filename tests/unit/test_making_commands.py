@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import (
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectPoses,
@@ -27,12 +28,11 @@ from eventsrc.commands import (
     encode_command,
     parse_command,
 )
-from eventsrc.errors import MisuseError
-from eventsrc.trajectory import Trajectory, TrajectoryPose, read_trajectory
+from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose, read_trajectory
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.listing import what
-from projections.settings import Camera, Settings
+from projections.fold.settings import Camera, Settings
 from tests.corrected_logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 
 CUP_LEFT, CUP_RIGHT, LAMP = "obj-2237cc2f33929b56", "obj-dc4cb3fc37c4dc9a", "obj-36156c6b0fcc3c5d"

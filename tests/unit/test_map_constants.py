@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.exact import to_float32
-from projections.model.view import MapView
-from projections.relocalize import Crop, ExactIndex, MapConstants
-from projections.relocalize.constants import FOLLOWERS, SAMPLED, Cosines, Sample
-from projections.settings import Settings
+from projections.fold.exact import to_float32
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Crop, ExactIndex, MapConstants
+from projections.localize.relocalize.constants import FOLLOWERS, SAMPLED, Cosines, Sample
+from projections.map.view import MapView
 from tests.folds import fold
 from tests.logs import walk
 
@@ -50,7 +50,7 @@ def test_different_things_are_those_of_one_picture_with_different_labels() -> No
 
 
 def test_of_many_observations_a_sample_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("projections.relocalize.constants.SAMPLED", 16)
+    monkeypatch.setattr("projections.localize.relocalize.constants.SAMPLED", 16)
     view = view_of(60)
     last = max(o.ordinal for o in view.observations if o.embedding is not None) + 1
     assert last > 64

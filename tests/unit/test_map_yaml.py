@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from eventsrc.errors import MisuseError
-from eventsrc.importers.map_yaml import MAX_YAML_BYTES, read_map_yaml
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.importers.map_yaml import MAX_YAML_BYTES, read_map_yaml
 from tests.maps import cells, write_map_yaml
 from tests.thorough import rounds
 

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
-from eventsrc.occupancy_map import OccupancyMap
-from projections.corrections import NO_CORRECTIONS
-from projections.database.graph_sink import GraphSink
-from projections.database.live_fold import LiveFold
-from projections.database.vector_sink import VectorSink
-from projections.history.stored_history import StoredHistory
-from projections.history.tables import Tables
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from projections.fold.corrections import NO_CORRECTIONS
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.postgres.graph_sink import GraphSink
+from projections.postgres.live_fold import LiveFold
+from projections.postgres.vector_sink import VectorSink
+from projections.store.stored_history import StoredHistory
+from projections.store.tables import Tables
 
 SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import FIRST_OFFSET
+from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import LogReader
-from projections.database.labels import COUNT_KEYS, LABELS, TABLE
-from projections.database.live_fold import LiveFold, batches
-from projections.database.memory_sink import MemorySink, MemoryTables
-from projections.database.sink import LiveSink, RebuildSink
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
+from projections.postgres.live_fold import LiveFold, batches
+from projections.postgres.memory_sink import MemorySink, MemoryTables
+from projections.postgres.sink import LiveSink, RebuildSink
 from tests.logs import bridge, walk, write_log
 
 SETTINGS = Settings()

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
+from projections.adapters.drawing.merge_picture import draw_merge
+from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.merges import chains_of, merge_reason
 from projections.history.names import keyframe_name
-from projections.history.picture import draw_merge
-from projections.settings import Settings
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log
 

@@ -4,11 +4,11 @@ import threading
 
 import pytest
 
-from eventsrc.gaps import Gap
-from eventsrc.recorder import queue as queue_module
-from eventsrc.recorder.queue import MAX_KEYS, OTHER_KEYS, MessageQueue
-from eventsrc.robot.acks import sent_key
-from eventsrc.transport.session import Received, SequenceNumber
+from eventsrc.envelope.gaps import Gap
+from eventsrc.record.recorder import queue as queue_module
+from eventsrc.record.recorder.queue import MAX_KEYS, OTHER_KEYS, MessageQueue
+from eventsrc.record.robot.acks import sent_key
+from eventsrc.record.transport.session import Received, SequenceNumber
 from tests.fixtures_zenoh import DEADLINE_S
 
 

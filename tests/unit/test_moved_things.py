@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projections.deltas import ObjectMissing, ObjectRelocated, ObjectsMerged
-from projections.model.digest import map_digest
-from projections.model.records import ObjectRecord
-from projections.model.snapshot import restore, snapshot
-from projections.settings import Settings
+from projections.fold.deltas import ObjectMissing, ObjectRelocated, ObjectsMerged
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.records import ObjectRecord
+from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
 from tests.folds import Folded
 from tests.thorough import mostly_slow

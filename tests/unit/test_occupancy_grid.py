@@ -5,9 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.clearance import NOWHERE
-from projections.occupancy import MAX_BLOCKS, OccupancyGrid
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.clearance import NOWHERE
+from projections.fold.occupancy import MAX_BLOCKS, OccupancyGrid
 
 M = 1_000_000
 

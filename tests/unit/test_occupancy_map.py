@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.grey_images import encode_png
-from eventsrc.occupancy_map import (
+from eventsrc.envelope.grey_images import encode_png
+from eventsrc.envelope.occupancy_map import (
     MAX_MAP_BYTES,
     MAX_MAP_CELLS,
     InvalidMap,
@@ -16,7 +16,7 @@ from eventsrc.occupancy_map import (
     decode_map,
     read_map_head,
 )
-from eventsrc.system_events import MAX_MAP_SIDE
+from eventsrc.envelope.system_events import MAX_MAP_SIDE
 from tests.maps import drawn_map
 
 HOUSE = drawn_map("##### #..?# #...#", 0.05, (-1.0, 2.5, 0.3), "house")

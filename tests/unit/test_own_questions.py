@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import projections.evaluate.own_questions as own
-from eventsrc.ingest import Accepted, ingest_all
-from projections.evaluate.questions import spread
-from projections.model.view import MapView
-from projections.relocalize import Candidates, Crop, ExactIndex
-from projections.settings import Settings
+import projections.localize.evaluate.own_questions as own
+from eventsrc.envelope.ingest import Accepted, ingest_all
+from projections.fold.settings import Settings
+from projections.localize.evaluate.questions import spread
+from projections.localize.relocalize import Candidates, Crop, ExactIndex
+from projections.map.view import MapView
 from tests.bench.truth.folding import fold_into
 from tests.envelopes import payload
 from tests.seen_rooms import drive

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.sim.catalogue import FURNITURE, MODELS
-from projections import place_type_table
-from projections.place_type_table import NAMES, SHARES, SYNONYMS, TABLE, TYPES
-from projections.place_types import UNSURE, known_class, place_type, type_of_name
+from eventsrc.adapters.sim.catalogue import FURNITURE, MODELS
+from projections.fold import place_type_table
+from projections.fold.place_type_table import NAMES, SHARES, SYNONYMS, TABLE, TYPES
+from projections.fold.place_types import UNSURE, known_class, place_type, type_of_name
 
 
 def type_of(counts: Mapping[str, float], name: str | None = None) -> str | None:

@@ -4,7 +4,8 @@ import random
 
 import pytest
 
-from projections.deltas import (
+from projections.fold.core_index import CoreIndex
+from projections.fold.deltas import (
     KeyframePlaced,
     PlaceChanged,
     PlaceFormed,
@@ -12,9 +13,8 @@ from projections.deltas import (
     PlacesLinked,
     PlacesMerged,
 )
-from projections.reducers.core_index import CoreIndex
-from projections.reducers.place_members import PosedKeyframe
-from projections.reducers.places import Places
+from projections.fold.place_members import PosedKeyframe
+from projections.fold.places import Places
 from tests.envelopes import envelope
 from tests.folds import fold
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.envelope import EnvelopeCamera
-from projections.errors import QuestionError
-from projections.relocalize import (
+from eventsrc.envelope.model import EnvelopeCamera
+from projections.fold.errors import QuestionError
+from projections.localize.relocalize import (
     Camera,
     parse_question,
     question_schema,
@@ -17,8 +17,8 @@ from projections.relocalize import (
     read_moved,
     read_question,
 )
-from projections.relocalize.question import MAX_CROPS, MAX_VIEWS
-from projections.serve import answering, description
+from projections.localize.relocalize.question import MAX_CROPS, MAX_VIEWS
+from projections.surfaces.serve import answering, description
 from tests.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.append import append_payload
-from eventsrc.envelope import ENVELOPE_VERSION
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
+from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.log import ALWAYS, LogWriter, active_segment
-from eventsrc.recorder.queue import MessageQueue
-from eventsrc.recorder.writer_thread import WriterThread
-from eventsrc.robot.acks import Ack, payload_sha256
-from eventsrc.transport.session import Received
+from eventsrc.record.append import append_payload
+from eventsrc.record.recorder.queue import MessageQueue
+from eventsrc.record.recorder.writer_thread import WriterThread
+from eventsrc.record.robot.acks import Ack, payload_sha256
+from eventsrc.record.transport.session import Received
 from tests.envelopes import detection, envelope, payload
 from tests.fixtures_log import KEY, MEMORY_DISK, read_log
 from tests.thorough import examples

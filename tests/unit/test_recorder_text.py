@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from eventsrc.recorder import RecorderReport
-from projections.cli.recorder_text import RecorderStatus, summary
+from eventsrc.record.recorder import RecorderReport
+from projections.surfaces.cli.recorder_text import RecorderStatus, summary
 
 NOTHING = RecorderReport(
     recorded=0,

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.deltas import MapGiven
-from projections.occupancy import wall_blocks
-from projections.relocalize import Crop, ExactIndex, rank
-from projections.relocalize.walls import _AT_POSE_M, _AT_THING_M, WallMap
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.deltas import MapGiven
+from projections.fold.occupancy import wall_blocks
+from projections.localize.relocalize import Crop, ExactIndex, rank
+from projections.localize.relocalize.walls import _AT_POSE_M, _AT_THING_M, WallMap
 from tests.envelopes import detection, envelope
 from tests.folds import fold
 from tests.maps import drawn_map

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope import Offset
-from projections.deltas import (
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import (
     Delta,
     ObjectClassified,
     ObjectEstimated,
@@ -19,9 +19,9 @@ from projections.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.reducers.presence import Presence
-from projections.reducers.relocations import Moved, Relocations
-from projections.settings import Camera
+from projections.fold.presence import Presence
+from projections.fold.relocations import Moved, Relocations
+from projections.fold.settings import Camera
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Repeated lines are held back and counted."""
 
-from projections.serve.answering import REPEAT_S, RepeatFilter
+from projections.surfaces.serve.answering import REPEAT_S, RepeatFilter
 
 
 def test_a_line_passes_at_once_and_then_once_a_minute_with_a_count() -> None:

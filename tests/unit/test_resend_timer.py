@@ -1,6 +1,6 @@
 """When the robot sends a probe, and when it sends everything again."""
 
-from eventsrc.robot.sender import ResendTimer
+from eventsrc.record.robot.sender import ResendTimer
 
 RESEND_AFTER_S = 2.0
 

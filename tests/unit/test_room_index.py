@@ -1,7 +1,7 @@
 """The room at a position: by other keyframes of this building, never by the one asked from."""
 
-from projections.evaluate.trials import RoomIndex
-from projections.evaluate.truth import TrueKeyframe, Truth
+from projections.localize.evaluate.trials import RoomIndex
+from projections.localize.evaluate.truth import TrueKeyframe, Truth
 from tests.relocalization.buildings import Building
 from tests.relocalization.drives import drive
 

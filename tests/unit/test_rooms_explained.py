@@ -6,17 +6,12 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import Command, Join, KeepApart
+from eventsrc.envelope.commands import Command, Join, KeepApart
+from projections.adapters.drawing.merge_picture import draw_merge
+from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.history.merges import (
-    chains_of,
-    merge_document,
-    merge_reason,
-    refusal_document,
-)
-from projections.history.picture import draw_merge
+from projections.history.merges import chains_of, merge_document, merge_reason, refusal_document
 from projections.history.rendering import merge_text, merges_text, refusals_text
-from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.fixtures_corrections import anchor, write_mixed_log
 

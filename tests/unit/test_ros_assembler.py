@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.ingest import Accepted, ingest
+from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.stream import Stream
 from eventsrc.ros.transforms import compose

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from eventsrc.ingest import Accepted, Rejected, ingest
+from eventsrc.envelope.ingest import Accepted, Rejected, ingest
 from eventsrc.ros.assembler import Assembler, RosMessage
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.transforms import Transform

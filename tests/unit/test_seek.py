@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import LogDamaged, MisuseError
+from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.log import LogReader, LogWriter, Unreadable
 from eventsrc.log import seal as _parts
 from eventsrc.log.seek import resolve, resolve_start

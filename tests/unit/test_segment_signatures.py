@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
 from eventsrc.log import (
     LogReader,
     LogWriter,
@@ -15,7 +14,8 @@ from eventsrc.log import (
     same_but_sealed,
     segment_signatures,
 )
-from projections.model.fold import fold_log, fold_log_cached
+from eventsrc.record.append import append_payload
+from projections.map.fold import fold_log, fold_log_cached
 from tests.envelopes import envelope, payload
 from tests.fixtures_timetravel import write_log
 from tests.history_process import RULES
@@ -72,7 +72,7 @@ def test_a_snapshot_of_a_log_put_back_from_a_copy_and_recorded_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The segment that was growing is there again, under the same name, with other events."""
-    monkeypatch.setattr("projections.model.fold.SNAPSHOT_MIN_EVENTS", 1)
+    monkeypatch.setattr("projections.map.fold.SNAPSHOT_MIN_EVENTS", 1)
     log = write_log(tmp_path / "log", documents(0, 12, 0.5))
     shutil.copytree(log, tmp_path / "copy")
     with begun(log, 30, 0.5), LogReader(log) as reader:

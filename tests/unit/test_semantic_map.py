@@ -14,13 +14,19 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from projections.deltas import EventSkipped, KeyframeAdded, ObjectFound, ObservationAdded, RunSeen
-from projections.model.digest import map_digest
-from projections.reducers import objects
-from projections.reducers.folded_ids import content_digest
-from projections.reducers.objects import object_id
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from projections.fold import objects
+from projections.fold.deltas import (
+    EventSkipped,
+    KeyframeAdded,
+    ObjectFound,
+    ObservationAdded,
+    RunSeen,
+)
+from projections.fold.folded_ids import content_digest
+from projections.fold.objects import object_id
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
 from tests.envelopes import detection, envelope
 from tests.folds import Folded, accepted, fold
 

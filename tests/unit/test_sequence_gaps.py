@@ -4,9 +4,9 @@ import random
 
 import pytest
 
-from eventsrc.gaps import Gap
-from eventsrc.recorder.queue import MAX_SOURCES, SequenceGaps
-from eventsrc.transport.session import SequenceNumber
+from eventsrc.envelope.gaps import Gap
+from eventsrc.record.recorder.queue import MAX_SOURCES, SequenceGaps
+from eventsrc.record.transport.session import SequenceNumber
 
 SETTLE_NS = 10
 

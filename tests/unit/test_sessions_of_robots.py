@@ -5,10 +5,10 @@ import threading
 import numpy as np
 import pytest
 
-from projections.errors import QuestionError
-from projections.relocalize import Answer, PoseHypothesis, Track
-from projections.relocalize.floors import Hypotheses
-from projections.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name
+from projections.fold.errors import QuestionError
+from projections.localize.relocalize import Answer, PoseHypothesis, Track
+from projections.localize.relocalize.floors import Hypotheses
+from projections.surfaces.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name
 
 STILL = (0.0, 0.0, 0.0)
 

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.errors import SettingsError
-from projections.evidence import EvidenceConstants
-from projections.settings import (
+from projections.fold.errors import SettingsError
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import (
     Camera,
     LocalizerConstants,
     RoomsConstants,

@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 
-from eventsrc.commands import UseSettings
-from eventsrc.envelope import Offset
-from projections.cli.options import settings_from
-from projections.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
-from projections.settings import Settings
+from eventsrc.envelope.commands import UseSettings
+from eventsrc.envelope.model import Offset
+from projections.fold.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
+from projections.fold.settings import Settings
+from projections.surfaces.cli.options import settings_from
 
 LOGGED = compile_corrections(
     [

@@ -10,19 +10,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eventsrc.detector.vision import decode
-from eventsrc.errors import MisuseError
-from eventsrc.sim import build_house
-from eventsrc.sim.detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, visible_objects
-from eventsrc.sim.house import House
-from eventsrc.sim.pictures import (
+from eventsrc.adapters.detector.vision import decode
+from eventsrc.adapters.sim import build_house
+from eventsrc.adapters.sim.detector import (
+    CAMERA_HEIGHT_M,
+    FOCAL_PX,
+    HEIGHT_PX,
+    WIDTH_PX,
+    visible_objects,
+)
+from eventsrc.adapters.sim.house import House
+from eventsrc.adapters.sim.pictures import (
     Camera,
     CameraPicture,
     camera_pictures,
     thing_colours,
     write_pictures,
 )
-from eventsrc.sim.tour import TruePose, drive, plan_tour
+from eventsrc.adapters.sim.tour import TruePose, drive, plan_tour
+from eventsrc.base.errors import MisuseError
 from tests.thorough import mostly_slow
 
 STEP_M = 0.004

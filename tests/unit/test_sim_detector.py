@@ -5,12 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from eventsrc.sim.catalogue import MODELS
-from eventsrc.sim.detector import FOCAL_PX, HEIGHT_PX, WIDTH_PX, VisibleObject, visible_objects
-from eventsrc.sim.floorplan import FloorPlan
-from eventsrc.sim.house import House, Thing, build_house
-from eventsrc.sim.shapes import Rect, Segment
-from eventsrc.sim.tour import TruePose
+from eventsrc.adapters.sim.catalogue import MODELS
+from eventsrc.adapters.sim.detector import (
+    FOCAL_PX,
+    HEIGHT_PX,
+    WIDTH_PX,
+    VisibleObject,
+    visible_objects,
+)
+from eventsrc.adapters.sim.floorplan import FloorPlan
+from eventsrc.adapters.sim.house import House, Thing, build_house
+from eventsrc.adapters.sim.shapes import Rect, Segment
+from eventsrc.adapters.sim.tour import TruePose
 
 FAR_WALL = Segment(-50.0, -50.0, -50.0, 50.0)
 

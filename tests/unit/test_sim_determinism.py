@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from eventsrc.sim import detector, simulate_run, tour
+from eventsrc.adapters.sim import detector, simulate_run, tour
 from tests.simulated import simulated
 from tests.thorough import stride
 

@@ -5,8 +5,8 @@ from itertools import combinations
 
 import pytest
 
-from eventsrc.sim.floorplan import DOOR_M, OPENING_M, build_floor_plan
-from eventsrc.sim.house import House, build_house
+from eventsrc.adapters.sim.floorplan import DOOR_M, OPENING_M, build_floor_plan
+from eventsrc.adapters.sim.house import House, build_house
 
 SEEDS = (0, 7, 11, 2**40)
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eventsrc.ingest import Accepted, ingest
-from eventsrc.sim import SimulatedRun, simulate_run
-from eventsrc.sim.detector import DIM
-from eventsrc.sim.run import truth_path, write_run
+from eventsrc.adapters.sim import SimulatedRun, simulate_run
+from eventsrc.adapters.sim.detector import DIM
+from eventsrc.adapters.sim.run import truth_path, write_run
+from eventsrc.envelope.ingest import Accepted, ingest
 from tests.simulated import simulated
 from tests.thorough import stride
 

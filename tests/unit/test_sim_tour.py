@@ -5,9 +5,16 @@ import math
 
 import pytest
 
-from eventsrc.sim.house import House, build_house
-from eventsrc.sim.shapes import Segment, wrap
-from eventsrc.sim.tour import KEYFRAME_M, KEYFRAME_RAD, TruePose, drive, keyframes, plan_tour
+from eventsrc.adapters.sim.house import House, build_house
+from eventsrc.adapters.sim.shapes import Segment, wrap
+from eventsrc.adapters.sim.tour import (
+    KEYFRAME_M,
+    KEYFRAME_RAD,
+    TruePose,
+    drive,
+    keyframes,
+    plan_tour,
+)
 from tests.thorough import mostly_slow
 
 pytestmark = pytest.mark.seconds

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from eventsrc.occupancy_map import OCCUPIED, decode_map
-from eventsrc.sim import build_house, occupancy_map
-from projections.occupancy import OccupancyGrid
+from eventsrc.adapters.sim import build_house, occupancy_map
+from eventsrc.envelope.occupancy_map import OCCUPIED, decode_map
+from projections.fold.occupancy import OccupancyGrid
 from tests.simulated import simulated
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log
-from projections.model import fold as folding
-from projections.model import snapshot as codec
-from projections.model.digest import map_digest
-from projections.model.fold import fold_log, fold_log_cached
-from projections.model.snapshot import (
+from projections.fold.settings import Settings
+from projections.map import fold as folding
+from projections.map import snapshot as codec
+from projections.map.digest import map_digest
+from projections.map.fold import fold_log, fold_log_cached
+from projections.map.snapshot import (
     MAGIC,
     MalformedSnapshot,
     SnapshotRefused,
@@ -23,8 +24,7 @@ from projections.model.snapshot import (
     snapshot,
     unpack,
 )
-from projections.model.snapshot_cache import SnapshotCache
-from projections.settings import Settings
+from projections.map.snapshot_cache import SnapshotCache
 from tests.envelopes import detection, envelope, payload
 from tests.folds import Folded, fold
 

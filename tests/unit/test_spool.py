@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import SpoolError, SpoolFull
-from eventsrc.robot.acks import Ack, Refusal, Refusals, payload_sha256
-from eventsrc.robot.spool import Refused, Spool, Spooled
+from eventsrc.base.errors import SpoolError, SpoolFull
+from eventsrc.record.robot.acks import Ack, Refusal, Refusals, payload_sha256
+from eventsrc.record.robot.spool import Refused, Spool, Spooled
 
 
 def _ack(*payloads: bytes) -> Ack:
@@ -118,7 +118,7 @@ def test_quarantined_bytes_are_dropped_for_new_envelopes_and_their_reason_stays(
 
 def test_spooled_envelopes_survive_the_process(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from pathlib import Path; from eventsrc.robot.spool import Spool\n"
+        "import os, sys; from pathlib import Path; from eventsrc.record.robot.spool import Spool\n"
         "spool = Spool(Path(sys.argv[1])); spool.add('run-a', 7, b'kept'); os._exit(9)"
     )
     path = tmp_path / "deep" / "spool"

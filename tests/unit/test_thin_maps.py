@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from eventsrc.envelope import RunId
-from projections.deltas import ObservationOrdinal
-from projections.relocalize import NEIGHBOURS, Crop, Match, rank
-from projections.relocalize.candidates import Candidates
-from projections.relocalize.certainty import thinness
+from eventsrc.envelope.model import RunId
+from projections.fold.deltas import ObservationOrdinal
+from projections.localize.relocalize import NEIGHBOURS, Crop, Match, rank
+from projections.localize.relocalize.candidates import Candidates
+from projections.localize.relocalize.certainty import thinness
 
 CROP = Crop(np.ones(1, dtype=np.float32))
 

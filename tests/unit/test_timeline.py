@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.errors import MisuseError
+from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogWriter
-from projections.errors import LogPointError
+from projections.fold.errors import LogPointError
+from projections.fold.settings import Settings
 from projections.history import ExpressionError, NoSuchThing, Timeline
 from projections.history.merges import merge_document
-from projections.settings import Settings
 from tests.envelopes import detection, envelope
 from tests.fixtures_timetravel import write_log
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from eventsrc.commands import (
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import (
     Command,
     CorrectPoses,
     DropDetection,
@@ -20,8 +21,8 @@ from eventsrc.commands import (
     UndoMerge,
     UseSettings,
 )
-from eventsrc.envelope import DetId, KeyframeId, Offset, RunId
-from eventsrc.errors import MisuseError
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from projections.fold.settings import Settings
 from projections.history import NoSuchThing, Timeline
 from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.history.parallel import Rules
@@ -34,8 +35,7 @@ from projections.history.rendering import (
 )
 from projections.history.whatif import command_trials, what_if
 from projections.history.whatif_rendering import whatif_text
-from projections.model.export import state_document, state_text
-from projections.settings import Settings
+from projections.map.export import state_document, state_text
 from tests.envelopes import detection, envelope
 from tests.fixtures_corrections import anchor, write_mixed_log
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.trajectory import MAX_LINE, Trajectory, TrajectoryError, read_trajectory
+from eventsrc.envelope.trajectory import MAX_LINE, Trajectory, TrajectoryError, read_trajectory
 
 Poses = list[tuple[float, float, float, float]]
 METRES = st.floats(-1e7, 1e7)

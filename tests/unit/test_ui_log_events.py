@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.envelope import Offset
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import NEVER, LogReader, LogWriter
-from eventsrc.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
-from projections.settings import Settings
-from projections.ui import log_map
-from projections.ui.log_events import LogEvents
-from projections.ui.log_map import LogMap
-from projections.ui.log_prefix import PrefixReader
-from projections.ui.opened import Opened
+from projections.fold.settings import Settings
+from projections.surfaces.ui import log_map
+from projections.surfaces.ui.log_events import LogEvents
+from projections.surfaces.ui.log_map import LogMap
+from projections.surfaces.ui.log_prefix import PrefixReader
+from projections.surfaces.ui.opened import Opened
 from tests.envelopes import envelope, payload
 from tests.logs import walk, write_log
 

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.append import append_payload
-from eventsrc.envelope import ENVELOPE_VERSION
-from eventsrc.gap_history import fold_and_save_ledger
-from eventsrc.importers.run import import_files
-from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, ingest
+from eventsrc.envelope.ingest import Accepted, CheckedEnvelope, Rejected, ingest
+from eventsrc.envelope.model import ENVELOPE_VERSION
+from eventsrc.envelope.upcast import UPCASTERS, detect_version, read_envelope
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
 from eventsrc.log.verify import verify_log
-from eventsrc.upcast import UPCASTERS, detect_version, read_envelope
-from projections.model.fold import fold_log
-from projections.settings import Settings
+from eventsrc.record.append import append_payload
+from eventsrc.record.gap_history import fold_and_save_ledger
+from eventsrc.record.importers.run import import_files
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
 from tests.fixtures_log import KEY, envelope, read_log
 
 BARE = json.dumps(

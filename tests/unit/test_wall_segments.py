@@ -6,8 +6,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from eventsrc.occupancy_map import UNKNOWN, OccupancyMap
-from projections.wall_segments import MOST_SEGMENTS, wall_segments
+from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
+from projections.map.wall_segments import MOST_SEGMENTS, wall_segments
 from tests.thorough import stride
 
 

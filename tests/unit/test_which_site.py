@@ -5,14 +5,14 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fleet.which_site import (
+from projections.adapters.fleet.which_site import (
     CONFIDENCE_WEIGHT,
     FITTED_SITES,
     INTERCEPT,
     KNOWN_WEIGHT,
     which_site,
 )
-from projections.relocalize import Answer
+from projections.localize.relocalize import Answer
 
 SHARES = st.floats(0.0, 1.0)
 ANSWERS = st.dictionaries(

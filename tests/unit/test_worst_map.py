@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from projections.cli.evaluate import worst_of, worst_text
+from projections.surfaces.cli.evaluate import worst_of, worst_text
 
 
 def scored(name: str, *, group: str = "relocalization", **errors: Any) -> tuple[Path, Any]:

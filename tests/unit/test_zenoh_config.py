@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.transport.config import DEFAULT_ENDPOINT, Mode, ZenohOptions, configure
+from eventsrc.record.transport.config import DEFAULT_ENDPOINT, Mode, ZenohOptions, configure
 
 ELSEWHERE = "tcp/127.0.0.2:0"
 ZENOHS_OWN = "{listen: {endpoints: {router: ['tcp/[::]:7447'], peer: ['tcp/[::]:0']}}}"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from eventsrc.log import LogWriter
 from eventsrc.ros.messages import DETECTIONS
-from projections.model.snapshot import MAGIC as SNAPSHOT_MAGIC
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.snapshot import MAGIC as SNAPSHOT_MAGIC
 from tests.attack.arena import Arena
 from tests.attack.bomb_files import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
 from tests.envelopes import envelope, payload

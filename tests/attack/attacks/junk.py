@@ -7,7 +7,7 @@ from random import Random
 
 import zenoh
 
-from eventsrc.transport.session import Session, ZenohOptions, open_session
+from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 from tests.attack.arena import Arena
 from tests.attack.forgery import mark_as_text
 from tests.attack.oracle import Oracle

@@ -12,7 +12,7 @@ import psycopg
 from psycopg import sql
 
 from eventsrc.log import NEVER, LogWriter
-from projections.database.cypher import connect_for_cypher
+from projections.postgres.cypher import connect_for_cypher
 from tests.attack.arena import Arena
 from tests.logs import walk, write_log
 

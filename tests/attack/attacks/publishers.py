@@ -16,7 +16,7 @@ SECONDS = 2.0
 
 PUBLISHERS = """
 import json, sys, threading
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.envelopes import envelope
 
 endpoint, publishers, per_second, count = sys.argv[1], *map(int, sys.argv[2:5])

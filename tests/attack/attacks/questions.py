@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 from urllib.parse import urlsplit
 
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.attack.arena import Arena
 from tests.attack.corruption import corrupt_json
 from tests.attack.honest_client import HonestClient, question

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from eventsrc.log import LogWriter
 from eventsrc.log.durable_files import FsyncPolicy
-from eventsrc.recorder import Recorder
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.transport.session import ZenohOptions, open_session
 
 from .payloads import KEY
 from .recording import ROUTER, program, said
@@ -17,7 +17,7 @@ from .recording import ROUTER, program, said
 RATE = 200
 PUBLISHER = """
 import sys, time
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.bench.log.payloads import KEY, Payloads
 endpoint, rate, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3])
 payloads = Payloads()

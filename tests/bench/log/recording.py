@@ -13,9 +13,9 @@ from pathlib import Path
 
 from eventsrc.log import LogWriter
 from eventsrc.log.durable_files import FsyncPolicy
-from eventsrc.log_info import log_info
-from eventsrc.recorder import Recorder
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.log_info import log_info
+from eventsrc.record.recorder import Recorder
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.cpu_time import UnusedCpu, cpu_seconds, unused_cpu
 
 from .payloads import KEY
@@ -23,15 +23,15 @@ from .plain import PlainFile
 
 ROUTER = """
 import sys
-from eventsrc.transport.session import ZenohOptions
-from eventsrc.transport.session import Router
+from eventsrc.record.transport.session import ZenohOptions
+from eventsrc.record.transport.session import Router
 with Router(ZenohOptions(listen=("tcp/127.0.0.1:0",))) as router:
     print(router.endpoints[0], flush=True)
     sys.stdin.read()
 """
 PUBLISHER = """
 import sys, time
-from eventsrc.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.bench.log.payloads import KEY, Payloads
 endpoint, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 payloads = Payloads()

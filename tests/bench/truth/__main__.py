@@ -21,8 +21,8 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
-from projections.errors import SettingsError
-from projections.settings import Settings
+from projections.fold.errors import SettingsError
+from projections.fold.settings import Settings
 
 from . import tables
 from .calibrating import calibrated_settings, calibration_table

@@ -4,10 +4,10 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 
-from eventsrc.ingest import Accepted
-from projections.calibrate.rounds import Cameras, calibrate_by, note_camera
-from projections.model.view import MapView
-from projections.settings import Settings
+from eventsrc.envelope.ingest import Accepted
+from projections.fold.settings import Settings
+from projections.localize.calibrate.rounds import Cameras, calibrate_by, note_camera
+from projections.map.view import MapView
 
 from .folding import fold_into
 from .scoring import ObjectScores

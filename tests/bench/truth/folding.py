@@ -3,14 +3,14 @@
 import time
 from collections.abc import Iterator, Sequence
 
-from eventsrc.ingest import Accepted
-from eventsrc.occupancy_map import OccupancyMap
-from projections.deltas import Delta
-from projections.exact import unit_vectors
-from projections.model.fold import READ_AHEAD, gc_paused
-from projections.model.view import MapView
-from projections.reducers.semantic_map import SemanticMap
-from projections.settings import Settings
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.deltas import Delta
+from projections.fold.exact import unit_vectors
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.fold import READ_AHEAD, gc_paused
+from projections.map.view import MapView
 
 
 def fold_timed(

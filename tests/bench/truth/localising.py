@@ -11,19 +11,24 @@ from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
 
-from eventsrc.ingest import Accepted
-from eventsrc.text import counted
-from projections.evaluate.questions import Question, make_questions, make_view_questions, spread
-from projections.evaluate.scores import (
+from eventsrc.base.text import counted
+from eventsrc.envelope.ingest import Accepted
+from projections.fold.settings import Settings
+from projections.localize.evaluate.questions import (
+    Question,
+    make_questions,
+    make_view_questions,
+    spread,
+)
+from projections.localize.evaluate.scores import (
     auroc,
     calibration_floor,
     expected_calibration_error,
     percentile,
 )
-from projections.evaluate.trials import RIGHT_WITHIN_M, Trial, TrialRunner
-from projections.model.view import MapView
-from projections.relocalize import Camera
-from projections.settings import Settings
+from projections.localize.evaluate.trials import RIGHT_WITHIN_M, Trial, TrialRunner
+from projections.localize.relocalize import Camera
+from projections.map.view import MapView
 
 from .calibrating import calibrated_settings
 from .folding import fold_into

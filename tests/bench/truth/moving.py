@@ -4,10 +4,10 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from projections.evaluate.scores import instances_of
-from projections.evaluate.truth import Truth
-from projections.model.records import ObjectRecord
-from projections.model.view import MapView
+from projections.localize.evaluate.scores import instances_of
+from projections.localize.evaluate.truth import Truth
+from projections.map.records import ObjectRecord
+from projections.map.view import MapView
 
 from .scoring import majorities
 from .worlds import TrueThing

@@ -9,10 +9,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from projections.evaluate.truth import Truth
-from projections.model.view import MapView
-from projections.place_types import type_of_name
-from projections.settings import Settings
+from projections.fold.place_types import type_of_name
+from projections.fold.settings import Settings
+from projections.localize.evaluate.truth import Truth
+from projections.map.view import MapView
 
 from .folding import fold_timed
 from .tables import number

@@ -8,12 +8,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from eventsrc.occupancy_map import OccupancyMap
-from projections.deltas import KeyframeOrdinal, KeyframePlaced, PlaceOrdinal
-from projections.evaluate.scores import agreement
-from projections.evaluate.truth import Truth
-from projections.model.view import MapView
-from projections.settings import Settings
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.deltas import KeyframeOrdinal, KeyframePlaced, PlaceOrdinal
+from projections.fold.settings import Settings
+from projections.localize.evaluate.scores import agreement
+from projections.localize.evaluate.truth import Truth
+from projections.map.view import MapView
 
 from .folding import fold_into, fold_timed
 from .tables import HOUSE, mean_of, number

@@ -5,11 +5,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from projections.deltas import ObjectOrdinal, Pose
-from projections.evaluate.scores import agreement, instances_of
-from projections.evaluate.truth import Truth
-from projections.model.records import ObjectRecord
-from projections.model.view import MapView
+from projections.fold.deltas import ObjectOrdinal, Pose
+from projections.localize.evaluate.scores import agreement, instances_of
+from projections.localize.evaluate.truth import Truth
+from projections.map.records import ObjectRecord
+from projections.map.view import MapView
 
 from .worlds import TrueThing
 

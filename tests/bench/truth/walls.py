@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.occupancy_map import OCCUPIED, OccupancyMap
+from eventsrc.envelope.occupancy_map import OCCUPIED, OccupancyMap
 
 _BESIDE_M = 0.3
 """A border between rooms is wall where a wall is this near; rooms are drawn to the wall's middle or

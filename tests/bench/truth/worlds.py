@@ -20,9 +20,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from eventsrc.ingest import Accepted, Rejected, ingest_all
-from projections.evaluate.truth import Truth, read_truth
-from projections.settings import Camera
+from eventsrc.envelope.ingest import Accepted, Rejected, ingest_all
+from projections.fold.settings import Camera
+from projections.localize.evaluate.truth import Truth, read_truth
 from tests.shared_data import DATA, WORLDS
 
 CACHE = Path(

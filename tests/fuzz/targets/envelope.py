@@ -1,9 +1,9 @@
-"""`eventsrc.ingest`: never raises; what it accepts is encoded and accepted again."""
+"""`eventsrc.envelope.ingest`: never raises; what it accepts is encoded and accepted again."""
 
 import random
 from collections.abc import Sequence
 
-from eventsrc.ingest import Accepted, CheckedEnvelope, Rejected, check_all, ingest
+from eventsrc.envelope.ingest import Accepted, CheckedEnvelope, Rejected, check_all, ingest
 from tests.attack.corruption import corrupt_json
 from tests.envelopes import detection, envelope, payload
 from tests.fuzz.target import Target

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from eventsrc.gap_history import ledger_of, save_ledger
-from eventsrc.gaps import GapLedger
+from eventsrc.envelope.gaps import GapLedger
 from eventsrc.log import NEVER, LogReader, LogWriter
+from eventsrc.record.gap_history import ledger_of, save_ledger
 from tests.attack.corruption import corrupt_json
 from tests.fixtures_log import KEY, envelope
 from tests.fuzz.scratch import scratch

@@ -7,9 +7,9 @@ from io import BytesIO
 
 from mcap.writer import CompressionType, Writer
 
-from eventsrc.errors import MapfoldError
-from eventsrc.importers import import_files
+from eventsrc.base.errors import MapfoldError
 from eventsrc.log import NEVER, LogReader, LogWriter
+from eventsrc.record.importers import import_files
 from tests.envelopes import envelope, payload
 from tests.fuzz.mcap_mutation import mutate_mcap
 from tests.fuzz.scratch import scratch

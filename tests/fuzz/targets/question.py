@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from projections.errors import QuestionError
-from projections.relocalize import parse_question
-from projections.relocalize.question import MAX_VIEWS
+from projections.fold.errors import QuestionError
+from projections.localize.relocalize import parse_question
+from projections.localize.relocalize.question import MAX_VIEWS
 from tests.attack.corruption import corrupt_json
 from tests.envelopes import detection, envelope, payload
 from tests.fuzz.target import Target, check_message

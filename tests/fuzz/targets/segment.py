@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from eventsrc.errors import LogError
+from eventsrc.base.errors import LogError
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.segment import Unreadable
 from tests.fixtures_log import BY_HAND, KEY, envelope

@@ -5,9 +5,9 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-from projections.cli.options import settings_from
-from projections.errors import SettingsError
-from projections.settings import Settings
+from projections.fold.errors import SettingsError
+from projections.fold.settings import Settings
+from projections.surfaces.cli.options import settings_from
 from tests.attack.corruption import corrupt_json
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target, check_message

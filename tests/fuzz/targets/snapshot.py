@@ -6,8 +6,8 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 
-from projections.model.snapshot import MAGIC, SnapshotRefused, restore, snapshot
-from projections.settings import Settings
+from projections.fold.settings import Settings
+from projections.map.snapshot import MAGIC, SnapshotRefused, restore, snapshot
 from tests.attack.corruption import corrupt_bytes, corrupt_json
 from tests.folds import fold
 from tests.fuzz.target import Target

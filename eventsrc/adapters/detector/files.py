@@ -1,0 +1,188 @@
+"""Pictures from files: a folder, a video, or stdin with a stream of pictures or a list of paths.
+
+The time at which a picture was taken:
+
+* Of a folder or a list of paths it is in the file's name, in seconds with a point or in
+  nanoseconds, as in the data sets of TUM and EuRoC: ``1777885200.05.jpg``,
+  ``1403636579763555584.png``. For other names a rate in pictures a second must be given.
+* Of a video's frames it follows from a start and the video's rate. Of a stream's pictures it is the
+  time of receipt, unless a rate is given.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
+
+from eventsrc.base.clock import system_clock
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from eventsrc.base.user_files import FileFault, open_file
+from eventsrc.envelope.model import MAX_TIMESTAMP_S
+
+from .picture import (
+    JPEG_START,
+    MAX_PICTURE_BYTES,
+    PNG_START,
+    Picture,
+    PictureError,
+    Pixels,
+    split_stream,
+)
+from .vision import Video, decode
+
+SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
+_TIME: Final = re.compile(r"[0-9]{1,10}\.[0-9]{1,9}|[0-9]{10}|[0-9]{16,19}", re.ASCII)
+"""A time in a file's name. ``000017`` is the number of a picture, not a time."""
+_NANOSECOND_DIGITS: Final = 16
+_PARTS: Final = re.compile(r"([0-9]+)", re.ASCII)
+_MAX_PATH: Final = 8_192
+Read: TypeAlias = Callable[[int], bytes]
+"""Returns up to so many bytes, none at the end."""
+
+
+class Timing(NamedTuple):
+    """The times of pictures without one of their own: ``per_s`` a second from ``start_s`` on."""
+
+    start_s: float = 0.0
+    per_s: float | None = None
+
+    def stamp_s(self, index: int, per_s: float | None = None) -> float | None:
+        """The time of picture ``index``; None without a rate."""
+        rate = self.per_s or per_s
+        return None if rate is None else self.start_s + index / rate
+
+
+def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[Picture]:
+    """The pictures of ``--images``. Raises MisuseError before the first, and where a picture has no
+    time."""
+    if text == "-":
+        return _from_stdin(stdin, timing)
+    path = Path(text)
+    if path.is_dir():
+        found = sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_in_order)
+        if not found:
+            raise MisuseError(f"--images {text}: no .jpg, .jpeg or .png in this folder")
+        if timing.per_s is None:
+            found.sort(key=_stamp_in)  # 5.25 before 5.5
+        return _from_paths(found, timing)
+    if not path.is_file():
+        raise MisuseError(f"--images {text}: no such folder or video; - reads stdin")
+    if path.suffix.lower() in SUFFIXES:
+        return _from_paths([path], timing)
+    try:
+        video = Video(path)
+    except PictureError as error:
+        raise MisuseError(
+            f"--images {text}: {error}; give a folder of pictures, a video, or -"
+        ) from None
+    return _from_video(path, video, timing)
+
+
+def _in_order(path: Path) -> list[tuple[int, int, str]]:
+    """A sort key that orders numbers in names by value: 2.png before 10.png."""
+    return [
+        (0, int(part), "") if part.isascii() and part.isdigit() else (1, 0, part)
+        for part in _PARTS.split(path.name)
+    ]
+
+
+def _from_paths(paths: Iterable[Path], timing: Timing) -> Iterator[Picture]:
+    for index, path in enumerate(paths):
+        stamp_s = timing.stamp_s(index)
+        if stamp_s is None:
+            stamp_s = _stamp_in(path)
+        yield Picture(visible(str(path)), stamp_s, _reader(path))
+
+
+def _stamp_in(path: Path) -> float:
+    text = path.stem
+    if _TIME.fullmatch(text):
+        nanoseconds = len(text) >= _NANOSECOND_DIGITS and "." not in text
+        stamp_s = int(text) / 1e9 if nanoseconds else float(text)
+        if stamp_s <= MAX_TIMESTAMP_S:
+            return stamp_s
+    raise MisuseError(
+        f"{visible(str(path))}: its name is no time; name pictures by the time they were taken, in"
+        " seconds with a point or nanoseconds, or give --fps N for N pictures a second from --start"
+        " on"
+    )
+
+
+def _reader(path: Path) -> Callable[[], Pixels]:
+    def pixels() -> Pixels:
+        try:
+            with open_file(path) as file:
+                data = file.read(MAX_PICTURE_BYTES + 1)
+        except FileFault as fault:
+            raise PictureError(str(fault)) from None
+        except OSError as error:
+            raise PictureError(error.strerror or str(error)) from None
+        return decode(data)
+
+    return pixels
+
+
+def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[Picture]:
+    try:
+        if timing.per_s is None and video.frames_per_s is None:
+            raise MisuseError(f"--images {path}: this video does not state its rate; give --fps")
+        index = 0
+        while video.next():
+            stamp_s = timing.stamp_s(index, video.frames_per_s)
+            yield Picture(f"{visible(str(path))}, frame {index}", stamp_s or 0.0, video.pixels)
+            index += 1
+        if index == 0:
+            raise MisuseError(f"--images {path}: no frame in this video can be read")
+    finally:
+        video.close()
+
+
+def _from_stdin(read: Read, timing: Timing) -> Iterator[Picture]:
+    """The pictures of a stream if it begins like a picture, else those of a path a line."""
+    start = b""
+    while len(start) < len(PNG_START) and b"\n" not in start:
+        piece = read(len(PNG_START) - len(start))
+        if not piece:
+            break
+        start += piece
+    if start.startswith((JPEG_START, PNG_START)):
+        yield from _from_stream(start, read, timing)
+    elif start.strip():
+        yield from _from_paths(_paths(start, read), timing)
+
+
+def _from_stream(start: bytes, read: Read, timing: Timing) -> Iterator[Picture]:
+    pending = [start]
+    parts = split_stream(lambda size: pending.pop() if pending else read(size))
+    for index, part in enumerate(parts):
+        stamp_s = timing.stamp_s(index)
+        stamp_s = system_clock() / 1e9 if stamp_s is None else stamp_s
+        yield Picture(f"stdin, picture {index}", stamp_s, _decoder(part))
+
+
+def _decoder(part: bytes | PictureError) -> Callable[[], Pixels]:
+    def pixels() -> Pixels:
+        if isinstance(part, PictureError):
+            raise part
+        return decode(part)
+
+    return pixels
+
+
+def _paths(start: bytes, read: Read) -> Iterator[Path]:
+    rest = start
+    ended = False
+    while rest or not ended:
+        line, newline, behind = rest.partition(b"\n")
+        if len(line) > _MAX_PATH or b"\0" in line:
+            raise MisuseError("--images -: neither pictures (JPEG, PNG) nor a path a line")
+        if not newline and not ended:
+            piece = read(_MAX_PATH)
+            ended = not piece
+            rest += piece
+            continue
+        rest = behind
+        text = line.decode("utf-8", "surrogateescape").strip()
+        if text:
+            yield Path(text)

@@ -1,0 +1,216 @@
+"""Make envelopes from pictures by the keyframe gate, the detector and the encoder."""
+
+import base64
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
+
+from .encoder import Encoder
+from .finder import Finder, Found
+from .gate import KeyframeGate, Pose
+from .picture import Picture, PictureError, Pixels
+from .poses import Poses
+from .vision import encode_jpeg, shrunk
+
+FIRST_KEYFRAME: Final = 1
+CROP_SIDE: Final = 640
+"""Largest width and height of kept crops: more than encoders take, and always under the 1 MiB that
+a log keeps."""
+_MOST_NOTES: Final = 5
+"""Messages for each kind of fault; further ones are only counted."""
+
+
+@dataclass
+class Counts:
+    """Counts of pictures by outcome. Each is one of ``between`` (too near the last keyframe),
+    ``unreadable`` or ``keyframes``."""
+
+    pictures: int = 0
+    between: int = 0
+    unreadable: int = 0
+    keyframes: int = 0
+    without_pose: int = 0
+    detections: int = 0
+    """Detections in the keyframes."""
+    not_encoded: int = 0
+    """Detections without an embedding, because the encoder's answer was not finite or zero."""
+    not_finite: int = 0
+    """Boxes left out because the detector's answer was not finite."""
+    too_small: int = 0
+    """Boxes left out because they are less than a pixel wide or high in the picture."""
+    cut: int = 0
+    """Boxes beyond the most that a picture may have."""
+
+    @property
+    def lost(self) -> int:
+        """The number of faults: pictures, detections and boxes that could not be used."""
+        return self.unreadable + self.not_encoded + self.not_finite + self.cut
+
+
+class Crop(NamedTuple):
+    """The JPEG of a detection's box."""
+
+    det_id: DetId
+    jpeg: bytes
+
+
+class Keyframe(NamedTuple):
+    """The JSON document of an envelope, and the crops of its detections if they are kept."""
+
+    envelope: dict[str, Any]
+    crops: list[Crop]
+
+
+class Keyframes:
+    """Detects objects in one picture after the other; ``note`` receives lines about faults."""
+
+    def __init__(
+        self,
+        finder: Finder,
+        encoder: Encoder,
+        gate: KeyframeGate,
+        poses: Poses,
+        run_id: RunId,
+        *,
+        hfov_deg: float | None = None,
+        keep_crops: bool = False,
+        note: Callable[[str], None],
+    ) -> None:
+        self._finder, self._encoder, self._gate, self._poses = finder, encoder, gate, poses
+        self._run_id, self._hfov_deg, self._keep_crops = run_id, hfov_deg, keep_crops
+        self._note = note
+        self._noted: dict[str, int] = {}
+        self.counts = Counts()
+
+    def process(self, picture: Picture) -> Keyframe | None:
+        """The keyframe of a picture; None if it is left out. Raises ModelError."""
+        counts = self.counts
+        counts.pictures += 1
+        if not 0.0 <= picture.stamp_s <= MAX_TIMESTAMP_S:
+            self._skip(picture, f"its time, {picture.stamp_s:g} s, is out of range")
+            return None
+        pose = self._poses.at(picture.stamp_s)
+        if not self._gate.is_due(picture.stamp_s, pose):
+            counts.between += 1
+            return None
+        try:
+            pixels = picture.pixels()
+        except PictureError as error:
+            self._skip(picture, str(error))
+            return None
+        self._gate.set_last(picture.stamp_s, pose)
+        found = self._finder.find(pixels)
+        self._count(picture, found)
+        counts.keyframes += 1
+        counts.without_pose += pose is None
+        return self._keyframe(picture, pixels, pose, found)
+
+    def _skip(self, picture: Picture, reason: str) -> None:
+        self.counts.unreadable += 1
+        self._note_fault("unreadable", f"{picture.name}: left out: {reason}")
+
+    def _count(self, picture: Picture, found: Found) -> None:
+        counts = self.counts
+        counts.detections += len(found.labels)
+        counts.not_finite += found.not_finite
+        counts.too_small += found.too_small
+        counts.cut += found.cut
+        if found.not_finite:
+            self._note_fault(
+                "not_finite",
+                f"{picture.name}: the detector answered NaN or infinity for {found.not_finite:,} "
+                "boxes, which are left out",
+            )
+        if found.cut:
+            self._note_fault(
+                "cut",
+                f"{picture.name}: {found.cut:,} boxes too many, of which some may show the same"
+                " thing; change --max-detections or --confidence to keep more or find fewer",
+            )
+
+    def _keyframe(
+        self, picture: Picture, pixels: Pixels, pose: Pose | None, found: Found
+    ) -> Keyframe:
+        number = KeyframeId(FIRST_KEYFRAME + self.counts.keyframes - 1)
+        cut_out = [_cut_out(pixels, box) for box in found.boxes]
+        vectors = self._encoder.encode(cut_out) if cut_out else []
+        missing = sum(vector is None for vector in vectors)
+        if missing:
+            self.counts.not_encoded += missing
+            self._note_fault(
+                "not_encoded",
+                f"{picture.name}: the encoder answered NaN or zero for {missing:,} crops, which"
+                " have no embedding",
+            )
+        ids = [default_det_id(self._run_id, number, index) for index in range(len(vectors))]
+        detections = [
+            self._detection(*each)
+            for each in zip(ids, found.labels, found.scores, found.boxes, vectors, strict=True)
+        ]
+        envelope = {
+            "run_id": self._run_id,
+            "keyframe_id": number,
+            "timestamp": round(picture.stamp_s, 6),
+            **_pose_fields(pose),
+            **self._camera_fields(pixels),
+            "detections": detections,
+        }
+        crops = []
+        if self._keep_crops:
+            jpegs = [encode_jpeg(shrunk(pixels, CROP_SIDE)) for pixels in cut_out]
+            crops = [Crop(*each) for each in zip(ids, jpegs, strict=True)]
+        return Keyframe(envelope, crops)
+
+    def _detection(
+        self,
+        det_id: DetId,
+        label: str,
+        score: float,
+        box: NDArray[np.float64],
+        vector: NDArray[np.float32] | None,
+    ) -> dict[str, Any]:
+        fields: dict[str, Any] = {
+            "det_id": det_id,
+            "class": label,
+            "confidence": round(score, 4),
+            "bbox": [round(edge, 1) for edge in box.tolist()],
+        }
+        if vector is not None:
+            fields |= {
+                "embedding": base64.b64encode(vector.astype("<f4").tobytes()).decode("ascii"),
+                "embedding_dim": len(vector),
+                "embedding_model": self._encoder.name,
+            }
+        return fields
+
+    def _camera_fields(self, pixels: Pixels) -> dict[str, Any]:
+        if self._hfov_deg is None:
+            return {}
+        height, width = pixels.shape[:2]
+        return {"camera": {"hfov_deg": self._hfov_deg, "width_px": width, "height_px": height}}
+
+    def _note_fault(self, kind: str, text: str) -> None:
+        times = self._noted[kind] = self._noted.get(kind, 0) + 1
+        if times <= _MOST_NOTES:
+            last = "; others like it are only counted" if times == _MOST_NOTES else ""
+            self._note(text + last)
+
+
+def _pose_fields(pose: Pose | None) -> dict[str, float]:
+    if pose is None:
+        return {}
+    yaw = math.remainder(pose.yaw, math.tau)
+    return {"map_x": round(pose.x, 6), "map_y": round(pose.y, 6), "map_yaw": round(yaw, 6)}
+
+
+def _cut_out(pixels: Pixels, box: NDArray[np.float64]) -> Pixels:
+    """The pixels that a box touches."""
+    x0, y0 = (int(edge) for edge in np.floor(box[:2]))
+    x1, y1 = (int(edge) for edge in np.ceil(box[2:]))
+    return pixels[y0:y1, x0:x1]

@@ -1,0 +1,171 @@
+"""Run ONNX models by onnxruntime. Only this module imports it, when the first model is opened.
+
+docs/decisions/onnxruntime.md says why onnxruntime.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.base.advised import command_line
+from eventsrc.base.errors import MapfoldError, MisuseError
+
+Device: TypeAlias = Literal["cpu", "cuda"]
+Array: TypeAlias = NDArray[np.floating[Any]]
+_TYPES: Final[Mapping[str, type[np.floating[Any]]]] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+}
+
+
+class ModelError(MapfoldError):
+    """A model cannot be used: its file, its inputs or its outputs are wrong."""
+
+
+class Tensor(NamedTuple):
+    """The name, type and sizes of an input or output; a size that is not fixed is None."""
+
+    name: str
+    type: str
+    shape: tuple[int | None, ...]
+
+    @property
+    def text(self) -> str:
+        """The sizes as text: ``1 × 3 × 640 × 640``."""
+        return shape_text(self.shape)
+
+
+def shape_text(shape: tuple[int | None, ...]) -> str:
+    """Sizes as text, with ``?`` for one that is not fixed."""
+    return " × ".join("?" if size is None else f"{size}" for size in shape) or "a number"
+
+
+class OnnxModel:
+    """A model that takes pictures, (n, 3, height, width), as its only input.
+
+    Raises MisuseError if the file is missing or onnxruntime cannot do what is asked, ModelError
+    if the file is no such model.
+    """
+
+    def __init__(self, path: Path, device: Device = "cpu", threads: int | None = None) -> None:
+        self.path = path
+        if not path.is_file():
+            raise MisuseError(
+                f"{path}: no such model; see `{command_line('detect')}` without models"
+            )
+        ort, self._faults = _onnxruntime()
+        options = ort.SessionOptions()
+        options.log_severity_level = 4  # faults come as exceptions
+        if threads is not None:
+            options.intra_op_num_threads = threads
+        wanted = _providers(ort, device)
+        try:
+            self._session = ort.InferenceSession(str(path), options, providers=wanted)
+        except self._faults as fault:
+            raise ModelError(f"{path}: cannot be loaded as ONNX: {_reason(fault)}") from None
+        if device == "cuda" and self._session.get_providers()[0] != wanted[0]:
+            raise MisuseError(
+                "--device cuda: onnxruntime could not start CUDA, whose libraries may be missing"
+                " or of another version; use --device cpu"
+            )
+        self.outputs = tuple(_tensor(each) for each in self._session.get_outputs())
+        self.input = self._only_input()
+        self._dtype = _TYPES[self.input.type]
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """The metadata that the exporter wrote into the file."""
+        found: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
+        return found
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the input in pixels; None if they are not fixed."""
+        _, _, height, width = self.input.shape
+        return None if width is None or height is None else (width, height)
+
+    @property
+    def batch(self) -> int | None:
+        """The number of pictures that it takes at once; None if that is not fixed."""
+        return self.input.shape[0]
+
+    def output(self, *names: str) -> str:
+        """The first of ``names`` that is an output, else the name of the only output. Raises
+        ModelError."""
+        there = [each.name for each in self.outputs]
+        for name in names:
+            if name in there:
+                return name
+        if len(there) != 1:
+            raise ModelError(
+                f"{self.path}: it has the outputs {', '.join(there)}, and none of them is "
+                f"{' or '.join(names) or 'named'}; export it with one output"
+            )
+        return there[0]
+
+    def run(self, pictures: NDArray[np.float32], output: str) -> Array:
+        """The output for ``pictures``, shape (n, 3, height, width). Raises ModelError."""
+        given = {self.input.name: pictures.astype(self._dtype, copy=False)}
+        try:
+            (answer,) = self._session.run([output], given)
+        except self._faults as fault:
+            raise ModelError(f"{self.path}: {_reason(fault)}") from None
+        if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
+            raise ModelError(f"{self.path}: output {output} is no array of floating point numbers")
+        return answer
+
+    def _only_input(self) -> Tensor:
+        inputs = tuple(_tensor(each) for each in self._session.get_inputs())
+        if len(inputs) != 1:
+            names = ", ".join(each.name for each in inputs) or "none"
+            raise ModelError(
+                f"{self.path}: it has the inputs {names}; one that takes pictures is needed"
+                " (of CLIP, export the image tower alone)"
+            )
+        found = inputs[0]
+        if len(found.shape) != 4 or found.shape[1] not in (3, None) or found.type not in _TYPES:
+            raise ModelError(
+                f"{self.path}: its input {found.name} is {found.type} of {found.text}; "
+                "n × 3 × height × width of float is needed"
+            )
+        return found
+
+
+def _tensor(described: Any) -> Tensor:
+    shape = tuple(size if isinstance(size, int) else None for size in described.shape)
+    return Tensor(described.name, described.type, shape)
+
+
+def _onnxruntime() -> tuple[Any, tuple[type[Exception], ...]]:
+    """The module, and the exceptions that it raises. MisuseError if it is not installed."""
+    try:
+        import onnxruntime
+        from onnxruntime.capi import onnxruntime_pybind11_state as state
+    except ImportError:
+        raise MisuseError(
+            "ONNX models need onnxruntime; install mapfold with the extra detector: "
+            "pip install 'mapfold[detector]'"
+        ) from None
+    kinds = [kind for kind in vars(state).values() if isinstance(kind, type)]
+    faults = tuple(kind for kind in kinds if issubclass(kind, Exception))
+    return onnxruntime, (*faults, RuntimeError, ValueError)
+
+
+def _providers(ort: Any, device: Device) -> list[str]:
+    if device == "cpu":
+        return ["CPUExecutionProvider"]
+    if "CUDAExecutionProvider" not in ort.get_available_providers():
+        raise MisuseError(
+            "--device cuda: this onnxruntime has no CUDA; pip uninstall onnxruntime and"
+            " pip install onnxruntime-gpu, or use --device cpu"
+        )
+    return ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+
+def _reason(fault: Exception) -> str:
+    """The last part of onnxruntime's message, which begins with codes and source lines."""
+    words = " ".join(str(fault).split())
+    return words.rpartition("Status Message: ")[2][:300] or type(fault).__name__

@@ -1,0 +1,195 @@
+"""A furnished house: a floor plan and the objects in it, from one seed.
+
+Furniture stands with its back to a wall, clear of doors and of each other; the dining set stands
+free. A furnishing is accepted only if the robot can drive from every room to every other; otherwise
+the next attempt is drawn.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.occupancy_map import OCCUPIED, OccupancyMap
+
+from .catalogue import DINING_SET, FURNITURE, MODELS, Model
+from .floorplan import Door, FloorPlan, Room, build_floor_plan
+from .grid import DriveGrid
+from .random_streams import stream, uniform
+from .shapes import Point, Rect, Walls
+
+_ATTEMPTS = 40
+_TRIES = 250
+_DOOR_CLEAR_M = 0.85
+_CHAIR_OFFSETS = ((-0.35, -0.7), (0.35, -0.7), (-0.35, 0.7), (0.35, 0.7))
+_MAP_RESOLUTION_M = 0.05
+_MAP_MARGIN = 10
+"""Cells around the outermost walls."""
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """One object. ``instance`` is its true identity, ``facing_rad`` the direction of its front."""
+
+    instance: str
+    model: Model
+    room: str
+    footprint: Rect
+    facing_rad: float
+
+    @property
+    def centre(self) -> Point:
+        """The middle of its footprint."""
+        return self.footprint.centre
+
+
+@dataclass(frozen=True)
+class House:
+    """A floor plan with things in it."""
+
+    seed: int
+    plan: FloorPlan
+    things: tuple[Thing, ...]
+
+    @cached_property
+    def walls(self) -> Walls:
+        """The walls, for lines of sight."""
+        return Walls(self.plan.walls)
+
+    @cached_property
+    def grid(self) -> DriveGrid:
+        """The floor where the robot can drive."""
+        return _grid(self.plan, self.things)
+
+
+def build_house(seed: int) -> House:
+    """The house of this seed. Raises MapfoldError if every attempt blocks a room."""
+    plan = build_floor_plan(seed)
+    for attempt in range(_ATTEMPTS):
+        things = _furnish(plan, stream("furniture", seed, attempt))
+        if things is not None and _grid(plan, things).connects(
+            [room.rect.centre for room in plan.rooms]
+        ):
+            return House(seed, plan, _with_instances(seed, things))
+    raise MapfoldError(
+        f"house {seed}: no furnishing leaves every room reachable; try another --seed"
+    )
+
+
+def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
+    return DriveGrid(
+        plan.outline, Walls(plan.walls), [t.footprint for t in things if t.model.stands]
+    )
+
+
+def _with_instances(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
+    """Name the instances of a model house7-model-1, house7-model-2 … in the order of placing. No
+    two houses share an instance."""
+    counts: dict[str, int] = {}
+    named: list[Thing] = []
+    for thing in things:
+        count = counts[thing.model.name] = counts.get(thing.model.name, 0) + 1
+        named.append(replace(thing, instance=f"house{seed}-{thing.model.name}-{count}"))
+    return tuple(named)
+
+
+def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | None:
+    """Everything in FURNITURE and the dining set; None when something does not fit."""
+    placed: list[Thing] = []
+    dining = _dining_set(plan, rng)
+    if dining is None:
+        return None
+    placed.extend(dining)
+    for room in plan.rooms:
+        for name in FURNITURE[room.name]:
+            thing = _against_a_wall(plan, room, MODELS[name], placed, rng)
+            if thing is None:
+                return None
+            placed.append(thing)
+    return tuple(placed)
+
+
+def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[Thing] | None:
+    room = plan.room("dining room")
+    keep_clear = list(_door_areas(plan, room))
+    for _ in range(_TRIES):
+        x = round(uniform(rng, room.rect.x0 + 1.1, room.rect.x1 - 1.1), 2)
+        y = round(uniform(rng, room.rect.y0 + 1.1, room.rect.y1 - 1.1), 2)
+        if any(Rect.around(x, y, 1.7, 2.0).overlaps(clear) for clear in keep_clear):
+            continue
+        table, *chairs = (MODELS[name] for name in DINING_SET)
+        things = [_thing(table, room, Rect.around(x, y, table.width_m, table.depth_m), 0)]
+        for chair, (dx, dy) in zip(chairs, _CHAIR_OFFSETS, strict=True):
+            spot = Rect.around(x + dx, y + dy, chair.width_m, chair.depth_m)
+            things.append(_thing(chair, room, spot, 1 if dy < 0 else 3))
+        return things
+    return None
+
+
+def _against_a_wall(
+    plan: FloorPlan, room: Room, model: Model, placed: list[Thing], rng: np.random.Generator
+) -> Thing | None:
+    taken = [t.footprint for t in placed if t.room == room.name and t.model.stands == model.stands]
+    taken += _door_areas(plan, room)
+    for _ in range(_TRIES):
+        side = int(rng.integers(0, 4))
+        spot = _spot(room.rect, model, side, uniform(rng, 0.0, 1.0))
+        if room.rect.encloses(spot) and not any(spot.grown(0.05).overlaps(t) for t in taken):
+            return _thing(model, room, spot, side)
+    return None
+
+
+def _spot(rect: Rect, model: Model, side: int, along: float) -> Rect:
+    """The footprint with its back to a side (0 west, 1 south, 2 east, 3 north), 5 cm off it."""
+    gap = 0.05 + model.depth_m / 2
+    if side in (0, 2):
+        half = model.width_m / 2 + 0.05
+        y = round(rect.y0 + half + along * (rect.height - 2 * half), 2)
+        x = rect.x0 + gap if side == 0 else rect.x1 - gap
+        return Rect.around(x, y, model.depth_m, model.width_m)
+    half = model.width_m / 2 + 0.05
+    x = round(rect.x0 + half + along * (rect.width - 2 * half), 2)
+    y = rect.y0 + gap if side == 1 else rect.y1 - gap
+    return Rect.around(x, y, model.width_m, model.depth_m)
+
+
+def _thing(model: Model, room: Room, spot: Rect, side: int) -> Thing:
+    """``side`` is the wall at its back; its front faces the other way."""
+    quarter_turns = {0: 0.0, 1: 0.5, 2: 1.0, 3: -0.5}
+    return Thing("", model, room.name, spot, quarter_turns[side] * np.pi)
+
+
+def _door_areas(plan: FloorPlan, room: Room) -> Iterator[Rect]:
+    """The floor around the room's doors, which stays free."""
+    for door in plan.doors:
+        if room.name in door.rooms:
+            yield _door_area(door)
+
+
+def _door_area(door: Door) -> Rect:
+    deep, wide = 2 * _DOOR_CLEAR_M, door.width_m
+    return Rect.around(*door.centre, *((wide, deep) if door.flat else (deep, wide)))
+
+
+def occupancy_map(house: House) -> OccupancyMap:
+    """The walls as an occupancy map, without furniture and without unknown cells. A wall occupies
+    the cells that its line is in."""
+    lines = [(w.x0, w.y0, w.x1, w.y1) for w in house.plan.walls]
+    left = _cell(min(min(x0, x1) for x0, _, x1, _ in lines)) - _MAP_MARGIN
+    below = _cell(min(min(y0, y1) for _, y0, _, y1 in lines)) - _MAP_MARGIN
+    columns = _cell(max(max(x0, x1) for x0, _, x1, _ in lines)) - left + _MAP_MARGIN + 1
+    rows = _cell(max(max(y0, y1) for _, y0, _, y1 in lines)) - below + _MAP_MARGIN + 1
+    cells = np.zeros((rows, columns), np.uint8)
+    for line in lines:
+        x0, y0, x1, y1 = map(_cell, line)
+        spans = sorted((y0 - below, y1 - below)), sorted((x0 - left, x1 - left))
+        cells[spans[0][0] : spans[0][1] + 1, spans[1][0] : spans[1][1] + 1] = OCCUPIED
+    origin = round(left * _MAP_RESOLUTION_M, 6), round(below * _MAP_RESOLUTION_M, 6), 0.0
+    return OccupancyMap(f"house-{house.seed}", _MAP_RESOLUTION_M, origin, "simulated house", cells)
+
+
+def _cell(metres: float) -> int:
+    """The index of a cell. Walls lie on tenths of a millimetre, so the division is exact enough."""
+    return round(metres * 10_000) // round(_MAP_RESOLUTION_M * 10_000)

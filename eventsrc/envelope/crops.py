@@ -1,0 +1,103 @@
+"""Crops of detections: JPEGs of the pixels inside a detection's box, as verbatim messages of a log.
+
+A detector publishes them under ``PREFIX/DET_ID``, the det_id percent-encoded. In a log all are on
+the topic ``PREFIX``, as sensor_msgs/CompressedImage in CDR with the det_id as ``frame_id``, so that
+Foxglove and Rerun show them. The JPEG itself is unchanged.
+"""
+
+import struct
+from typing import Final, NamedTuple
+from urllib.parse import unquote
+
+from eventsrc.base.text import visible
+
+from .model import MAX_ID_LENGTH, DetId
+
+CROP_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
+CROP_ENCODING: Final = "cdr"
+CROP_SCHEMA_ENCODING: Final = "ros2msg"
+CROP_SCHEMA_TEXT: Final = b"""\
+std_msgs/Header header
+string format
+uint8[] data
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+MAX_CROP_BYTES: Final = 1024 * 1024
+"""Bound of a crop's JPEG."""
+_HEAD: Final = b"\0\1\0\0"
+_JPEG_START: Final = b"\xff\xd8\xff"
+_JPEG_END: Final = b"\xff\xd9"
+_FORMAT: Final = b"jpeg"
+_NS: Final = 1_000_000_000
+
+
+class InvalidCrop(ValueError):
+    """Bytes or a key that are no crop; the message says why."""
+
+
+class Crop(NamedTuple):
+    """The JPEG of a detection."""
+
+    det_id: DetId
+    jpeg: bytes
+
+
+def received_crop(key: str, payload: bytes) -> tuple[str, Crop]:
+    """Topic and crop of a message under ``PREFIX/DET_ID``. Raises InvalidCrop."""
+    topic, slash, last = key.rpartition("/")
+    try:
+        det_id = unquote(last, errors="strict")
+    except UnicodeDecodeError:
+        raise InvalidCrop(f"{visible(last)}: the det_id in the key is no UTF-8") from None
+    if not slash or not topic or not 0 < len(det_id) <= MAX_ID_LENGTH or "\0" in det_id:
+        raise InvalidCrop(f"{visible(key)}: a crop's key is PREFIX/DET_ID")
+    if len(payload) > MAX_CROP_BYTES:
+        raise InvalidCrop(f"a crop of {len(payload):,} bytes; at most {MAX_CROP_BYTES:,}")
+    if not payload.startswith(_JPEG_START) or _JPEG_END not in payload[-64:]:
+        raise InvalidCrop(f"a crop that is no whole JPEG: it begins with {payload[:4].hex(' ')}")
+    return topic, Crop(DetId(det_id), payload)
+
+
+def encode_crop(crop: Crop, stamp_ns: int) -> bytes:
+    """The CompressedImage of a crop, in CDR."""
+    frame_id = crop.det_id.encode() + b"\0"
+    head = struct.pack("<iII", min(stamp_ns // _NS, 2**31 - 1), stamp_ns % _NS, len(frame_id))
+    body = _padded(_padded(head + frame_id) + struct.pack("<I", len(_FORMAT) + 1) + _FORMAT + b"\0")
+    return b"".join((_HEAD, body, struct.pack("<I", len(crop.jpeg)), crop.jpeg))
+
+
+def _padded(body: bytes) -> bytes:
+    return body + b"\0" * (-len(body) % 4)
+
+
+def decode_crop(payload: bytes) -> Crop:
+    """The crop that `encode_crop` made. Raises InvalidCrop."""
+    body = payload[len(_HEAD) :]
+    try:
+        if payload[: len(_HEAD)] != _HEAD:
+            raise InvalidCrop("it is no message in CDR of little endian")
+        frame_id, at = _text(body, 8)
+        _, at = _text(body, at)
+        (length,) = struct.unpack_from("<I", body, at)
+        jpeg = body[at + 4 : at + 4 + length]
+        if len(jpeg) != length or len(body) - at - 4 - length > 3:
+            raise InvalidCrop(f"its data of {length:,} bytes do not fit its {len(payload):,}")
+        return Crop(DetId(frame_id.decode()), jpeg)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise InvalidCrop(f"it is no sensor_msgs/CompressedImage: {error}") from None
+
+
+def _text(body: bytes, at: int) -> tuple[bytes, int]:
+    """The text at ``at``, and the aligned position behind it. Raises InvalidCrop."""
+    (length,) = struct.unpack_from("<I", body, at)
+    end = at + 4 + length
+    if not 0 < length <= len(body) - at - 4 or body[end - 1]:
+        raise InvalidCrop("a text in it does not end where it says")
+    return body[at + 4 : end - 1], end + -end % 4

@@ -1,0 +1,302 @@
+"""The envelope: one keyframe's message as it came over Zenoh.
+
+The models define a *valid* envelope. They are strict: an int is not a string, NaN is not a number.
+Unknown fields need only be JSON; they are ignored here, and the log keeps them, since it stores the
+payload verbatim. `eventsrc.envelope.ingest` makes an envelope from bytes and gives the reason if it
+cannot. The docstrings of the models are part of the JSON schema in every segment: do not change
+them.
+
+The types of identifiers are here too: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are ints and
+strings at run time; mypy keeps them apart.
+"""
+
+import math
+import unicodedata
+from collections.abc import Sequence
+from decimal import Decimal
+from typing import Annotated, Any, NewType
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    PlainValidator,
+    StringConstraints,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import ErrorDetails
+
+Offset = NewType("Offset", int)
+"""The index of an event in its log: 0, 1, 2 … without holes. The only order and progress marker;
+times and keyframe ids are data. As the end of a range it is excluded."""
+FIRST_OFFSET = Offset(0)
+RunId = NewType("RunId", str)
+KeyframeId = NewType("KeyframeId", int)
+"""The number a robot gives a keyframe within its run."""
+DetId = NewType("DetId", str)
+
+ENVELOPE_VERSION = 5
+"""The version of the models below; `eventsrc.envelope.upcast` converts older ones to it."""
+FIRST_ENVELOPE_VERSION = 2
+"""Since this version payloads are envelopes, with a run, a keyframe id and a time."""
+
+MAX_ID_LENGTH = 256
+MAX_POSITION_M = 1e7
+"""Bound of map_x, map_y and map_z, ±10,000 km: the fold computes in integer micrometres and is
+exact within it (see `projections.fold.exact`)."""
+MAX_TIMESTAMP_S = 9_000_000_000.0
+"""Bound of a timestamp: int nanoseconds must fit 63 bits."""
+MAX_DIMENSION = 16_000
+"""Bound of an embedding's dimension, pgvector's own."""
+MAX_DETECTIONS = 10_000
+"""Bound of the detections in one envelope; with embeddings of 512 numbers, 16 MiB hold 6,000."""
+
+
+TEXT = StringConstraints(max_length=MAX_ID_LENGTH, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")
+Text = Annotated[str, TEXT]
+"""An id or a name: 1 to 256 characters, none of them a control character (category Cc)."""
+
+
+def describe_error(error: ErrorDetails) -> str:
+    """The rule that a value breaks: a `Text`'s own, else the message of pydantic."""
+    if error["type"] not in ("string_too_long", "string_pattern_mismatch"):
+        return error["msg"].removeprefix("Value error, ")
+    text: str = error["input"]
+    if not text:
+        return "is empty"
+    most = error.get("ctx", {}).get("max_length", MAX_ID_LENGTH)
+    if len(text) > most:
+        return f"is {len(text)} characters long, more than {most}"
+    at, char = next((i, c) for i, c in enumerate(text) if unicodedata.category(c) == "Cc")
+    return f"has the control character U+{ord(char):04X} at index {at}"
+
+
+HFOV_DEG = Field(ge=1.0, le=170.0)
+PIXELS = Field(ge=1.0, le=1e6)
+ANGLE_RAD = Field(ge=-7.0, le=7.0)
+"""Bounds of a camera's field of view, its picture's size, and the angle at which it is mounted."""
+SIGMA_M = Field(ge=0.001, le=1000.0)
+"""Bounds of a standard error, metres."""
+MAX_DEPTH_M = 1000.0
+
+INT64 = Field(ge=-(2**63), lt=2**63)
+Int64 = Annotated[int, INT64]
+
+
+def _floor_name(value: object) -> str | None:
+    """A floor's name: the text itself, or an integer's digits."""
+    if value is None:
+        return None
+    if type(value) is int and -(2**63) <= value < 2**63:
+        return str(value)
+    if isinstance(value, str) and 1 <= len(value) <= MAX_ID_LENGTH:
+        if all(unicodedata.category(char) != "Cc" for char in value):
+            return value
+        raise ValueError("has a control character; name the floor by a text without one")
+    raise ValueError(f"is no floor; give an integer or a text of 1 to {MAX_ID_LENGTH} characters")
+
+
+_FLOOR_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "minLength": 1, "maxLength": MAX_ID_LENGTH},
+        {"type": "integer"},
+        {"type": "null"},
+    ]
+}
+Floor = Annotated[str | None, PlainValidator(_floor_name), WithJsonSchema(_FLOOR_SCHEMA)]
+"""The name of a floor; an integer is its decimal digits, so 2 and "2" are one floor."""
+
+Position = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+
+
+COVARIANCE_SIZE = 9
+MAX_VARIANCE = 1e6
+"""Bound of a pose's variances: a standard error of a kilometre, or of 1000 radians."""
+_SAME = 1e-6
+"""How far two symmetric entries of a covariance may differ, and exceed the largest value that their
+variances allow, relative to that value."""
+_ROUNDING = 1e-12
+"""How far rounding may move an entry beside a variance of 0, relative to the largest variance."""
+
+
+def covariance_fault(nine: Sequence[float]) -> str | None:
+    """Why ``nine`` numbers, row by row, are no covariance of x, y and yaw; None if they are."""
+    if len(nine) != COVARIANCE_SIZE:
+        return f"has {len(nine)} numbers; give {COVARIANCE_SIZE}, row by row of x, y and yaw"
+    if not all(map(math.isfinite, nine)):
+        return "holds NaN or infinity"
+    for name, variance in zip(_OF_POSE, nine[::4], strict=True):
+        if not 0.0 <= variance <= MAX_VARIANCE:
+            return (
+                f"has the variance {variance:g} of {name}, which is not from 0 to {MAX_VARIANCE:g}"
+            )
+    rounding = _ROUNDING * max(nine[::4])
+    for row, column in ((0, 1), (0, 2), (1, 2)):
+        one, other = nine[3 * row + column], nine[3 * column + row]
+        most = math.sqrt(nine[4 * row] * nine[4 * column])
+        names = f"{_OF_POSE[row]} and {_OF_POSE[column]}"
+        slack = _SAME * most + rounding
+        if abs(one - other) > slack:
+            return f"is not symmetric: {one:g} and {other:g} for {names}"
+        if abs(one) > most + slack:
+            return f"has {one:g} for {names}, more than their variances allow ({most:g})"
+    return None
+
+
+_OF_POSE = ("x", "y", "yaw")
+
+
+def _checked_covariance(nine: tuple[float, ...]) -> tuple[float, ...]:
+    fault = covariance_fault(nine)
+    if fault is not None:
+        raise ValueError(fault)
+    return nine
+
+
+_COVARIANCE = Field(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)
+PoseCovariance = Annotated[tuple[float, ...], _COVARIANCE, AfterValidator(_checked_covariance)]
+"""Of x, y (metres) and yaw (radians), row by row."""
+
+
+class NonFinite(Exception):
+    """An unknown field holds NaN or infinity.
+
+    No ValueError, so that pydantic stops at the first one instead of collecting a million errors.
+    """
+
+
+def contains_non_finite(value: object) -> bool:
+    """Whether NaN or infinity is anywhere in a JSON value."""
+    rest = [value]
+    while rest:
+        item = rest.pop()
+        if isinstance(item, float):
+            if not math.isfinite(item):
+                return True
+        elif isinstance(item, list):
+            rest.extend(item)
+        elif isinstance(item, dict):
+            rest.extend(item.values())
+    return False
+
+
+def _require_finite(value: object) -> None:
+    """Raise NonFinite for NaN or infinity in an unknown field: they are not JSON, and a reader of
+    the log that parses JSON would fail. Returns None: the model drops the value, the log has it."""
+    if isinstance(value, float | list | dict) and contains_non_finite(value):
+        raise NonFinite
+
+
+Unknown = Annotated[Any, AfterValidator(_require_finite)]
+
+
+class _Model(BaseModel):
+    __pydantic_extra__: dict[str, Unknown]
+    # "allow" makes pydantic check unknown fields; it costs nothing without any.
+    model_config = ConfigDict(
+        strict=True, frozen=True, extra="allow", allow_inf_nan=False, populate_by_name=True
+    )
+
+
+class Detection(_Model):
+    """One detected object in a keyframe.
+
+    ``bbox`` is x_min, y_min, x_max, y_max in pixels. ``embedding`` is base64 of
+    ``embedding_dim`` little-endian float32. ``depth_m`` is how far away the thing is along the ray
+    through the box's centre, ``position`` its x and y in the map frame, in metres; their standard
+    errors count only beside them.
+    """
+
+    det_id: Annotated[DetId, TEXT] | None = None
+    class_name: Text = Field(alias="class")
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding: str | None = None
+    embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
+    embedding_model: Text | None = None
+    depth_m: Annotated[float, Field(gt=0.0, le=MAX_DEPTH_M)] | None = None
+    depth_sigma_m: Annotated[float, SIGMA_M] | None = None
+    position: tuple[Position, Position] | None = None
+    position_sigma_m: Annotated[float, SIGMA_M] | None = None
+
+
+class EnvelopeCamera(_Model):
+    """The level pinhole camera that took the picture: horizontal field of view, picture size, and
+    the angle from the robot's heading to where it looks, to the left."""
+
+    hfov_deg: Annotated[float, HFOV_DEG]
+    width_px: Annotated[float, PIXELS]
+    height_px: Annotated[float, PIXELS]
+    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+
+
+class Envelope(_Model):
+    """One keyframe: where the robot was and what it saw.
+
+    ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
+    metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
+    Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
+    is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
+    the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
+    counts only beside a pose.
+    """
+
+    run_id: Annotated[RunId, TEXT]
+    keyframe_id: Annotated[KeyframeId, INT64]
+    timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
+    map_x: Position | None = None
+    map_y: Position | None = None
+    map_yaw: float | None = None
+    camera: EnvelopeCamera | None = None
+    floor: Floor = None
+    map_z: Position | None = None
+    pose_covariance: PoseCovariance | None = None
+    detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
+
+    @model_validator(mode="after")
+    def _check_pose(self) -> "Envelope":
+        if not (self.map_x is None) is (self.map_y is None) is (self.map_yaw is None):
+            raise ValueError("map_x, map_y and map_yaw must all be numbers or all be absent")
+        return self
+
+    @property
+    def stamp_ns(self) -> int:
+        """``timestamp`` as int nanoseconds."""
+        return stamp_ns(self.timestamp)
+
+
+def stamp_ns(timestamp: float) -> int:
+    """Seconds as int nanoseconds, exact to the shortest decimal that names the float."""
+    text = repr(timestamp)
+    whole, _, part = text.partition(".")
+    if 0 < len(part) <= 9 and "e" not in part:
+        return int(whole + part.ljust(9, "0"))  # the same, faster
+    return int(Decimal(text).scaleb(9).to_integral_value())
+
+
+def has_evidence(envelope: Envelope) -> bool:
+    """Whether the envelope states its camera, or a depth or position of any detection."""
+    if envelope.camera is not None:
+        return True
+    for detection in envelope.detections:
+        if detection.depth_m is not None or detection.position is not None:
+            return True
+    return False
+
+
+def has_floor(envelope: Envelope) -> bool:
+    """Whether the envelope states a floor or a height."""
+    return envelope.floor is not None or envelope.map_z is not None
+
+
+def has_keyframe_id(version: int) -> bool:
+    """Whether payloads of this envelope version name their keyframe."""
+    return FIRST_ENVELOPE_VERSION <= version <= ENVELOPE_VERSION
+
+
+def default_det_id(run_id: RunId, keyframe_id: KeyframeId, index: int) -> DetId:
+    """The id of a keyframe's detection ``index`` (from 0) that has none of its own."""
+    return DetId(f"{run_id}_kf{keyframe_id}_d{index}")

@@ -1,0 +1,169 @@
+"""mapfold's own events, in the same log and offset space as the envelopes.
+
+``mapfold/rejected``  a payload that is no valid envelope, with its bytes and the reason
+``mapfold/loss``      a detected gap: publisher, first and last missing, cause
+``mapfold/command``   a command (`.commands`), appended by `mapfold edit` or, at its
+                      request, by a recorder
+``mapfold/ros``       how envelopes are made of the messages of ROS behind it
+                      (`eventsrc.ros.derivation`)
+``mapfold/map``       an occupancy grid: where walls are (`.occupancy_map`)
+``mapfold/embeddings``  vectors of another space for older detections (`.embeddings`)
+
+The docstrings of the models are part of the JSON schema in every segment: do not change them.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from typing import Annotated, Final, Literal, NamedTuple
+
+import pybase64
+from pydantic import BaseModel, ConfigDict, Field
+
+from .model import MAX_DIMENSION, Floor, Position, Text
+
+RESERVED_PREFIX = "mapfold/"
+REJECTED_KEY = "mapfold/rejected"
+LOSS_KEY = "mapfold/loss"
+COMMAND_KEY = "mapfold/command"
+MAP_KEY = "mapfold/map"
+ROS_KEY = "mapfold/ros"
+EMBEDDINGS_KEY = "mapfold/embeddings"
+
+
+def is_system_key(key: str) -> bool:
+    """Whether ``key`` is for mapfold's own events; every other key carries envelopes."""
+    return key.startswith(RESERVED_PREFIX)
+
+
+MAX_KEPT_BYTES: Final = 64 * 1024 * 1024
+"""Refused payloads up to this size are kept whole; in base64 one still fits into an event."""
+EXCERPT_BYTES: Final = 4_096
+"""First bytes that are kept of a larger one."""
+
+
+class Excerpt(NamedTuple):
+    """What is kept of a refused payload of more than `MAX_KEPT_BYTES`: its first bytes, and size
+    and SHA-256 (hex digits) of the whole."""
+
+    start: bytes
+    size: int
+    sha256: str
+
+    @classmethod
+    def of(cls, pieces: Iterable[bytes]) -> "Excerpt":
+        """The excerpt of the payload that ``pieces`` make up, of which one is held at a time."""
+        sha, start, size = hashlib.sha256(), b"", 0
+        for piece in pieces:
+            if len(start) < EXCERPT_BYTES:
+                start += piece[: EXCERPT_BYTES - len(start)]
+            sha.update(piece)
+            size += len(piece)
+        return cls(start, size, sha.hexdigest())
+
+    @property
+    def reason(self) -> str:
+        """The reason for which the payload was refused."""
+        return (
+            f"payload of {self.size:,} bytes, more than the {MAX_KEPT_BYTES:,} that are read; its "
+            f"first {len(self.start):,} bytes and the SHA-256 of all are kept"
+        )
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class RejectedPayload(_Model):
+    """The content of a ``mapfold/rejected`` event. ``payload`` is base64 of the refused bytes."""
+
+    key: str
+    reason: str
+    payload: str
+    size: int | None = None
+    """With ``sha256``, of the whole payload if ``payload`` is an excerpt of it."""
+    sha256: str | None = None
+
+    @staticmethod
+    def encode(key: str, reason: str, raw: bytes | Excerpt) -> bytes:
+        """The event's JSON, for ``raw`` that came under ``key`` and was refused for ``reason``.
+
+        Built from bytes: ``raw`` may be large, and each conversion to text would copy it.
+        """
+        fields: dict[str, str | int] = {"key": key, "reason": reason}
+        if isinstance(raw, Excerpt):
+            fields |= {"size": raw.size, "sha256": raw.sha256}
+            raw = raw.start
+        head = json.dumps(fields, separators=(",", ":"))
+        return b"".join((head[:-1].encode(), b',"payload":"', pybase64.b64encode(raw), b'"}'))
+
+    @property
+    def raw(self) -> bytes:
+        """The refused bytes, as far as they are kept."""
+        return pybase64.b64decode(self.payload)
+
+
+class Loss(_Model):
+    """The content of a ``mapfold/loss`` event.
+
+    ``publisher`` names who it was lost from: a run id (cause ``keyframe_gap``), a Zenoh source id
+    (``transport_miss``), the key (``queue_full``, ``too_large``), or ``log`` where a recovered log
+    lacks the event of this very offset (``rot``). ``first`` and ``last`` are the first and last
+    missing number in that publisher's own counting, None where nothing was counted.
+    """
+
+    publisher: str
+    first: int | None = None
+    last: int | None = None
+    count: Annotated[int, Field(ge=1)]
+    cause: Literal["keyframe_gap", "queue_full", "too_large", "transport_miss", "rot"]
+
+
+MAX_MAP_SIDE = 10_000
+"""Bound of a map's width and height in cells."""
+Resolution = Annotated[float, Field(ge=0.001, le=10.0)]
+"""The side of a map's cell in metres."""
+MapYaw = Annotated[float, Field(ge=-7.0, le=7.0)]
+
+
+class OccupancyMapEvent(BaseModel):
+    """The content of a ``mapfold/map`` event: an occupancy grid, as nav_msgs/OccupancyGrid has it.
+
+    ``resolution`` is the side of a cell in metres, ``origin`` x, y and yaw of the outer corner of
+    the grid's first cell in the map frame. ``png`` is base64 of an 8-bit grey PNG of ``width`` by
+    ``height`` cells, its last row the one of the first cell: 0 is free, 100 occupied, between them
+    how likely occupied in percent, 255 unknown. ``source`` is the file or key that it came from.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="ignore", allow_inf_nan=False)
+
+    map_id: Text | None = None
+    resolution: Resolution
+    origin: tuple[Position, Position, MapYaw]
+    width: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
+    height: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
+    png: str
+    source: Text
+    floor: Floor = None
+    """The floor that it is of; without it the one that the log is of first."""
+
+
+MAX_REEMBEDDED = 4_096
+"""Bound of the detections in an event on ``mapfold/embeddings``."""
+
+
+class Embeddings(BaseModel):
+    """The content of a ``mapfold/embeddings`` event: vectors of the space ``space`` for detections
+    that were recorded without one of it.
+
+    ``vectors`` is base64 of float32, little endian, ``dim`` values for each of ``det_ids``.
+    ``encoder`` is the SHA-256 of the model that made them, in hex digits.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="ignore", allow_inf_nan=False)
+
+    space: Text
+    encoder: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)]
+    det_ids: Annotated[tuple[Text, ...], Field(min_length=1, max_length=MAX_REEMBEDDED)]
+    vectors: str

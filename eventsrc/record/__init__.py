@@ -1,0 +1,1 @@
+"""What fills a log: recorder, importers, the robot's side, Zenoh."""

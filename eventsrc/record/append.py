@@ -1,0 +1,146 @@
+"""Validate a payload from outside and append it to a log, or its rejection.
+
+An accepted payload is appended verbatim under its own key, stamped with the robot's time; the
+channel has its version if it is of an older form (`eventsrc.envelope.upcast`). A refused one is
+appended under ``mapfold/rejected``, with its key, its bytes and the reason, so nothing is dropped
+silently.
+
+A payload that is no envelope but a nav_msgs/OccupancyGrid is appended as a ``mapfold/map`` event,
+which has the same cells in a hundredth of the bytes.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.ingest import (
+    DEFAULT_MAX_PAYLOAD_BYTES,
+    CheckedEnvelope,
+    Rejected,
+    abbreviate,
+)
+from eventsrc.envelope.model import Offset, has_keyframe_id
+from eventsrc.envelope.occupancy_map import InvalidMap
+from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
+from eventsrc.envelope.upcast import PendingEvent, check_envelopes, detect_version
+from eventsrc.log import LogWriter, NewEvent
+
+from .transport.config import key_fault
+
+
+class NewMap(NamedTuple):
+    """The JSON of a ``mapfold/map`` event, made of a nav_msgs/OccupancyGrid."""
+
+    event: bytes
+
+
+Result = CheckedEnvelope | NewMap | Rejected
+
+
+class Checked(msgspec.Struct, frozen=True, gc=False):
+    """The version of a payload, and the result of its validation."""
+
+    version: int
+    result: Result
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """The robot's time; None if the payload is no envelope or its version has no time."""
+        if not isinstance(self.result, CheckedEnvelope) or not has_keyframe_id(self.version):
+            return None
+        return self.result.stamp_ns
+
+
+def append_payload(
+    writer: LogWriter,
+    key: str,
+    payload: bytes,
+    *,
+    logged_ns: int | None = None,
+    max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
+) -> Result:
+    """Append ``payload``, received under ``key``, and return the result of its validation.
+
+    ``logged_ns`` is the time of receipt, by default the current time.
+    """
+    logged = writer.now_ns() if logged_ns is None else logged_ns
+    (checked,) = check_payloads(
+        [(key, payload)],
+        first=writer.next_offset,
+        logged_ns=logged,
+        max_bytes=max_bytes,
+    )
+    writer.append_all([checked_event(key, payload, checked, logged)])
+    return checked.result
+
+
+def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
+    """The event to append for a payload received under ``key``, by the result of its check."""
+    version, result = checked.version, checked.result
+    if isinstance(result, Rejected):
+        return rejected_event(key, payload, result.reason, logged_ns)
+    if isinstance(result, NewMap):
+        return map_event(result.event, logged_ns)
+    stamp = checked.stamp_ns
+    return NewEvent(key, payload, logged_ns, logged_ns if stamp is None else stamp, version)
+
+
+def check_payloads(
+    messages: Sequence[tuple[str, bytes]],
+    *,
+    first: Offset,
+    logged_ns: int,
+    max_bytes: int,
+    version: int | None = None,
+) -> list[Checked]:
+    """Validate key and payload of each message (key, payload).
+
+    Results are the same as one by one; together is faster. A dozen or two at a time is best: their
+    decoded vectors then fit the processor's cache.
+
+    ``first`` and ``logged_ns`` stand in for the keyframe id and the time of a bare list
+    (`eventsrc.envelope.upcast`), which has neither. For validation any offset and any time will do,
+    so both may be earlier than those that the events get. ``version`` is the envelope version that
+    another log has recorded them in; by default it is detected.
+    """
+    pending = [
+        PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))
+        for offset, (key, payload) in enumerate(messages, first)
+    ]
+    results: list[CheckedEnvelope | NewMap | Rejected] = [
+        *check_envelopes(pending, max_bytes=max_bytes)
+    ]
+    keys = {event.key for event in pending}  # usually one
+    faults = {key: fault for key in keys if (fault := key_fault(key)) is not None}
+    for index, event in enumerate(pending if faults else ()):
+        if event.key in faults:
+            results[index] = Rejected(f"key {abbreviate(event.key)} {faults[event.key]}")
+    for index, result in enumerate(results):
+        if isinstance(result, Rejected) and pending[index].key not in faults:
+            results[index] = _as_map(pending[index], max_bytes) or result
+    return [Checked(event.version, result) for event, result in zip(pending, results, strict=True)]
+
+
+def _as_map(event: PendingEvent, max_bytes: int) -> NewMap | Rejected | None:
+    """The occupancy map in a payload that is no envelope, or the reason why its grid is refused;
+    None if the payload does not look like a grid."""
+    if len(event.payload) > max_bytes or not is_grid_message(event.payload):
+        return None
+    try:
+        return NewMap(read_grid_message(event.payload, event.key).encode())
+    except InvalidMap as error:
+        return Rejected(str(error))
+
+
+def map_event(event: bytes, logged_ns: int) -> NewEvent:
+    """The ``mapfold/map`` event of the JSON ``event``."""
+    return NewEvent(MAP_KEY, event, logged_ns, logged_ns)
+
+
+def rejected_event(key: str, payload: bytes | Excerpt, reason: str, logged_ns: int) -> NewEvent:
+    """The ``mapfold/rejected`` event of a refused payload."""
+    escaped = key.encode(errors="backslashreplace").decode()  # a lone surrogate is not UTF-8
+    record = RejectedPayload.encode(escaped, reason, payload)
+    return NewEvent(REJECTED_KEY, record, logged_ns, logged_ns)

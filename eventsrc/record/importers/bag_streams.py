@@ -1,0 +1,378 @@
+"""Choose the topics of a bag and their uses: by option, else by their types, names and frames.
+
+Of several candidates the one whose name shares the most leading parts with the detections' topic is
+used (``/robot1/tf`` for ``/robot1/camera/detections``). If two share as many, neither is used, and
+a note names the option that chooses.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Final, TypeVar
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from eventsrc.ros import messages as ros
+from eventsrc.ros.library import MessageTypes, Undecodable
+from eventsrc.ros.messages import BadMessage
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
+from eventsrc.ros.transforms import TransformBuffer
+
+from .bag_files import BagContents, Topic
+
+TF_POSE: Final = "tf"
+"""The value of ``--pose`` for transforms instead of a topic of poses."""
+NONE: Final = "none"
+"""The value of an option that switches its kind of topic off."""
+_BASES: Final = ("base_link", "base_footprint")
+_MAP: Final = "map"
+_FIRST_TRANSFORMS: Final = 300
+_EVERY_TRANSFORM: Final = 101
+_LAST_TRANSFORM: Final = 100_000
+_POSE_TYPES: Final = (ros.POSE, ros.ODOMETRY)
+_MOST_NAME: Final = 100
+_NS: Final = 1_000_000_000
+
+_Read = TypeVar("_Read")
+
+
+@dataclass(frozen=True)
+class BagOptions:
+    """The user's choices for a bag; what is None or empty follows from the bag's topics."""
+
+    detections: tuple[str, ...] = ()
+    pose: str | None = None
+    covariance: str | None = None
+    embeddings: str | None = None
+    camera: str | None = None
+    grid: str | None = None
+    map_frame: str | None = None
+    base_frame: str | None = None
+    run_id: str | None = None
+    embedding_model: str | None = None
+    labels: Mapping[str, str] = field(default_factory=dict)
+    heights: bool = False
+    max_gap_ns: int = DEFAULT_MAX_GAP_NS
+
+
+@dataclass
+class Choice:
+    """The streams of a bag, the topics of its occupancy grids, the uses of each topic, and notes
+    for the user."""
+
+    streams: list[Stream] = field(default_factory=list)
+    grids: list[str] = field(default_factory=list)
+    uses: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def use(self, topic: str | None, what: str) -> None:
+        """Add a use to those of a topic."""
+        if topic is not None:
+            uses = self.uses.get(topic)
+            if uses is None:
+                self.uses[topic] = what
+            elif what not in uses.split(", "):
+                self.uses[topic] = f"{uses}, {what}"
+
+
+def sampled(type_name: str, number: int) -> bool:
+    """Whether `choose` needs the message of a type with this number on its topic. Of transforms it
+    needs later ones too: a localiser publishes the map frame only once it is localised."""
+    if type_name == ros.TF:
+        few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
+        return few or number < _FIRST_TRANSFORMS
+    return number == 0 and type_name in (ros.DETECTIONS, ros.CAMERA_INFO, *_POSE_TYPES)
+
+
+def choose(name: str, contents: BagContents, types: MessageTypes, options: BagOptions) -> Choice:
+    """Choose the topics of a bag and their uses. Raises MisuseError for an option that names a
+    missing topic, or one of another type."""
+    return _Chooser(name, contents, types, options).choose()
+
+
+class _Chooser:
+    def __init__(
+        self, name: str, contents: BagContents, types: MessageTypes, options: BagOptions
+    ) -> None:
+        self._name = name
+        self._contents = contents
+        self._types = types
+        self._options = options
+        self._made = Choice()
+        self._frames = {
+            topic.name: frame
+            for topic in contents.topics.values()
+            if topic.type_name != ros.TF and (frame := self._frame_of(topic)) is not None
+        }
+
+    def choose(self) -> Choice:
+        """Streams, grids, uses and notes."""
+        detections = self._detections()
+        for topic in detections:
+            self._add_stream(topic, several=len(detections) > 1)
+        self._choose_grids(detections)
+        return self._made
+
+    def _detections(self) -> Sequence[str]:
+        given = self._options.detections
+        for topic in given:
+            self._check("--detections", topic, ros.DETECTIONS)
+        return given or self._of_type(ros.DETECTIONS)
+
+    def _add_stream(self, topic: str, *, several: bool) -> None:
+        made, options, max_gap_ns = self._made, self._options, self._options.max_gap_ns
+        run_id = options.run_id or self._run_id()
+        if several:
+            run_id = f"{run_id}:{topic.strip('/').removesuffix('/detections')}"
+        tf = self._nearest(topic, self._transforms(static=False), "transforms")
+        tf_static = self._nearest(topic, self._transforms(static=True), "static transforms")
+        tree = self._tree(tf, tf_static)
+        camera_frame = self._frames.get(topic, "")
+        map_frame, base_frame = self._map_and_base(tree, camera_frame)
+        found = any(tree.is_connected(map_frame, each) for each in (base_frame, camera_frame))
+        pose = self._pose(topic, has_transforms=found)
+        if pose == TF_POSE and tf is None and tf_static is None:
+            raise MisuseError(f"--pose {TF_POSE}: the bag has no topic of {ros.TF}")
+        if pose is None:  # without a topic of poses a stream takes those of its transforms
+            tf = tf_static = None
+        by_transforms = pose == TF_POSE
+        covariance = self._covariance(topic, map_frame) if by_transforms else None
+        embeddings = self._embeddings(topic)
+        camera = self._camera(topic, camera_frame)
+        stream = Stream(
+            topic,
+            run_id,
+            tf,
+            tf_static,
+            None if by_transforms else pose,
+            covariance,
+            embeddings,
+            camera,
+            map_frame,
+            base_frame,
+            options.labels,
+            options.embedding_model,
+            options.heights,
+            max_gap_ns=max_gap_ns,
+        )
+        made.streams.append(stream)
+        made.use(topic, f"keyframes of run {run_id}")
+        if by_transforms:
+            made.use(tf, f"poses of {base_frame} in {map_frame}")
+            made.use(tf_static, "where the camera is")
+            if found and _last(map_frame) != _MAP and options.map_frame is None:
+                made.notes.append(
+                    f"poses are in the frame {map_frame!r}: no transform leads to a frame "
+                    f"{_MAP!r}; odometry alone drifts, so give --map-frame or --pose "
+                    "if there is something better"
+                )
+            elif not found:
+                made.notes.append(
+                    f"no transforms lead from {map_frame!r} to {base_frame!r} or to the camera's "
+                    f"{camera_frame!r}; there are {_some(sorted(tree.frames()))}; "
+                    "--map-frame and --base-frame name others"
+                )
+        else:
+            made.use(pose, "poses")
+            made.use(tf, "where the camera is")
+            made.use(tf_static, "where the camera is")
+            if pose is None and options.pose != NONE:
+                made.notes.append(f"{topic}: no topic has poses; its keyframes are kept without")
+        made.use(covariance, "errors of poses")
+        made.use(embeddings, "embeddings")
+        made.use(camera, "camera")
+        if embeddings is None and options.embeddings != NONE:
+            made.notes.append(
+                f"{topic}: no topic has embeddings, so there will be no Objects; "
+                "docs/ros.md says how to publish them"
+            )
+
+    def _choose_grids(self, detections: Sequence[str]) -> None:
+        given = self._options.grid
+        there = self._of_type(ros.GRID)
+        if given is not None:
+            if given != NONE:
+                self._check("--grid", given, ros.GRID)
+                self._made.grids.append(given)
+        else:
+            maps = [topic for topic in there if _last(topic) == _MAP]
+            if not maps and there:
+                self._made.notes.append(
+                    f"no occupancy grid is on a topic called map; {_some(there)} may be costmaps; "
+                    "give --grid TOPIC to take one"
+                )
+            near = [self._nearest(topic, maps, "maps", "--grid") for topic in detections]
+            chosen = {topic for topic in near if topic is not None} if detections else {*maps}
+            self._made.grids += sorted(chosen)
+        for topic in self._made.grids:
+            self._made.use(topic, "map")
+
+    def _pose(self, topic: str, *, has_transforms: bool) -> str | None:
+        given = self._options.pose
+        if given is not None:
+            if given not in (TF_POSE, NONE):
+                self._check("--pose", given, *_POSE_TYPES)
+            return None if given == NONE else given
+        if has_transforms:
+            return TF_POSE
+        poses = [each for each in self._of_type(ros.POSE) if _last(each) != "initialpose"]
+        for candidates in (poses, self._of_type(ros.ODOMETRY)):
+            nearest = self._nearest(topic, candidates, "poses", "--pose")
+            if nearest is not None:
+                return nearest
+        return TF_POSE if self._transforms(static=False) else None
+
+    def _covariance(self, topic: str, map_frame: str) -> str | None:
+        given = self._options.covariance
+        if given is not None:
+            if given != NONE:
+                self._check("--covariance", given, *_POSE_TYPES)
+            return None if given == NONE else given
+        for kind in _POSE_TYPES:
+            there = [
+                each
+                for each in self._of_type(kind)
+                if self._frames.get(each) == map_frame and _last(each) != "initialpose"
+            ]
+            nearest = self._nearest(topic, there, "errors of poses", "--covariance")
+            if nearest is not None:
+                return nearest
+        return None
+
+    def _embeddings(self, topic: str) -> str | None:
+        given = self._options.embeddings
+        if given is not None:
+            if given != NONE:
+                self._check("--embeddings", given, ros.TEXT, ros.FLOATS)
+            return None if given == NONE else given
+        there = [each for each in self._of_type(ros.TEXT, ros.FLOATS) if "embedding" in _last(each)]
+        return self._nearest(topic, there, "embeddings", "--embeddings")
+
+    def _camera(self, topic: str, frame: str) -> str | None:
+        given = self._options.camera
+        if given is not None:
+            if given != NONE:
+                self._check("--camera", given, ros.CAMERA_INFO)
+            return None if given == NONE else given
+        there = self._of_type(ros.CAMERA_INFO)
+        same = [each for each in there if frame and self._frames.get(each) == frame]
+        return self._nearest(topic, same or there, "cameras", "--camera")
+
+    def _map_and_base(self, tree: TransformBuffer, camera: str) -> tuple[str, str]:
+        """The frames of the map and of the robot's base."""
+        frames = sorted(tree.frames())
+        chain = tree.above(camera) if camera in frames else []
+        base = self._options.base_frame or _first(chain, _BASES) or _first(frames, _BASES)
+        if not chain and base in frames:
+            chain = tree.above(base)
+        root = chain[-1] if len(chain) > 1 else None
+        map_ = self._options.map_frame or _first(chain, (_MAP,)) or root
+        return map_ or _first(frames, (_MAP,)) or _MAP, base or _BASES[0]
+
+    def _tree(self, *topics: str | None) -> TransformBuffer:
+        """The tree of frames of the sampled transforms, all of them taken as static."""
+        tree = TransformBuffer(0)
+        for topic in topics:
+            for each in self._samples(topic, lambda message: [*message.transforms]):
+                for stamped in each:
+                    try:
+                        link = ros.read(ros.transform_of, stamped)
+                    except BadMessage:
+                        continue  # the assembler counts it
+                    tree.add_static(link.parent, link.child, link.pose)
+        return tree
+
+    def _frame_of(self, topic: Topic) -> str | None:
+        """The frame of a topic's first message."""
+        frames = self._samples(topic.name, lambda message: ros.frame_name(message.header.frame_id))
+        return next(iter(frames), None)
+
+    def _samples(self, topic: str | None, reader: Callable[[Any], _Read]) -> Iterable[_Read]:
+        known = None if topic is None else self._contents.topics.get(topic)
+        for payload in () if known is None else known.samples:
+            try:
+                yield ros.read(reader, self._types.decode(payload, known.type_name))  # type: ignore[union-attr]
+            except (Undecodable, BadMessage):
+                continue  # counted or kept as rejected when the bag is imported
+
+    def _transforms(self, *, static: bool) -> list[str]:
+        return [t for t in self._of_type(ros.TF) if (_last(t) == "tf_static") is static]
+
+    def _of_type(self, *type_names: str) -> list[str]:
+        """The topics of these types, by name."""
+        topics = self._contents.topics.values()
+        return sorted(topic.name for topic in topics if topic.type_name in type_names)
+
+    def _nearest(
+        self, topic: str, candidates: Sequence[str], what: str, option: str | None = None
+    ) -> str | None:
+        """The candidate that shares the most leading parts with ``topic``, of several the one with
+        the fewest parts; None, with a note, if that leaves several."""
+        if not candidates:
+            return None
+        parts = topic.strip("/").split("/")
+
+        def distance(candidate: str) -> tuple[int, int]:
+            others = candidate.strip("/").split("/")
+            shared = 0
+            while shared < min(len(parts), len(others)) and parts[shared] == others[shared]:
+                shared += 1
+            return -shared, len(others)
+
+        best = min(map(distance, candidates))
+        nearest = [each for each in candidates if distance(each) == best]
+        if len(nearest) > 1:
+            how = "none is used" if option is None else f"{option} chooses one; none is used"
+            self._made.notes.append(f"{topic}: several topics have {what}: {_some(nearest)}; {how}")
+            return None
+        return nearest[0]
+
+    def _check(self, option: str, topic: str, *type_names: str) -> None:
+        known = self._contents.topics.get(topic)
+        there = self._of_type(*type_names)
+        others = f"of that type it has {_some(there)}" if there else "it has none of that type"
+        wanted = " or ".join(type_names)
+        if known is None:
+            raise MisuseError(
+                f"{option} {visible(topic)}: the bag has no messages of that topic; it should be "
+                f"of type {wanted}, and {others}"
+            )
+        if known.type_name not in type_names:
+            raise MisuseError(
+                f"{option} {visible(topic)}: it is of type {visible(known.type_name)}, not "
+                f"{wanted}; {others}"
+            )
+
+    def _run_id(self) -> str:
+        """The run id: the bag's name and time, so that importing it again gives the same id."""
+        name = "".join(char if char.isprintable() else "_" for char in self._name)[:_MOST_NAME]
+        first_ns = self._contents.first_ns or 0
+        try:
+            began = datetime.fromtimestamp(first_ns // _NS, UTC)
+        except (OverflowError, ValueError, OSError):
+            return f"{name}-{first_ns}"
+        return f"{name}-{began:%Y%m%dT%H%M%S}"
+
+
+def _last(name: str) -> str:
+    return name.rstrip("/").rpartition("/")[2]
+
+
+def _first(frames: Iterable[str], names: Sequence[str]) -> str | None:
+    """The first frame that has the first of these names that any frame has, prefixes ignored."""
+    known = [*frames]
+    for name in names:
+        for frame in known:
+            if _last(frame) == name:
+                return frame
+    return None
+
+
+_MOST_NAMED: Final = 8
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first few names, and the number of the others."""
+    shown = ", ".join(visible(name)[:_MOST_NAME] for name in names[:_MOST_NAMED]) or "none"
+    more = len(names) - _MOST_NAMED
+    return shown if more <= 0 else f"{shown} and {more} more"

@@ -1,0 +1,377 @@
+"""Import files into a log, with the same validation as recording.
+
+An import only appends. A file that is imported twice is in the log twice; the fold ignores
+duplicate keyframes, so the map is the same.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
+from eventsrc.envelope.model import Offset, RunId, has_keyframe_id
+from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
+from eventsrc.envelope.system_events import EMBEDDINGS_KEY, LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY
+from eventsrc.envelope.upcast import UPCASTERS
+from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
+from eventsrc.log.format import list_segments
+from eventsrc.record.append import Checked, NewMap, check_payloads, checked_event, rejected_event
+
+from .bag_files import METADATA, START_BYTES, is_bag, is_file_of_a_bag
+from .bag_streams import BagOptions
+from .json_lines import JsonLines
+from .log_times import LogTimes
+from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
+from .ros_bags import BagReport, RosBag
+from .source import ImportedMessage, Source
+from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, looks_like_envelope
+
+DEFAULT_KEY = "tb/detections"
+STDIN = "-"
+IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
+"""Larger commits than a recorder's: the source can be read again after a crash."""
+
+ALL_TOPICS = TopicChoice()
+_PROGRESS_EVERY = 64
+_DEFAULT_BAGS = BagOptions()
+
+Progress = Callable[[Source], None]
+OnReject = Callable[[str, str], None]
+"""Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """Counts of an import, which appended the events ``first_offset`` to ``next_offset`` - 1."""
+
+    accepted: int
+    rejected: int
+    system: int
+    """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
+    skipped: int
+    """Number of messages that were passed over."""
+    first_offset: Offset
+    next_offset: Offset
+    maps: int = 0
+    """Occupancy maps, given or among the messages."""
+    verbatim: int = 0
+    """Verbatim messages of another mapfold log, copied unchanged."""
+    passed_over: tuple[PassedOver, ...] = ()
+    """Messages that were passed over, by topic and what they are, in the order of the first."""
+
+    @property
+    def imported_nothing(self) -> bool:
+        """Whether there were messages, all of them rejected or passed over."""
+        imported = self.accepted + self.system + self.maps + self.verbatim
+        return not imported and bool(self.rejected or self.skipped)
+
+    bags: tuple[BagReport, ...] = ()
+    """The reports of the ROS 2 bags."""
+    repeated: int | None = None
+    """How many accepted envelopes are of keyframes that the log had already and the fold ignores;
+    None if no ledger was given."""
+
+
+class ImportInterrupted(KeyboardInterrupt):
+    """An import was ended by Ctrl-C. ``report`` counts what is synced to the log; ``place`` is the
+    place of the last message (``line 17 of run.jsonl``), None without any."""
+
+    def __init__(self, report: ImportReport, place: str | None) -> None:
+        super().__init__()
+        self.report = report
+        self.place = place
+
+
+def import_files(
+    writer: LogWriter,
+    names: Sequence[str],
+    *,
+    key: str = DEFAULT_KEY,
+    progress: Progress | None = None,
+    on_reject: OnReject | None = None,
+    step: AbstractContextManager[object] | None = None,
+    given_map: OccupancyMap | None = None,
+    topics: TopicChoice = ALL_TOPICS,
+    bags: BagOptions = _DEFAULT_BAGS,
+    ledger: GapLedger[RunId] | None = None,
+) -> ImportReport:
+    """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
+    without a key get ``key``. Without a time of receipt the log time of an envelope is its stamp
+    (`log_times`), that of anything else the log time of the message before it.
+
+    Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
+    file that no importer reads and, unless ``topics`` chooses them, those that do not look like
+    envelopes. ``bags`` has the choices for bags of ROS 2. The map is appended when the first
+    message was read. ``ledger`` is the gap ledger of the log, to which new keyframes are added.
+
+    ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
+    Raises MisuseError and MapfoldError for files that cannot be read.
+    """
+    refused = on_reject or (lambda _place, _reason: None)
+    run = _Import(writer, key, refused, given_map, topics, ledger)
+    try:
+        with ExitStack() as files:
+            for name in names:
+                source = open_source(name, files, bags)
+                if topics and isinstance(source, RosBag):
+                    raise MisuseError(
+                        f"{name}: --topic does not choose what is used of a bag of ROS 2; "
+                        "--detections, --grid and so on do"
+                    )
+                run.begins = True
+                for number, message in enumerate(source.messages()):
+                    with step or nullcontext():
+                        run.append(source, message)
+                    if progress is not None and number % _PROGRESS_EVERY == 0:
+                        progress(source)
+                run.skipped += source.skipped
+                if isinstance(source, RosBag) and source.report is not None:
+                    run.bags.append(source.report)
+        run.append_given_map(None)
+    except KeyboardInterrupt:
+        raise ImportInterrupted(run.report(), run.place) from None
+    return run.report()
+
+
+class _Keyframe(NamedTuple):
+    run_id: RunId
+    stamp_ns: int
+
+
+def _keyframe(checked: Checked) -> _Keyframe | None:
+    """Run and stamp of a payload; None if it is no envelope, or of a version without them."""
+    stamp_ns, envelope = checked.stamp_ns, checked.result
+    if stamp_ns is None or not isinstance(envelope, CheckedEnvelope):
+        return None
+    return _Keyframe(envelope.run_id, stamp_ns)
+
+
+class _Import:
+    """Counts of what has been appended, and the place of the last message."""
+
+    def __init__(
+        self,
+        writer: LogWriter,
+        key: str,
+        on_reject: OnReject,
+        given_map: OccupancyMap | None,
+        topics: TopicChoice,
+        ledger: GapLedger[RunId] | None,
+    ) -> None:
+        self._ledger = ledger
+        self._repeated_before = 0 if ledger is None else ledger.duplicates
+        self._writer = writer
+        self._key = key
+        self._on_reject = on_reject
+        self._given_map = given_map
+        self._topics = topics
+        self._passed_over: Counter[tuple[str, str]] = Counter()
+        self._times = LogTimes()
+        self.begins = False
+        """Whether no message of the source had a time yet. If log times go back there, a new
+        segment is begun."""
+        self._logged_ns: int | None = None
+        self._first = writer.next_offset
+        self._last: tuple[Source, int | None] | None = None
+        self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
+        self.verbatim = 0
+        self.bags: list[BagReport] = []
+
+    def append(self, source: Source, message: ImportedMessage) -> None:
+        """Append one message: a system event or a verbatim message unchanged, anything else after
+        validation."""
+        topic = message.key or self._key
+        self.begins |= message.begins
+        if not self._topics.takes(topic):
+            self._passed_over[topic, NOT_CHOSEN] += 1
+        elif message.refused is not None:
+            self._append_refused(source, message, message.refused)
+        elif message.unread is not None:
+            self._passed_over[topic, message.unread] += 1
+        elif message.form is not None:
+            self._append_verbatim(message, message.form)
+        elif message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY, EMBEDDINGS_KEY):
+            self._append_system_event(message.key or "", message)
+        elif message.key == MAP_KEY:
+            self._append_map_event(source, message)
+        else:
+            self._append_envelope(source, message)
+        self._last = source, source.at
+
+    def append_given_map(self, next_ns: int | None) -> None:
+        """Append the given map, once. ``next_ns`` is the log time of the message after it, which
+        the map gets too unless it is in the future, so that log times do not go back."""
+        if self._given_map is None:
+            return
+        now_ns = self._writer.now_ns()
+        logged_ns = now_ns if next_ns is None else min(now_ns, next_ns)
+        self._writer.append(MAP_KEY, self._given_map.encode(), logged_ns=logged_ns)
+        self.maps += 1
+        self._given_map = None
+
+    def _time_of(self, message: ImportedMessage, keyframe: _Keyframe | None = None) -> int:
+        """The log time of the next message. Appends the given map before it."""
+        if message.logged_ns is not None:
+            logged_ns = self._times.add(message.logged_ns)
+        elif keyframe is not None:
+            logged_ns = self._times.add_stamped(*keyframe)
+        elif self._times.last_ns is not None:
+            logged_ns = self._times.last_ns
+        else:
+            logged_ns = self._writer.now_ns()
+        if self.begins and self._logged_ns is not None and logged_ns < self._logged_ns:
+            self._writer.begin_segment()
+        if message.logged_ns is not None or keyframe is not None:
+            self.begins = False
+        self._logged_ns = logged_ns
+        self.append_given_map(logged_ns)
+        return logged_ns
+
+    def _append_map_event(self, source: Source, message: ImportedMessage) -> None:
+        """Append a map event of another log, or its rejection."""
+        try:
+            decode_map(message.payload)
+        except InvalidMap as error:
+            logged_ns = self._time_of(message)
+            event = rejected_event(MAP_KEY, message.payload, str(error), logged_ns)
+            self._writer.append_all([event])
+            self._count_rejected(source, str(error))
+        else:
+            self._append_system_event(MAP_KEY, message)
+            self.maps += 1
+
+    def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
+        if self._is_for_others(message):
+            self._passed_over[message.key or self._key, NO_ENVELOPES] += 1
+            return
+        payload = message.payload if message.excerpt is None else message.excerpt
+        event = rejected_event(message.key or self._key, payload, reason, self._time_of(message))
+        self._writer.append_all([event])
+        self._count_rejected(source, reason)
+
+    def _count_rejected(self, source: Source, reason: str) -> None:
+        self.rejected += 1
+        self._on_reject(f"{source.name}: {source.unit} {source.at}", reason)
+
+    def _append_system_event(self, key: str, message: ImportedMessage) -> None:
+        logged_ns = self._time_of(message)
+        self._writer.append(key, message.payload, logged_ns=logged_ns, stamp_ns=message.stamp_ns)
+        self.system += 1
+
+    def _append_verbatim(self, message: ImportedMessage, form: MessageFormat) -> None:
+        self._writer.append(
+            message.key or self._key,
+            message.payload,
+            logged_ns=self._time_of(message),
+            stamp_ns=message.stamp_ns,
+            form=form,
+        )
+        self.verbatim += 1
+
+    def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
+        key = message.key or self._key
+        (checked,) = check_payloads(
+            [(key, message.payload)],
+            first=self._writer.next_offset,
+            logged_ns=self._writer.now_ns() if message.logged_ns is None else message.logged_ns,
+            max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
+            version=message.version if message.version in UPCASTERS else None,
+        )
+        is_rejected = isinstance(checked.result, Rejected)
+        if is_rejected and self._is_for_others(message):
+            self._passed_over[key, NO_ENVELOPES] += 1
+            return
+        logged_ns = self._time_of(message, _keyframe(checked))
+        self._writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
+        if isinstance(checked.result, Rejected):
+            self._count_rejected(source, checked.result.reason)
+        elif isinstance(checked.result, NewMap):
+            self.maps += 1
+        else:
+            self.accepted += 1
+            if self._ledger is not None and has_keyframe_id(checked.version):
+                envelope = checked.result
+                self._ledger.record(envelope.run_id, envelope.keyframe_id, 0)
+
+    def _is_for_others(self, message: ImportedMessage) -> bool:
+        """Whether to pass over a message that is no envelope and does not look like one."""
+        return message.is_foreign and not self._topics and not looks_like_envelope(message.payload)
+
+    @property
+    def place(self) -> str | None:
+        """The last message's place, such as ``line 17 of run.jsonl``."""
+        if self._last is None:
+            return None
+        source, at = self._last
+        return f"{source.unit} {at} of {source.name}"
+
+    def report(self) -> ImportReport:
+        """Sync the log and count what was appended."""
+        skipped = self.skipped + self._passed_over.total()
+        counts = (self.accepted, self.rejected, self.system, skipped)
+        return ImportReport(
+            *counts,
+            self._first,
+            self._writer.sync(),
+            self.maps,
+            self.verbatim,
+            tuple(PassedOver(*what, count) for what, count in self._passed_over.items()),
+            tuple(self.bags),
+            None if self._ledger is None else self._ledger.duplicates - self._repeated_before,
+        )
+
+
+def check_sources(names: Sequence[str]) -> None:
+    """Raise MisuseError for the first source that cannot be read; call it before a log is
+    created."""
+    for name in names:
+        if name == STDIN:
+            continue
+        path = Path(name)
+        try:
+            path.stat()
+            is_source = not path.is_dir() or is_bag(path) or bool(list_segments(path))
+        except FileNotFoundError:
+            raise MisuseError(f"{name}: no such file; check the path") from None
+        except OSError as error:
+            raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
+        if not is_source:
+            raise MisuseError(f"{name}: neither a bag of ROS 2 nor a log; check the path")
+
+
+def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -> Source:
+    """Open the source ``name``: a folder is a bag of ROS 2 or a log, ``-`` is standard input, a
+    file is JSON lines, MCAP or part of a bag. Raises MisuseError."""
+    if name != STDIN and Path(name).is_dir():
+        return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
+    if Path(name).name == METADATA:
+        raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
+    try:
+        file, size = _open_file(name, files)
+        start = _peek(file)
+    except OSError as error:
+        raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
+    label = "standard input" if name == STDIN else name
+    if name != STDIN and is_file_of_a_bag(start):
+        return RosBag(Path(name), files, bags)
+    if start.startswith(MCAP_MAGIC):
+        return McapFile(label, file, size)
+    return JsonLines(label, file, size, start)
+
+
+def _open_file(name: str, files: ExitStack) -> tuple[BinaryIO, int | None]:
+    if name == STDIN:
+        return sys.stdin.buffer, None
+    path = Path(name)
+    return files.enter_context(path.open("rb")), path.stat().st_size
+
+
+def _peek(file: BinaryIO) -> bytes:
+    data: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
+    return data

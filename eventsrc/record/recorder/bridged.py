@@ -1,0 +1,214 @@
+"""Record messages of a zenoh-bridge-ros2dds verbatim, and the envelopes that they complete.
+
+Zenoh's threads put messages into the queue and note tokens of types. The writer thread gives the
+messages to `Bridge.take`, which finds the type of each and returns what is to be appended: the
+message with its schema, and right behind it the envelopes that it completes (`eventsrc.ros`).
+
+A message whose type no token has given yet is held back, for at most `HOLD_NS` and within
+`HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema, and no envelope is made of it.
+Messages of one topic keep their order. Only messages under keys of no topic are left out; they are
+counted.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import msgspec
+
+from eventsrc.envelope.model import ENVELOPE_VERSION
+from eventsrc.envelope.system_events import MAP_KEY
+from eventsrc.log import MessageFormat
+from eventsrc.record.transport.session import Received
+from eventsrc.ros.bridge_keys import key_of, type_of_token
+from eventsrc.ros.derivation import CDR, ROS2MSG, Derivation, Derived, RosRecording
+from eventsrc.ros.library import MessageTypes, Undecodable
+from eventsrc.ros.stream import Counts
+
+from .checking import CheckedMessage
+from .queue import BridgedMessage
+
+HOLD_NS: Final = 10_000_000_000
+HOLD_MESSAGES: Final = 4_096
+HOLD_BYTES: Final = 32 * 1024 * 1024
+_UNKNOWN: Final = MessageFormat(CDR)
+
+CheckEnvelope = Callable[[Sequence[Received]], Iterator[CheckedMessage]]
+
+
+class _Held(NamedTuple):
+    received_ns: int
+    key: str
+    payload: bytes
+
+
+class Bridge:
+    """The topics of a bridge that are recorded, with the types and held messages of each.
+
+    Only the writer thread changes it, except by `note_token`. ``topics`` are all that are recorded,
+    also those from which ``recording`` makes no envelope.
+    """
+
+    def __init__(self, recording: RosRecording, topics: Iterable[str], types: MessageTypes) -> None:
+        self.recording = recording
+        self.topics = tuple(topics)
+        self.keys = tuple(map(key_of, self.topics))
+        self._topics = dict(zip(self.keys, self.topics, strict=True))
+        self._derivation = Derivation(recording, types)
+        self._types = types
+        self._lock = threading.Lock()
+        self._new_types: dict[str, str] = {}
+        self._formats: dict[str, MessageFormat] = {}
+        self._held: deque[_Held] = deque()
+        self._held_bytes = 0
+        self.untyped = 0
+        """Messages kept without a schema, since their type is not known."""
+        self.unknown_keys = 0
+        """Messages left out, since their keys belong to no recorded topic."""
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many messages are kept but cannot be read, by topic."""
+        return self._derivation.refused
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why the first of each topic cannot be read."""
+        return self._derivation.reasons
+
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """Counts of the envelopes made, by topic of detections."""
+        return self._derivation.counts
+
+    @property
+    def unread(self) -> tuple[tuple[str, int, str], ...]:
+        """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
+        counts = [*self.refused.items()]
+        return tuple((topic, count, self.reasons.get(topic, "")) for topic, count in counts)
+
+    @property
+    def streams(self) -> tuple[tuple[str, Counts], ...]:
+        """Copies of `counts`, for other threads: the writer thread goes on counting."""
+        return tuple(
+            (topic, replace(counts, unused=dict(counts.unused), reasons=dict(counts.reasons)))
+            for topic, counts in self.counts.items()
+        )
+
+    @property
+    def types_known(self) -> frozenset[str]:
+        """The keys whose types are known; may be called from any thread."""
+        with self._lock:
+            return frozenset(self._formats) | frozenset(self._new_types)
+
+    @property
+    def latched_keys(self) -> tuple[str, ...]:
+        """Keys whose last messages a bridge may cache for late subscribers. Without detections and
+        their embeddings: cached ones are older than this recording."""
+        live = {t for s in self.recording.streams for t in (s.detections, s.embeddings)}
+        return tuple(key for key, topic in self._topics.items() if topic not in live)
+
+    @property
+    def held(self) -> int:
+        """Messages that wait for their type."""
+        return len(self._held)
+
+    def note_token(self, token: str) -> None:
+        """Note the type of a key that is recorded; called by Zenoh's threads."""
+        found = type_of_token(token)
+        if found is not None and found[0] in self._topics:
+            with self._lock:
+                self._new_types[found[0]] = found[1]
+
+    def take(
+        self, messages: Sequence[BridgedMessage], logged_ns: int, check: CheckEnvelope
+    ) -> list[CheckedMessage]:
+        """The messages to append at ``logged_ns``: these, and those held back whose type is known
+        by now or whose time is over, each with what it completes."""
+        self._store_new_types()
+        taken = [*self._release(logged_ns, check)] if self._held else []
+        waiting = {held.key for held in self._held}
+        for message in messages:
+            key, payload = message.key, message.payload
+            if key not in self._topics:  # a key expression that a publisher made up
+                self.unknown_keys += 1
+                continue
+            if key in self._formats and key not in waiting:
+                taken += self._appended(key, payload, logged_ns, check)
+            else:
+                waiting.add(key)
+                self._hold(_Held(logged_ns, key, payload))
+        while len(self._held) > HOLD_MESSAGES or self._held_bytes > HOLD_BYTES:
+            taken += self._give_up(self._next_held(), logged_ns, check)
+        return taken
+
+    def finish(self, logged_ns: int, check: CheckEnvelope) -> list[CheckedMessage]:
+        """The messages still to be appended when the recording ends."""
+        taken = self.take((), logged_ns, check)
+        while self._held:
+            taken += self._give_up(self._next_held(), logged_ns, check)
+        for derived in self._derivation.finish():
+            taken += _checked(derived, check)
+        return taken
+
+    def _store_new_types(self) -> None:
+        """Make a format of each type that tokens gave since the last call."""
+        with self._lock:
+            new_types, self._new_types = self._new_types, {}
+            for key, type_name in new_types.items():
+                self._formats[key] = self._format(type_name)
+
+    def _format(self, type_name: str) -> MessageFormat:
+        """The format of messages of a type, with its definition if that is known."""
+        try:
+            text = self._types.definition(type_name).encode()
+        except Undecodable:
+            return MessageFormat(CDR, type_name)
+        return MessageFormat(CDR, type_name, ROS2MSG, text)
+
+    def _hold(self, message: _Held) -> None:
+        self._held.append(message)
+        self._held_bytes += len(message.payload)
+
+    def _next_held(self) -> _Held:
+        message = self._held.popleft()
+        self._held_bytes -= len(message.payload)
+        return message
+
+    def _release(self, now_ns: int, check: CheckEnvelope) -> Iterator[CheckedMessage]:
+        for _ in range(len(self._held)):
+            message = self._next_held()
+            if message.key in self._formats:
+                yield from self._appended(message.key, message.payload, now_ns, check)
+            elif abs(now_ns - message.received_ns) > HOLD_NS:  # also where the clock was set
+                yield from self._give_up(message, now_ns, check)
+            else:
+                self._hold(message)
+
+    def _give_up(
+        self, message: _Held, logged_ns: int, check: CheckEnvelope
+    ) -> Iterator[CheckedMessage]:
+        self.untyped += message.key not in self._formats
+        yield from self._appended(message.key, message.payload, logged_ns, check)
+
+    def _appended(
+        self, key: str, payload: bytes, logged_ns: int, check: CheckEnvelope
+    ) -> Iterator[CheckedMessage]:
+        topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
+        yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
+        if form.schema:  # without a known definition no envelope is made, which is counted
+            definition = form.schema_text.decode()
+            made = self._derivation.add(topic, form.schema, definition, logged_ns, payload)
+            for derived in made:
+                yield from _checked(derived, check)
+
+
+def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]:
+    if derived.key == MAP_KEY:
+        yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
+    else:
+        for message in check([Received(derived.key, derived.payload)]):
+            # no robot sent it, so none is answered
+            yield msgspec.structs.replace(message, sha256="")

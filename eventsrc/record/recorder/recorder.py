@@ -1,0 +1,199 @@
+"""Record what is published over Zenoh: Zenoh's channel → bounded queue → one writer thread."""
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Final
+
+from eventsrc.base.errors import TransportError
+from eventsrc.envelope.crops import MAX_CROP_BYTES
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
+from eventsrc.envelope.model import RunId
+from eventsrc.log import LogWriter
+from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
+from eventsrc.record.transport.session import (
+    Query,
+    Received,
+    SequenceNumber,
+    Session,
+    SizeLimit,
+    check_keys,
+)
+from eventsrc.ros.bridge_keys import cache_selectors, token_selectors
+
+from .bridged import Bridge
+from .edit_requests import EditRequest, Edits, fault_of, refuse_query
+from .edits import edit_key
+from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
+from .writer_thread import RecorderReport, WriterThread
+
+DEFAULT_KEYS: Final = ("tb/detections",)
+DEFAULT_CROPS: Final = ("tb/crops/*",)
+_CACHE_TIMEOUT_S: Final = 2.0
+_MAX_CACHED: Final = 1_000
+"""Limit for the messages fetched from a bridge's cache of one topic."""
+_MAX_REJECTED: Final = 2
+"""A message of up to this many times the size limit (or the default limit, if larger) is rejected,
+kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it
+would be in memory several times before it is on the disk."""
+
+
+class Recorder:
+    """Records everything under ``keys`` from an open session into an open log.
+
+    It is subscribed when the constructor returns. ``ledger`` is the log's gap history
+    (`eventsrc.record.gap_history`); without it, a gap between an earlier recorder's last keyframe
+    and this one's first is not found, and no ledger is saved. Turn ``report_gaps`` off for robots
+    that do not count their keyframes by one. With ``edits`` it records commands too (`edits`), with
+    ``bridge`` the messages of a bridge from ROS (`bridged`). Under ``crops``, each ``PREFIX/*``, it
+    records the JPEGs of detections (`eventsrc.envelope.crops`), and ignores them under ``keys``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        writer: LogWriter,
+        keys: Sequence[str] = DEFAULT_KEYS,
+        *,
+        queue_size: int = DEFAULT_QUEUE_SIZE,
+        max_events: int | None = None,
+        ledger: GapLedger[RunId] | None = None,
+        report_gaps: bool = True,
+        max_payload_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
+        edits: Edits | None = None,
+        bridge: Bridge | None = None,
+        crops: Sequence[str] = (),
+    ) -> None:
+        bridged = () if bridge is None else bridge.keys
+        check_keys((*keys, *bridged))
+        check_keys(crops)
+        self._session = session
+        self._crop_prefixes = tuple(key.removesuffix("*") for key in crops)
+        self._queue = MessageQueue(queue_size)
+        self._writer_thread = WriterThread(
+            self._queue,
+            writer,
+            ledger,
+            self._send_reply,
+            max_events=max_events,
+            report_gaps=report_gaps,
+            max_payload_bytes=max_payload_bytes,
+            edits=edits,
+            bridge=bridge,
+        )
+        limit = SizeLimit(
+            _MAX_REJECTED * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._count_too_large
+        )
+        # A larger announcement is ignored, as is one that cannot be read: it is no event.
+        sent_limit = SizeLimit(MAX_SENT_BYTES, lambda _key, _number: None)
+        self._subscriptions = [
+            subscription
+            for key in keys
+            for subscription in (
+                session.subscribe_batches(key, self._receive, limit),
+                session.subscribe(sent_key(key), self._queue.put, limit=sent_limit),
+                session.subscribe_heartbeats(key, self._queue.put_heartbeat),
+            )
+        ]
+        crop_limit = SizeLimit(_MAX_REJECTED * MAX_CROP_BYTES, self._count_too_large)
+        self._subscriptions += [
+            session.subscribe(key, self._receive_crop, limit=crop_limit) for key in crops
+        ]
+        if edits is not None:
+            key = edit_key(writer.log_id)
+            self._subscriptions.append(session.queryable(key, self._receive_edit))
+        if bridge is not None:
+            self._subscribe_bridge(session, bridge, limit)
+        session.confirm()
+
+    def _subscribe_bridge(self, session: Session, bridge: Bridge, limit: SizeLimit) -> None:
+        """Subscribe to a bridge's tokens, then to its messages, and get those that it has cached
+        for late subscribers."""
+        for key in bridge.keys:
+            for selector in token_selectors(key):
+                self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
+        for key in bridge.keys:
+            self._subscriptions += [
+                session.subscribe(key, self._receive_bridged, limit=limit, in_order=True),
+                session.subscribe_heartbeats(key, self._queue.put_heartbeat),
+            ]
+        session.confirm()
+        for key in bridge.latched_keys:
+            for selector in cache_selectors(key):
+                for message in session.cached(
+                    selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MAX_CACHED
+                ):
+                    self._receive_bridged(message)
+
+    def run(
+        self,
+        stop: threading.Event,
+        *,
+        every_s: float = 1.0,
+        watch: Callable[[RecorderReport], None] | None = None,
+    ) -> RecorderReport:
+        """Record until ``stop`` is set, then drain the queue and sync.
+
+        ``watch`` is called in this thread about every ``every_s`` seconds. ``stop`` is also set
+        when ``max_events`` is reached or the log cannot be written; the latter raises LogError, and
+        `report` counts what was lost.
+        """
+        with ThreadPoolExecutor(1, thread_name_prefix="log-writer") as thread:
+            writing = thread.submit(self._writer_thread.run)
+            writing.add_done_callback(lambda _: stop.set())
+            try:
+                self._wait(stop, every_s, watch)
+            finally:
+                self._drain(writing)
+        return self._writer_thread.report()
+
+    def report(self) -> RecorderReport:
+        """The numbers so far; may be called from any thread."""
+        return self._writer_thread.report()
+
+    def _wait(
+        self,
+        stop: threading.Event,
+        every_s: float,
+        watch: Callable[[RecorderReport], None] | None,
+    ) -> None:
+        while not stop.wait(every_s if watch is not None else None):
+            if watch is not None:
+                watch(self.report())
+
+    def _drain(self, writing: "Future[None]") -> None:
+        for subscription in self._subscriptions:
+            subscription.close()
+        self._queue.close()
+        writing.result()
+
+    def _receive(self, messages: Sequence[Received]) -> None:
+        # A recorder of `**` also receives acks and refusals, which are not data, and each crop a
+        # second time.
+        ignored = (ACK_PREFIX, *self._crop_prefixes)
+        self._queue.put_all([m for m in messages if not m.key.startswith(ignored)])
+
+    def _receive_bridged(self, message: Received) -> None:
+        self._queue.put(BridgedMessage(message.key, message.payload, message.number))
+
+    def _receive_crop(self, message: Received) -> None:
+        self._queue.put(CropMessage(message.key, message.payload, message.number))
+
+    def _receive_edit(self, query: Query) -> None:
+        fault = fault_of(query)
+        if fault is not None:
+            refuse_query(query, fault)
+        elif not self._queue.put_edit(EditRequest(query)):
+            refuse_query(query, "the recorder is busy or ending; try again in a moment")
+
+    def _count_too_large(self, key: str, number: SequenceNumber | None) -> None:
+        if not key.startswith(ACK_PREFIX):
+            self._queue.count_too_large(key, number)
+
+    def _send_reply(self, key: str, payload: bytes) -> None:
+        try:
+            self._session.send(key, payload)
+        except TransportError:
+            # The robot sends the message again, and is then replied to again.
+            return

@@ -1,0 +1,280 @@
+"""Publishers, subscriptions and queryables of a Zenoh session, and the messages it receives.
+
+Other packages use them through `eventsrc.record.transport.session`, which states the rules.
+"""
+
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import msgspec
+import zenoh
+
+from eventsrc.base.errors import TransportError
+
+from .errors import ignore_transport_errors, transport_errors
+
+_MAX_KEY_BYTES: Final = 16 * 1024
+"""Zenoh panics when a key does not fit into one batch of 64 KiB with the rest of its content."""
+CHANNEL_SIZE: Final = 256
+"""Messages received and in no batch yet: those of 12 ms at 20,000 a second."""
+_MAX_BATCH_BYTES: Final = 4 * 1024 * 1024
+"""Payload bytes that end a batch."""
+_PAUSE_FROM: Final = 8
+_PAUSE_S: Final = 0.002
+"""Pause after a batch of at least `_PAUSE_FROM` messages; at 20,000 a second 40 come meanwhile."""
+_JSON: Final = zenoh.Encoding.APPLICATION_JSON
+_HEARTBEATS: Final = "@adv/pub/"
+"""In a heartbeat's key: between the publisher's key and its session and entity id."""
+_HEARTBEAT_BYTES: Final = 4
+
+
+class SequenceNumber(NamedTuple):
+    """The number that an advanced publisher gave to a message.
+
+    ``source`` is the publisher's ``<session id>:<entity id>``, ``value`` has 32 bits and wraps.
+    """
+
+    source: str
+    value: int
+
+
+class Received(msgspec.Struct, frozen=True, gc=False):
+    """One message, with its publisher's number if it has one.
+
+    Zenoh's timestamp is not read: it may be missing, repeated or out of order.
+    """
+
+    key: str
+    payload: bytes
+    number: SequenceNumber | None = None
+
+
+class SizeLimit(NamedTuple):
+    """Messages over ``size_bytes`` are not received; ``refuse`` is called with the key of each and
+    its publisher's number, if it has one."""
+
+    size_bytes: int
+    refuse: Callable[[str, SequenceNumber | None], None]
+
+
+class Query:
+    """A query to a queryable. Reply once, from any thread; that ends it.
+
+    ``key`` is the key expression of the query, which may hold wildcards. ``size`` and
+    ``selector_size`` are the bytes of the payload and of the key with its parameters, known
+    without reading either.
+    """
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self.key = str(query.key_expr)
+        self.size = len(query.payload) if query.payload is not None else 0
+        self.selector_size = len(str(query.selector))
+        self.ended = False
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """The parameters, after the ``?`` of the selector."""
+        return _parameters(str(self._query.parameters))
+
+    @property
+    def payload(self) -> bytes:
+        """A copy of the payload; empty if the query has none."""
+        return self._query.payload.to_bytes() if self._query.payload is not None else b""
+
+    def reply(self, key: str, payload: bytes) -> None:
+        """Reply under ``key``. The payload is JSON, and Zenoh's encoding says so: other clients,
+        such as the REST plugin of a router, show it by its encoding."""
+        self._end(lambda: self._query.reply(key, payload, encoding=_JSON))
+
+    def reply_error(self, payload: bytes) -> None:
+        """Reply with an error, which is JSON."""
+        self._end(lambda: self._query.reply_err(payload, encoding=_JSON))
+
+    def _end(self, send: Callable[[], None]) -> None:
+        with ignore_transport_errors():  # the peer that asked may be gone
+            send()
+        self._query.drop()  # type: ignore[no-untyped-call]
+        self.ended = True
+
+
+class Publisher:
+    """Sends bytes under one key: reliable, in order, blocking while the network is full."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        check_key_length(key)
+        self.key = key
+        self._not_sent = transport_errors(f"key {key!r}: not sent")
+        self.departures = 0
+        """How many times the last subscriber has left."""
+        with transport_errors(f"key {key!r} cannot be published to"):
+            self._sender: Any = session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                reliability=zenoh.Reliability.RELIABLE,
+            )
+            self._listener: Any = self._sender.declare_matching_listener(self._on_matching)
+
+    def _on_matching(self, status: Any) -> None:
+        self.departures += not status.matching
+
+    def put(self, payload: bytes) -> None:
+        """Send. Returns when Zenoh has accepted the message; it may not have been received yet."""
+        with self._not_sent:
+            self._sender.put(payload)
+
+    @property
+    def has_subscriber(self) -> bool:
+        """Whether this session knows of a subscriber to this key."""
+        with transport_errors(f"key {self.key!r}: the session is gone"):
+            status: Any = self._sender.matching_status  # not a bool, as its stubs say
+            return bool(status.matching)
+
+    def wait_for_subscriber(self, timeout_s: float) -> bool:
+        """Wait for a subscriber to this key; False when there was none in time."""
+        matched = threading.Event()
+        with transport_errors(f"key {self.key!r}: the session is gone"):
+            listener = self._sender.declare_matching_listener(
+                lambda status: matched.set() if status.matching else None
+            )
+        try:
+            return self.has_subscriber or matched.wait(timeout_s)
+        finally:
+            listener.undeclare()
+
+    def close(self) -> None:
+        """Stop publishing under this key."""
+        with ignore_transport_errors():
+            self._listener.undeclare()
+            self._sender.undeclare()
+
+
+class Subscription:
+    """A declared subscription or queryable. Closing it, or its session, ends the calls."""
+
+    def __init__(self, *declared: Any) -> None:
+        self._declared = declared
+
+    def close(self) -> None:
+        """Stop receiving."""
+        with ignore_transport_errors():
+            for entity in self._declared:
+                entity.undeclare()
+
+
+class BatchSubscription(Subscription):
+    """A subscription with a thread that reads messages from Zenoh's channel in batches.
+
+    Zenoh calls a handler with the interpreter lock taken, so each message would make the thread
+    that records wait. The thread needs the lock once a batch. While many messages come it pauses
+    between batches, so that there are fewer of them.
+    """
+
+    def __init__(
+        self,
+        subscriber: "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]",
+        handler: Callable[[list[Received]], None],
+        limit: SizeLimit,
+    ) -> None:
+        super().__init__(subscriber)
+        self._thread = threading.Thread(
+            target=_receive_batches,
+            args=(subscriber.handler, handler, limit),
+            name="zenoh-batches",
+            daemon=True,
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop receiving; returns when every message received so far is handled."""
+        super().close()
+        self._thread.join()
+
+
+def _receive_batches(
+    channel: "zenoh.handlers.Handler[zenoh.Sample]",
+    handler: Callable[[list[Received]], None],
+    limit: SizeLimit,
+) -> None:
+    """Call ``handler`` with the messages in a channel until the subscription has ended and the
+    channel is empty. An exception is reported and ends one batch only, as Zenoh does with those of
+    a callback."""
+    pause = threading.Event()  # never set
+    while True:
+        try:
+            first = channel.recv()
+        except zenoh.ZError:  # empty and closed
+            return
+        batch: list[Received] = []
+        try:
+            _fill_batch(first, channel, batch, limit)
+            handler(batch)
+        except Exception:  # noqa: BLE001 - reported
+            raised, thread = sys.exc_info(), threading.current_thread()
+            threading.excepthook(threading.ExceptHookArgs((*raised, thread)))
+        if len(batch) >= _PAUSE_FROM:
+            pause.wait(_PAUSE_S)
+
+
+def _fill_batch(
+    first: zenoh.Sample,
+    channel: "zenoh.handlers.Handler[zenoh.Sample]",
+    batch: list[Received],
+    limit: SizeLimit,
+) -> None:
+    """Append ``first`` and the messages in ``channel`` to ``batch``, up to its bounds."""
+    sample: zenoh.Sample | None = first
+    size = 0
+    while sample is not None:
+        payload = sample.payload  # each access makes a new object
+        if len(payload) > limit.size_bytes:
+            limit.refuse(str(sample.key_expr), sequence_number(sample))
+        else:
+            data = payload.to_bytes()
+            batch.append(Received(str(sample.key_expr), data, sequence_number(sample)))
+            size += len(data)
+        if size >= _MAX_BATCH_BYTES or len(batch) >= CHANNEL_SIZE:
+            return
+        try:
+            sample = channel.try_recv()
+        except zenoh.ZError:  # empty and closed, which `recv` reports, too
+            return
+
+
+def _parameters(text: str) -> dict[str, str]:
+    """Parse the parameters of a selector, ``name=value;name=value``."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}
+
+
+def sequence_number(sample: zenoh.Sample) -> SequenceNumber | None:
+    """The number of ``sample``; None if no advanced publisher sent it."""
+    info = sample.source_info
+    if info is None:
+        return None
+    return SequenceNumber(f"{info.source_id.zid}:{info.source_id.eid}", info.source_sn)
+
+
+def heartbeats_under(key_expr: str) -> str:
+    """The key expression of the heartbeats of all advanced publishers under ``key_expr``."""
+    return f"{key_expr}/{_HEARTBEATS}**"
+
+
+def parse_heartbeat(sample: zenoh.Sample) -> SequenceNumber | None:
+    """The last number its publisher gave; None if ``sample`` is no heartbeat of a known form."""
+    source = str(sample.key_expr).rpartition(_HEARTBEATS)[2].split("/")
+    if len(source) < 2 or len(sample.payload) != _HEARTBEAT_BYTES:
+        return None
+    return SequenceNumber(":".join(source[:2]), int.from_bytes(sample.payload.to_bytes(), "little"))
+
+
+def check_key_length(key: str) -> None:
+    """Raise TransportError for a key so long that Zenoh would panic and end the session."""
+    size = len(key.encode())
+    if size > _MAX_KEY_BYTES:
+        raise TransportError(
+            f"key {key[:80]!r}…: {size:,} bytes are more than {_MAX_KEY_BYTES:,}; "
+            "choose a shorter key"
+        )

@@ -1,0 +1,135 @@
+"""The canvas a map is drawn on: a figure with axes in metres, occupied boxes, and the colours.
+
+Each place has a colour of its own; the rest of the picture is grey.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+
+from eventsrc.base.errors import MisuseError
+from projections.map.view import MapView
+
+from .labels import Extent
+from .scene import Floor, drives
+
+HALO = [withStroke(linewidth=2.2, foreground="white")]
+SUFFIXES = (".png", ".svg", ".pdf")
+
+_MARGIN_M = 0.35
+_AROUND_POSES_M = 0.4
+"""Added to the margin around poses, because a place's region reaches 0.55 m around its
+keyframes."""
+_WIDTH_IN = 13.0
+_HEAD_IN, _FOOT_IN = 0.7, 0.5
+_DPI = 120
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass
+class Canvas:
+    """``bounds`` are x0, y0, x1, y1 of the drawn area; ``unit`` is the metres in a point.
+
+    ``occupied`` are the boxes that labels must not cover.
+    """
+
+    figure: Figure
+    axes: Axes
+    bounds: Bounds
+    unit: float
+    occupied: list[Extent] = field(default_factory=list)
+
+    def header(
+        self, line: int, text: str, size: float, colour: str, weight: str = "normal"
+    ) -> None:
+        """A line of text above the map; lines are numbered from the top."""
+        height = self.figure.get_figheight()
+        y = 1 - (0.27 + 0.27 * line) / height
+        self.figure.text(0.02, y, text, fontsize=size, color=colour, weight=weight, va="center")
+
+    def footer(self, line: int, text: str, colour: str) -> None:
+        """A line of text below the map; lines are numbered from the top."""
+        y = (_FOOT_IN - 0.12 - 0.2 * line) / self.figure.get_figheight()
+        self.figure.text(0.02, y, text, fontsize=8.5, color=colour, va="center")
+
+    def save(self, out: Path) -> None:
+        """Write the picture; the same picture gives the same bytes."""
+        self._take_texts_literally()
+        # PDF and SVG carry a date, SVG also ids with a random salt: left out, or fixed.
+        undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            with _drawing():
+                self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
+        except OSError as error:
+            raise MisuseError(
+                f"{out}: cannot be written: {error.strerror or error}; choose another"
+            ) from None
+
+    def png(self) -> bytes:
+        """The picture as a PNG."""
+        self._take_texts_literally()
+        out = BytesIO()
+        with _drawing():
+            self.figure.savefig(out, dpi=_DPI, format="png")
+        return out.getvalue()
+
+    def _take_texts_literally(self) -> None:
+        for text in self.figure.findobj(Text):
+            text.set_parse_math(False)  # a class may be called "$5 bill$"
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    with (
+        rc_context({"svg.hashsalt": "mapfold", "svg.fonttype": "none"}),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # drawn as a box
+        yield
+
+
+def check_suffix(out: Path) -> None:
+    """Raise MisuseError unless the suffix of ``out`` is .png, .svg or .pdf."""
+    if out.suffix.lower() not in SUFFIXES:
+        raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
+
+
+def new_canvas(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] = ()) -> Canvas:
+    """An empty canvas that fits every pose of ``view``, wall of ``floor`` and spot of ``more``."""
+    x0, y0, x1, y1 = bounds = _bounds(view, floor, more)
+    height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
+    figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
+    axes = figure.add_axes((0.0, _FOOT_IN / height, 1.0, 1 - (_HEAD_IN + _FOOT_IN) / height))
+    axes.set_xlim(x0, x1)
+    axes.set_ylim(y0, y1)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return Canvas(figure, axes, bounds, (x1 - x0) / (_WIDTH_IN * 72))
+
+
+def _bounds(view: MapView, floor: Floor, more: Sequence[tuple[float, float]]) -> Bounds:
+    reach = _AROUND_POSES_M
+    poses = [spot for _, drive in drives(view) for spot in drive]
+    spots = [(x + dx, y + dy) for x, y in poses for dx in (-reach, reach) for dy in (-reach, reach)]
+    spots += [end for x0, y0, x1, y1 in floor.walls for end in ((x0, y0), (x1, y1))]
+    spots += more
+    if not spots:
+        return (-2.0, -1.0, 2.0, 1.0)
+    xs, ys = [x for x, _ in spots], [y for _, y in spots]
+    x0, y0, x1, y1 = min(xs), min(ys), max(xs), max(ys)
+    # A drive along a line still gets some area: wide ≥ high / 2, high ≥ wide / 3.
+    wide, high = max(x1 - x0, (y1 - y0) / 2, 1.0), max(y1 - y0, (x1 - x0) / 3, 1.0)
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    dx, dy = wide / 2 + _MARGIN_M, high / 2 + _MARGIN_M
+    return (x - dx, y - dy, x + dx, y + dy)

@@ -1,0 +1,152 @@
+"""A map's picture: layers from the floor up, fixed text before labels that can be moved.
+
+Objects are drawn at their estimated position under fusion by evidence; else at the mean position of
+the *robot* when it saw them. Their labels are moved to stay legible, and a thin line leads back.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from eventsrc.base.text import counted
+from projections.adapters import palette
+from projections.fold.deltas import PlacesMerged
+from projections.map.fold import FoldedEvent
+from projections.map.view import MapView
+
+from .base_layers import (
+    draw_drives,
+    draw_floor,
+    draw_map_walls,
+    draw_regions,
+    draw_walls,
+    wall_spots,
+)
+from .canvas import Canvas, check_suffix, new_canvas
+from .labels import Extent
+from .overlays import (
+    DOT_M,
+    draw_adjacency,
+    draw_bridges,
+    draw_lost,
+    draw_objects,
+    draw_place_names,
+    draw_room_names,
+)
+from .scene import Bridge, Floor, LostRobot, place_names, shown_objects, spot_of
+
+LEGEND = (
+    "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
+    "(mean)    dashed: neighbouring places and their transitions"
+)
+EVIDENCE_LEGEND = (
+    "■ start    ● keyframe, in its place's colour    ◆ object, drawn where it stands, with the "
+    "ellipse of two standard errors    ◇ dashed: missing    dotted arrow: moved    "
+    "dashed line: neighbouring places"
+)
+
+
+def draw_map(
+    view: MapView,
+    out: Path,
+    *,
+    title: str,
+    floor: Floor | None = None,
+    lost: LostRobot | None = None,
+    bridges: Sequence[Bridge] = (),
+    min_observations: int = 2,
+) -> None:
+    """Draw ``view`` to ``out``, in the format of its suffix (.png, .svg, .pdf).
+
+    Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
+    cannot be written or has another suffix.
+    """
+    check_suffix(out)
+    compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
+
+
+def map_png(view: MapView, title: str) -> bytes:
+    """``view`` drawn as a PNG."""
+    return compose(view, title, Floor()).png()
+
+
+def compose(
+    view: MapView,
+    title: str,
+    floor: Floor,
+    lost: LostRobot | None = None,
+    bridges: Sequence[Bridge] = (),
+    min_observations: int = 2,
+) -> Canvas:
+    """The finished canvas, not yet written to a file."""
+    by_evidence = view.settings.fusion == "evidence"
+    shown = shown_objects(view, min_observations) if by_evidence else []
+    standing = [found.spot for found in shown]
+    canvas = new_canvas(view, floor, [*standing, *wall_spots(view)])
+    draw_floor(canvas, floor)
+    draw_map_walls(canvas, view)
+    draw_regions(canvas, view)
+    draw_drives(canvas, view)
+    draw_walls(canvas, floor)
+    draw_adjacency(canvas, view)
+    draw_place_names(canvas, view)
+    if lost is not None:
+        draw_lost(canvas, lost)
+    canvas.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
+    draw_room_names(canvas, floor)
+    draw_bridges(canvas, bridges)
+    left_out = draw_objects(canvas, view, min_observations)
+    canvas.header(0, title, 14, palette.INK, "bold")
+    canvas.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
+    legend = legend_lines(lost, bridges, left_out, by_evidence=by_evidence)
+    for line, text in enumerate(legend):
+        canvas.footer(line, text, palette.SMALL_PRINT)
+    return canvas
+
+
+def _numbers(view: MapView, min_observations: int) -> str:
+    counts, settings = view.counts(), view.settings
+    shown = sum(found.obs_count >= min_observations for found in view.objects.values())
+    keyframes = counts["poses" if view.floors else "keyframes"]
+    return (
+        f"{counted(keyframes, 'keyframe')} ({counts['noise']} in no place)  ·  "
+        f"{counted(counts['places'], 'place')}  ·  "
+        f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
+        f"{counted(min_observations, 'time')} or more  ·  {settings.places_text()}"
+    )
+
+
+def legend_lines(
+    lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int, *, by_evidence: bool = False
+) -> list[str]:
+    """The lines below the map; ``left_out`` counts labels without room."""
+    parts = []
+    if bridges:
+        parts.append("○ keyframe that made two places one")
+    if lost is not None:
+        parts.append("✖ lost robot, true spot    ● (red) where the map puts it")
+    if left_out:
+        parts.append(f"{counted(left_out, 'object label')} had no room")
+    return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
+
+
+def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[PlacesMerged]:
+    """Apply every event to ``view`` and return its merges, in offset order."""
+    merges: list[PlacesMerged] = []
+    for event in events:
+        view.apply_event(event.offset, event.deltas)
+        merges += (delta for delta in event.deltas if isinstance(delta, PlacesMerged))
+    return merges
+
+
+def bridges_of(view: MapView, merges: Iterable[PlacesMerged]) -> list[Bridge]:
+    """One mark for each merge, at the position of its bridging keyframe."""
+    names = place_names(view)
+    marks: list[Bridge] = []
+    for merge in merges:
+        keyframe = view.keyframes[merge.bridge]
+        spot = spot_of(keyframe)
+        if spot is not None:
+            absorbed = " and ".join(names[place] for place in merge.absorbed)
+            text = f"{absorbed} into {names[merge.survivor]}, keyframe {keyframe.keyframe_id}"
+            marks.append(Bridge(*spot, text))
+    return marks

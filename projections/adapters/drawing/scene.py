@@ -1,0 +1,201 @@
+"""The contents of a picture: floor plan, lost robot, merges; and from the map groups, names,
+drives.
+
+Lengths in metres, angles in radians.
+"""
+
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+
+from eventsrc.adapters.sim import House
+from eventsrc.envelope.model import RunId
+from projections.map.records import Estimate, KeyframeRecord, ObjectRecord
+from projections.map.view import MapView
+
+_NEAR_M = 1.0
+_MOST_LETTERS = 24
+"""Most letters of a place's name; longer names are cut."""
+
+Line = tuple[float, float, float, float]
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """A building's plan: wall lines, furniture boxes, and where to write the rooms' names.
+
+    Lines are x0, y0, x1, y1; boxes are x0, y0, x1, y1 with the lower corner first.
+    """
+
+    walls: tuple[Line, ...] = ()
+    furniture: tuple[Box, ...] = ()
+    rooms: tuple[tuple[str, Box], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A position, with a heading where one is known."""
+
+    x: float
+    y: float
+    yaw_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LostRobot:
+    """Where a lost robot is, and where re-localisation puts it (None: no pose)."""
+
+    truth: Spot
+    estimate: Spot | None
+    spread_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The keyframe that merged places, and a label for it."""
+
+    x: float
+    y: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectGroup:
+    """Objects of one class in one place near each other: one label, a dot for each.
+
+    All of them are missing, or none is.
+    """
+
+    class_name: str
+    place: int | None
+    missing: bool
+    members: tuple[ObjectRecord, ...]
+
+    @property
+    def obs_count(self) -> int:
+        """Observations of all its members."""
+        return sum(member.obs_count for member in self.members)
+
+    @property
+    def label(self) -> str:
+        """The class, how many if more than one, and whether they are missing."""
+        count, ending = len(self.members), " (missing)" if self.missing else ""
+        return f"{self.class_name}{f' ×{count}' if count > 1 else ''}{ending}"
+
+    @property
+    def spot(self) -> tuple[float, float]:
+        """The middle of its members."""
+        xs, ys = zip(*(member.spot for member in self.members), strict=True)
+        return sum(xs) / len(xs), sum(ys) / len(ys)
+
+
+def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
+    """The objects seen at least that often, by place and class; most seen first."""
+    grouped: dict[tuple[int | None, str, bool], list[list[ObjectRecord]]] = defaultdict(list)
+    for found in shown_objects(view, min_observations):
+        _add_to_group(grouped[found.place, found.class_name, found.missing_in is not None], found)
+    groups = [
+        ObjectGroup(name, place, missing, tuple(members))
+        for (place, name, missing), clumps in grouped.items()
+        for members in clumps
+    ]
+    return sorted(groups, key=lambda group: (-group.obs_count, group.members[0].ordinal))
+
+
+def shown_objects(view: MapView, min_observations: int) -> list[ObjectRecord]:
+    """The objects seen at least that often."""
+    return [found for found in view.objects.values() if found.obs_count >= min_observations]
+
+
+def two_sigma(at: Estimate) -> tuple[float, float, float]:
+    """The ellipse of two standard errors around an estimate: full width and height in metres, and
+    the angle from the x axis to the width, in degrees."""
+    half = (at.var_xx_um2 + at.var_yy_um2) / 2
+    apart, across = (at.var_xx_um2 - at.var_yy_um2) / 2, float(at.var_xy_um2)
+    spread = math.hypot(apart, across)
+    wide, high = (4e-6 * math.sqrt(max(v, 0.0)) for v in (half + spread, half - spread))
+    return wide, high, math.degrees(math.atan2(across, apart) / 2)
+
+
+def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
+    """Add an object to the first clump whose first member is near, else begin another."""
+    for clump in clumps:
+        if math.dist(clump[0].spot, found.spot) <= _NEAR_M:
+            clump.append(found)
+            return
+    clumps.append([found])
+
+
+def place_names(view: MapView) -> dict[int, str]:
+    """The label of each place, absorbed ones too: the name that a command gave it, else its short
+    id: p3, or run_p3 where two runs have a p3. Places that share a name have their ids too.
+    """
+    short = {p.ordinal: p.place_id.rpartition("_")[2] for p in view.all_places}
+    used = Counter(short.values())
+    ids: dict[int, str] = {
+        ordinal: name if used[name] == 1 else view.all_places[ordinal].place_id
+        for ordinal, name in short.items()
+    }
+    given: dict[int, str] = {
+        p.ordinal: _cut(p.name) for p in view.places.values() if p.name is not None
+    }
+    shared = Counter([*given.values(), *ids.values()])
+    return ids | {
+        ordinal: name if shared[name] == 1 else f"{name} ({ids[ordinal]})"
+        for ordinal, name in given.items()
+    }
+
+
+def place_badges(view: MapView) -> dict[int, str]:
+    """`place_names`, with the type of the place below an id, if it is known."""
+    labels = place_names(view)
+    for place in view.places.values():
+        kind = view.type_of(place.ordinal) if place.name is None else None
+        if kind is not None and kind.type is not None:
+            labels[place.ordinal] += f"\n{kind.type}?"
+    return labels
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 1]}…"
+
+
+def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
+    """A keyframe's position, None without a pose."""
+    if keyframe.pose is None:
+        return None
+    return keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6
+
+
+def drives(view: MapView) -> list[tuple[RunId, list[tuple[float, float]]]]:
+    """Per run its id and its positions, in keyframe_id order."""
+    by_run: dict[int, list[KeyframeRecord]] = defaultdict(list)
+    for keyframe in view.keyframes:
+        by_run[keyframe.run].append(keyframe)
+    result = []
+    for run in view.runs:
+        ordered = sorted(by_run[run.ordinal], key=lambda k: k.keyframe_id)
+        result.append((run.run_id, [s for k in ordered if (s := spot_of(k)) is not None]))
+    return result
+
+
+def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
+    """Per place the positions of its keyframes."""
+    return {
+        ordinal: [s for k in place.members if (s := spot_of(view.keyframes[k])) is not None]
+        for ordinal, place in view.places.items()
+    }
+
+
+def floor_of(house: House) -> Floor:
+    """Walls, standing furniture and room names of ``house``."""
+    standing = (thing.footprint for thing in house.things if thing.model.stands)
+    return Floor(
+        walls=tuple((wall.x0, wall.y0, wall.x1, wall.y1) for wall in house.plan.walls),
+        furniture=tuple((rect.x0, rect.y0, rect.x1, rect.y1) for rect in standing),
+        rooms=tuple(
+            (room.name, (room.rect.x0, room.rect.y0, room.rect.x1, room.rect.y1))
+            for room in house.plan.rooms
+        ),
+    )

@@ -1,0 +1,115 @@
+"""The map as a graph of Places and Objects, in GraphML and in Graphviz' DOT.
+
+Labels are those of the database's graph: Place, Object, ADJACENT_TO, LOCATED_IN. Node ids are
+place_id and object_id. A property that is unknown is left out.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from eventsrc.base.text import visible
+from projections.map.view import MapView
+
+if TYPE_CHECKING:
+    import networkx
+
+_NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def _graph(view: MapView) -> "networkx.Graph":
+    import networkx  # here: it takes longer to import than most commands take to run
+
+    graph = networkx.Graph()
+    for place in view.places.values():
+        kind = view.type_of(place.ordinal)
+        typed = kind is not None and kind.type is not None
+        graph.add_node(
+            place.place_id,
+            **_known(
+                label="Place",
+                name=place.name,
+                floor=view.floor_of(place.ordinal),
+                type=kind.type if kind is not None and typed else None,
+                type_probability=kind.probability if kind is not None and typed else None,
+                x=place.centroid_x,
+                y=place.centroid_y,
+                keyframe_count=place.keyframe_count,
+            ),
+        )
+    for found in view.objects.values():
+        x, y = found.spot
+        graph.add_node(
+            found.object_id,
+            **_known(
+                label="Object",
+                class_name=found.class_name,
+                x=x,
+                y=y,
+                sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
+                obs_count=found.obs_count,
+                missing=True if found.missing_in is not None else None,
+            ),
+        )
+        if found.place is not None:
+            graph.add_edge(found.object_id, view.place_id(found.place), label="LOCATED_IN")
+    for a, b, transitions in view.edges():
+        graph.add_edge(
+            view.place_id(a), view.place_id(b), label="ADJACENT_TO", shared_transitions=transitions
+        )
+    return graph
+
+
+def _known(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def graphml(view: MapView) -> str:
+    """GraphML 1.0, for Gephi, yEd, Cytoscape and networkx. Characters that XML cannot hold are
+    written as escapes (``\\x1b``)."""
+    import networkx
+
+    graph = _graph(view)
+    ids = {node: _in_xml(node) for node in graph}
+    for _, values in graph.nodes(data=True):
+        values.update({k: _in_xml(v) for k, v in values.items() if isinstance(v, str)})
+    return "\n".join(networkx.generate_graphml(networkx.relabel_nodes(graph, ids))) + "\n"
+
+
+def _in_xml(text: str) -> str:
+    return _NOT_IN_XML.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def dot(view: MapView) -> str:
+    """DOT of Graphviz. ``neato`` keeps each Place at its centroid, a metre as an inch, and arranges
+    the Objects around the Place that they are in."""
+    graph = _graph(view)
+    lines = [
+        "graph semantic_map {",
+        "  graph [outputorder=edgesfirst, overlap=false];",
+        "  node [fontsize=10, margin=0.03, width=0, height=0];",
+    ]
+    lines += [f"  {_quoted(n)} {_attributes(_node(n, v))};" for n, v in graph.nodes(data=True)]
+    for a, b, values in graph.edges(data=True):
+        located = {"style": "dotted", "len": "0.7"}
+        adjacent = {"label": f"×{values.get('shared_transitions')}", "style": "bold"}
+        shown = adjacent if values["label"] == "ADJACENT_TO" else located
+        lines.append(f"  {_quoted(a)} -- {_quoted(b)} {_attributes(shown)};")
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _node(node: str, values: Mapping[str, Any]) -> dict[str, str]:
+    at = f"{values['x']:.3f},{values['y']:.3f}"
+    if values["label"] == "Object":
+        return {"label": values["class_name"], "pos": at, "shape": "plaintext"}
+    text = values.get("name") or values.get("type") or node
+    return {"label": text, "pos": f"{at}!", "shape": "box", "style": "filled", "fontsize": "14"}
+
+
+def _attributes(values: Mapping[str, str]) -> str:
+    return "[" + ", ".join(f"{name}={_quoted(value)}" for name, value in values.items()) + "]"
+
+
+def _quoted(text: str) -> str:
+    """A DOT string. A backslash in a label begins an escape sequence, so it is doubled."""
+    return '"' + visible(text).replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,222 @@
+"""The database of each site: from a URL template, or of the embedded server, named as the site.
+
+A map has fixed names in its database: the graph ``semantic_map``, which Apache AGE keeps as a
+schema, the schema ``mapfold`` with the checkpoints, and tables in ``public``. So two sites cannot
+share a database, not even in two schemas, and ``{site}`` must be in the database's name.
+"""
+
+import contextlib
+import os
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+from urllib.parse import quote
+
+import psycopg
+from psycopg import sql
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from projections.fold.errors import DatabaseError
+from projections.postgres.connection import (
+    Connection,
+    Targets,
+    check_url,
+    connect,
+    database_errors,
+    describe_target,
+    open_targets,
+)
+
+from .sites import Site
+
+PLACEHOLDER: Final = "{site}"
+MAX_BYTES: Final = 63
+"""Most bytes of a database's name; PostgreSQL would truncate a longer one."""
+_RESERVED: Final = frozenset({"template0", "template1"})
+_MARK: Final = "mapfoldsitemark"
+"""The placeholder of a site's name while a template is checked."""
+_EXAMPLE: Final = f"postgresql://host/{PLACEHOLDER}, or postgresql://host/map_{PLACEHOLDER}"
+Template = tuple[str, str]
+"""A URL with ``{site}``, and what messages call it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SiteDatabases:
+    """The URLs of one site."""
+
+    graph_url: str = field(repr=False)
+    vector_url: str = field(repr=False)
+
+    @property
+    def targets(self) -> Targets:
+        """The same URLs as `Targets`, which functions for one map take."""
+        return Targets(self.graph_url, self.vector_url)
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """Each database once."""
+        return tuple(dict.fromkeys((self.graph_url, self.vector_url)))
+
+
+@contextlib.contextmanager
+def site_databases(
+    sites: Sequence[Site], db: str | None, vector_db: str | None
+) -> Iterator[dict[str, SiteDatabases]]:
+    """The databases of each site, by its name. The embedded server, if needed, runs while the
+    context is open. Raises MisuseError for an invalid template or name, and where two sites would
+    share a database."""
+    graph = template_of(db, "--db", "MAPFOLD_DB")
+    vectors = template_of(vector_db, "--vector-db", "MAPFOLD_VECTOR_DB") or graph
+    if graph is not None and vectors is not None:
+        yield _databases(sites, graph, vectors)
+        return
+    vector_url = None if vectors is None else _filled(vectors, sites[0].name)
+    with open_targets(None, vector_url) as targets:
+        if targets.embedded is None:
+            raise MisuseError("set --db too, or neither --db nor --vector-db")
+        url = targets.embedded.url_of(_MARK).replace(_MARK, PLACEHOLDER)
+        own = url, "the embedded server"
+        yield _databases(sites, own, vectors or own)
+
+
+def template_of(option: str | None, name: str, variable: str) -> Template | None:
+    """The template of an option, else of an environment variable, checked; None without both."""
+    url, given_as = (option, name) if option else (os.environ.get(variable), variable)
+    if not url:
+        return None
+    if PLACEHOLDER not in url:
+        raise MisuseError(
+            f"{given_as}: no {PLACEHOLDER} in it, so all sites would have one database; a map has"
+            f" fixed names there, and each site needs its own: {_EXAMPLE}"
+        )
+    filled = url.replace(PLACEHOLDER, _MARK)
+    check_url(filled, given_as)
+    with_mark = sorted(
+        name for name, value in conninfo_to_dict(filled).items() if _MARK in str(value)
+    )
+    if with_mark != ["dbname"]:
+        raise MisuseError(
+            f"{given_as}: {PLACEHOLDER} may be only in the database's name (not in"
+            f" {', '.join(n for n in with_mark if n != 'dbname')}): {_EXAMPLE}; where"
+            " sites have servers of their own, run the command once for each server, with a list"
+        )
+    rest = filled.replace(_MARK, "")
+    if "{" in rest or "}" in rest:
+        raise MisuseError(
+            f"{given_as}: braces other than those of {PLACEHOLDER}: {_EXAMPLE}; write %7B for {{"
+            " and %7D for }"
+        )
+    return url, given_as
+
+
+def _filled(template: Template, name: str) -> str:
+    url, given_as = template
+    filled = url.replace(PLACEHOLDER, quote(name, safe=""))
+    check_url(filled, f"{given_as} for the site {visible(name)}")
+    database = str(conninfo_to_dict(filled)["dbname"])
+    size = len(database.encode())
+    if size > MAX_BYTES:
+        raise MisuseError(
+            f"site {visible(name)}: its database would be named {visible(database)}, {size} bytes,"
+            f" and PostgreSQL allows {MAX_BYTES}; give a list with a shorter name: NAME PATH"
+        )
+    if database in _RESERVED:
+        raise MisuseError(
+            f"site {visible(name)}: {database} is a database of PostgreSQL's own; give a list with"
+            f" another name, or a template such as --db postgresql://host/map_{PLACEHOLDER}"
+        )
+    return filled
+
+
+def _databases(
+    sites: Sequence[Site], graph: Template, vectors: Template
+) -> dict[str, SiteDatabases]:
+    of: dict[str, SiteDatabases] = {}
+    owners: dict[tuple[str, str, str], str] = {}
+    for site in sites:
+        of[site.name] = SiteDatabases(_filled(graph, site.name), _filled(vectors, site.name))
+        for url in of[site.name].urls:
+            parts = conninfo_to_dict(url)
+            port = parts.get("port") or os.environ.get("PGPORT") or 5432
+            key = str(parts.get("host")).lower(), str(port), str(parts["dbname"])
+            if owners.setdefault(key, site.name) != site.name:
+                raise MisuseError(
+                    f"sites {visible(owners[key])} and {visible(site.name)} would both have"
+                    f" {describe_target(url)}; give a list with other names"
+                )
+    return of
+
+
+def exists(url: str) -> bool | None:
+    """Whether a database exists; None where no server answers."""
+    with _maintenance(url) as connection:
+        if connection is None:
+            return None
+        return _is_there(connection, _name(url))
+
+
+def check_server(url: str) -> None:
+    """Raise DatabaseUnavailable when neither a database's server nor the database answers."""
+    if exists(url) is None:
+        connect(url, application="mapfold fleet").close()
+
+
+def create_if_missing(url: str) -> bool:
+    """Create the database of a URL; False if it exists or no server answers.
+
+    Raises DatabaseError when it may not be created.
+    """
+    name = _name(url)
+    with _maintenance(url) as connection:
+        if connection is None or _is_there(connection, name):
+            return False
+        try:
+            connection.execute(
+                sql.SQL("CREATE DATABASE {} TEMPLATE template0 ENCODING 'UTF8'").format(
+                    sql.Identifier(name)
+                )
+            )
+        except psycopg.errors.InsufficientPrivilege:
+            user = connection.info.user
+            raise DatabaseError(
+                f"{describe_target(url)}: it does not exist, and user {user} may not create it;"
+                f" have a superuser run ALTER ROLE {sql.Identifier(user).as_string()} CREATEDB, or"
+                f" create it with createdb -E UTF8 -T template0 -O"
+                f" {shlex.join([user, name])}"
+            ) from None
+        except (psycopg.errors.DuplicateDatabase, psycopg.errors.UniqueViolation):
+            return False  # another process has just created it
+        return True
+
+
+def _name(url: str) -> str:
+    return str(conninfo_to_dict(url)["dbname"])
+
+
+@contextlib.contextmanager
+def _maintenance(url: str) -> Iterator[Connection | None]:
+    """A connection to the server's database ``postgres``, None where that is not allowed."""
+    # In UTF-8 whatever the URL or PGCLIENTENCODING says: a site may have any name.
+    parts = conninfo_to_dict(url) | {"dbname": "postgres", "client_encoding": "UTF8"}
+    server = make_conninfo("", **parts)
+    try:
+        connection = psycopg.connect(
+            server, autocommit=True, application_name="mapfold fleet", connect_timeout=10
+        )
+    except psycopg.OperationalError:
+        # No server answers, or this user may not use that database. Connecting to the site's own
+        # database next raises the error that says which.
+        yield None
+        return
+    with connection, database_errors(url):
+        yield connection
+
+
+def _is_there(connection: Connection, name: str) -> bool:
+    row = connection.execute(
+        "SELECT FROM pg_catalog.pg_database WHERE datname = %s", [name]
+    ).fetchone()
+    return row is not None

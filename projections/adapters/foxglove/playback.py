@@ -1,0 +1,281 @@
+"""A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was;
+and a layout for its panels.
+
+The SDK calls the ``on_`` methods in its own thread; they only store the request. The thread that
+runs `Playback.run` folds and publishes.
+"""
+
+import math
+import threading
+import time
+from bisect import bisect_left
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from foxglove import Capability, Context, layouts, start_server
+from foxglove.websocket import (
+    ChannelView,
+    Client,
+    PlaybackCommand,
+    PlaybackControlRequest,
+    PlaybackState,
+    PlaybackStatus,
+    ServerListener,
+    WebSocketServer,
+)
+
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
+from eventsrc.log import LogReader
+from projections.fold.corrections import Corrections
+from projections.fold.deltas import PlacesMerged
+from projections.fold.settings import Settings
+from projections.map.change_lines import change_lines
+from projections.map.digest import map_digest
+from projections.map.fold import READ_AHEAD, fold_events, gc_paused
+from projections.map.moments import Moments
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+from projections.store.column_rows import TableWriter
+from projections.store.history_recorder import map_at
+from projections.store.stored_history import StoredHistory
+from projections.store.stored_view import StoredView
+from projections.store.tables import Tables
+
+from .messages import MapTopics
+from .scene import FRAME
+
+_SERIES: Final = (("places", "#3b82c4"), ("objects", "#e08a1e"), ("noise", "#8b939c"))
+
+
+def layout_json() -> str:
+    """The layout as JSON, for "Import from file" in Foxglove's menu of layouts."""
+    seen_from_above = layouts.ThreeDeeConfig(
+        fixed_frame=FRAME,
+        follow_mode="follow-none",
+        camera_state=layouts.ThreeDeeCameraState(perspective=False, phi=0.0, distance=25.0),
+        topics={
+            "/mapfold/map": layouts.BaseRendererSceneUpdateTopicSettings(visible=True),
+            "/mapfold/walls": layouts.BaseRendererGridTopicSettings(visible=True),
+        },
+    )
+    counts = layouts.PlotConfig(
+        paths=[
+            layouts.PlotSeries(
+                value=f"/mapfold/state.{name}",
+                label=name,
+                color=colour,
+                enabled=True,
+                line_interpolation="step",
+            )
+            for name, colour in _SERIES
+        ],
+        show_legend=True,
+    )
+    changes = layouts.LogConfig(topic_to_render="/mapfold/changes")
+    beside = layouts.SplitContainer(
+        direction="column",
+        items=[
+            layouts.SplitItem(content=layouts.PlotPanel(config=counts, title="Counts")),
+            layouts.SplitItem(content=layouts.LogPanel(config=changes, title="Changes")),
+        ],
+    )
+    whole = layouts.SplitContainer(
+        direction="row",
+        items=[
+            layouts.SplitItem(
+                proportion=2, content=layouts.ThreeDeePanel(config=seen_from_above, title="Map")
+            ),
+            layouts.SplitItem(proportion=1, content=beside),
+        ],
+    )
+    return layouts.Layout(content=whole).to_json() + "\n"
+
+
+TICK_S: Final = 0.05
+"""Seconds between two maps that are shown while playing."""
+ANSWERED_S: Final = 0.02
+"""Delay of messages after a seek, seconds. The SDK sends its answer after the call that makes it
+and does not report when; a client clears its display at that answer."""
+
+
+class PastMaps:
+    """Every past map of a log's first ``end`` events under ``corrections``, from one fold, which
+    raises FoldError at an event that cannot be folded. ``floors`` are those that the log's
+    occupancy maps name."""
+
+    def __init__(
+        self,
+        reader: LogReader,
+        settings: Settings,
+        corrections: Corrections,
+        end: Offset,
+        progress: Callable[[int, int], None] = lambda *_: None,
+    ) -> None:
+        self.reader = reader
+        self.moments = Moments(reader.read(FIRST_OFFSET, end))
+        self._lines: list[tuple[Offset, str]] = []
+        self._merges: list[PlacesMerged] = []
+        tables = Tables()
+        writer = TableWriter(tables)
+        view = MapView(settings, keep_embeddings=False, corrections=corrections)
+        semantic_map = new_map(reader, settings, corrections)
+        events = reader.read(FIRST_OFFSET, end)
+        with gc_paused():
+            for offset, deltas in fold_events(events, semantic_map, ahead=READ_AHEAD):
+                view.apply_event(offset, deltas)
+                writer.add(offset, deltas)
+                self._lines += ((offset, line) for line in change_lines(view, deltas))
+                self._merges += (delta for delta in deltas if isinstance(delta, PlacesMerged))
+                progress(offset, end)
+        writer.flush()
+        self.floors = list(view.maps)
+        self._history = StoredHistory(settings, corrections, tables, partial(map_at, reader))
+
+    def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:
+        """The changes of the events from ``start`` to before ``end``: offset and line of each."""
+        first, last = (
+            bisect_left(self._lines, at, key=lambda each: each[0]) for at in (start, end)
+        )
+        return self._lines[first:last]
+
+    def at(self, end: Offset) -> tuple[MapView, list[PlacesMerged]]:
+        """The map after ``end`` events, and its merges of places."""
+        merges = self._merges[: bisect_left(self._merges, end, key=lambda merge: merge.offset)]
+        with gc_paused():
+            return StoredView(self._history, end), merges
+
+
+class Playback(ServerListener):
+    """A server of past maps, which listens from its construction until `run` has ended.
+
+    Raises OSError where it cannot listen. At first it shows the end of the log, paused.
+    """
+
+    def __init__(self, maps: PastMaps, name: str, host: str, port: int) -> None:
+        self._maps = maps
+        self._first_ns, self._last_ns = maps.moments.span_ns
+        self._changed = threading.Condition()
+        # The fields below are shared with the SDK's thread, under _changed.
+        self._now_ns, self._shown = self._last_ns, Offset(len(maps.moments.times_ns))
+        self._playing, self._speed = False, 1.0
+        self._to_show, self._ended = False, False
+        context = Context()
+        self._topics = MapTopics(context)
+        self._topics.declare(maps.moments.topics, maps.floors)
+        try:
+            self.server: WebSocketServer = start_server(
+                name=name,
+                host=host,
+                port=port,
+                capabilities=[Capability.PlaybackControl, Capability.Time],
+                server_listener=self,
+                playback_time_range=(self._first_ns, self._last_ns),
+                context=context,
+            )
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+
+    def end(self) -> None:
+        """End `run`, and with it the server."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def on_playback_control_request(
+        self, playback_control_request: PlaybackControlRequest
+    ) -> PlaybackState | None:
+        """Apply a client's request; the SDK answers with the returned state."""
+        asked = playback_control_request
+        with self._changed:
+            self._playing = asked.playback_command is PlaybackCommand.Play
+            self._speed = asked.playback_speed if 0 < asked.playback_speed < math.inf else 1.0
+            if asked.seek_time is not None:
+                self._now_ns = min(max(asked.seek_time, self._first_ns), self._last_ns)
+                self._shown = self._maps.moments.offset_at(self._now_ns)
+                self._to_show = True
+            if self._now_ns >= self._last_ns:
+                self._playing = False
+            self._changed.notify()
+            return self._state(asked.request_id, did_seek=asked.seek_time is not None)
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
+        """Publish the current map to a client that subscribes to a topic."""
+        with self._changed:
+            self._to_show = True
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Publish what clients request, and advance the time, until `end`; then stop the server."""
+        try:
+            self._run()
+        finally:
+            self.server.stop()  # here: the SDK's server must not be used by two threads at once
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda: self._ended or self._to_show, TICK_S if self._playing else None
+                )
+                if self._to_show:
+                    self._changed.wait_for(lambda: self._ended, ANSWERED_S)
+                if self._ended:
+                    return
+                to_show = self._to_show
+            if to_show:
+                self._show()
+            now = time.monotonic()
+            self._pass(now - before)
+            before = now
+
+    def _state(self, request_id: str = "", *, did_seek: bool = False) -> PlaybackState:
+        if self._playing:
+            status = PlaybackStatus.Playing
+        else:
+            at_end = self._now_ns >= self._last_ns
+            status = PlaybackStatus.Ended if at_end else PlaybackStatus.Paused
+        return PlaybackState(status, self._now_ns, self._speed, did_seek, request_id)
+
+    def _show(self) -> None:
+        """Publish the whole map, for clients that have nothing yet."""
+        with self._changed:
+            self._to_show, now, shown = False, self._now_ns, self._shown
+        view, merges = self._maps.at(shown)
+        self.server.broadcast_time(now)
+        for given in view.maps.values():
+            self._topics.walls(view, given, now)
+        self._topics.robot(view, now)
+        self._topics.scene(view, merges, now, digest=map_digest(view))
+
+    def _pass(self, seconds: float) -> None:
+        """Advance the time while playing, and publish what changed."""
+        with self._changed:
+            if not self._playing or self._to_show:
+                return
+            self._now_ns = min(self._now_ns + int(seconds * self._speed * 1e9), self._last_ns)
+            before, self._shown = self._shown, self._maps.moments.offset_at(self._now_ns)
+            now, shown = self._now_ns, self._shown
+            ended = now >= self._last_ns
+            self._playing = not ended
+        self.server.broadcast_time(now)
+        if shown > before:
+            self._publish(before, shown, now)
+        if ended:
+            with self._changed:
+                state = self._state()
+            self.server.broadcast_playback_state(state)
+
+    def _publish(self, start: Offset, end: Offset, now: int) -> None:
+        view, merges = self._maps.at(end)
+        times = self._maps.moments.times_ns
+        for event in self._maps.reader.read(start, end):
+            self._topics.event(event, times[event.offset])
+        for offset, line in self._maps.lines_between(start, end):
+            self._topics.changes([line], times[offset])
+        for given in view.maps.values():
+            if given.offset >= start:
+                self._topics.walls(view, given, now)
+        self._topics.robot(view, now)
+        self._topics.scene(view, merges, now)

@@ -1,0 +1,399 @@
+"""Deltas: what an event changed in the map. The contract between the fold and all that uses it.
+
+Sinks, the view and time travel are built from deltas and never look into a reducer. A delta carries
+*absolute* new values (a count, not an increment): the last one per thing is enough, and applying
+one twice does no harm. ``offset`` is that of the event that caused it, which need not be a
+keyframe.
+
+Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
+They are never reused, and a database's ids are computed from them. They are ints at run time; mypy
+keeps those of one kind apart from the others.
+
+Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are
+exact; `projections.fold.exact` says why and where the bounds are. Timestamps are the robot's, float
+seconds.
+
+The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
+(PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), Objects
+(ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
+ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
+after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
+names only things that deltas before it have introduced. MapGiven is the only one of its event.
+
+Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
+the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which
+would traverse a whole history of them; a delta is never part of a reference cycle.
+"""
+
+from typing import Literal, NewType, TypeAlias
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.occupancy_map import OccupancyMap
+
+RunOrdinal = NewType("RunOrdinal", int)
+KeyframeOrdinal = NewType("KeyframeOrdinal", int)
+ObservationOrdinal = NewType("ObservationOrdinal", int)
+PlaceOrdinal = NewType("PlaceOrdinal", int)
+ObjectOrdinal = NewType("ObjectOrdinal", int)
+SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused", "forgotten", "dropped"]
+"""Why an envelope, or an observation of it, is left out of the map; see `EventSkipped`."""
+UnitVector: TypeAlias = NDArray[np.int32]
+"""A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.fold.exact`."""
+
+
+class Pose(msgspec.Struct, frozen=True, gc=False):
+    """The robot's pose in the map frame: micrometres, and radians as they came."""
+
+    x_um: int
+    y_um: int
+    yaw_rad: float
+
+    @property
+    def x_m(self) -> float:
+        """Metres, correctly rounded."""
+        return self.x_um / 1_000_000
+
+    @property
+    def y_m(self) -> float:
+        """Metres, correctly rounded."""
+        return self.y_um / 1_000_000
+
+
+class RunSeen(msgspec.Struct, frozen=True, gc=False):
+    """A run is new, or started earlier than known so far.
+
+    ``started_at`` is the earliest keyframe timestamp of the run so far, in seconds.
+    """
+
+    offset: Offset
+    run: RunOrdinal
+    run_id: RunId
+    started_at: float
+
+
+class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
+    """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
+    floor that the pose is on, None if the envelope states none."""
+
+    offset: Offset
+    keyframe: KeyframeOrdinal
+    run: RunOrdinal
+    run_id: RunId
+    keyframe_id: KeyframeId
+    timestamp: float
+    pose: Pose | None
+    floor: str | None = None
+
+
+class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """A new detection of a keyframe.
+
+    ``embedding`` is None when the detection has none *or* it is of another space than the map's
+    (then ``foreign_space`` is true).
+    """
+
+    offset: Offset
+    observation: ObservationOrdinal
+    keyframe: KeyframeOrdinal
+    run_id: RunId
+    keyframe_id: KeyframeId
+    det_id: DetId
+    class_name: str
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding_model: str | None
+    embedding: UnitVector | None
+    foreign_space: bool
+
+
+class EventSkipped(msgspec.Struct, frozen=True, gc=False):
+    """An envelope, or a detection of it, that changes nothing.
+
+    ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (same keyframe, other
+    content: the first one stands), ``forgotten`` (a correction leaves the keyframe out),
+    ``det_id_reused`` (an observation of a new keyframe whose det_id an earlier keyframe has) or
+    ``dropped`` (a correction leaves the detection out). The last two are of one detection,
+    ``det_id``; the rest of the keyframe is folded.
+    """
+
+    offset: Offset
+    kind: SkipKind
+    run_id: RunId
+    keyframe_id: KeyframeId
+    det_id: DetId | None = None
+    first_offset: Offset | None = None
+
+
+class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
+    """A new place, founded by the keyframe ``founder``, its first core point.
+
+    ``place_id`` is ``{run_id}_p{counter}`` with a counter from 0 per founding run.
+    """
+
+    offset: Offset
+    place: PlaceOrdinal
+    place_id: str
+    founder: KeyframeOrdinal
+
+
+class PlaceLink(msgspec.Struct, frozen=True, gc=False):
+    """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
+
+    Of places by rooms: the founders of the two places' cells that are the shortest drive apart,
+    and the length of that drive.
+    """
+
+    core: KeyframeOrdinal
+    neighbour: KeyframeOrdinal
+    distance_um: int
+
+
+class MeanDrive(msgspec.Struct, frozen=True, gc=False):
+    """Why places by rooms became one: the mean driven distance, rounded down, between the ``cells``
+    of the survivor and the ``absorbed_cells`` of the other."""
+
+    mean_um: int
+    cells: int
+    absorbed_cells: int
+
+
+class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
+    """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
+
+    No KeyframePlaced is emitted for them: code that keeps members must move them all. ``bridge`` is
+    the keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one
+    pair for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before the
+    merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's two
+    anchors, at whatever distance. ``drives`` are there for places by rooms, one for each absorbed
+    place but those in ``joined``.
+    """
+
+    offset: Offset
+    survivor: PlaceOrdinal
+    absorbed: tuple[PlaceOrdinal, ...]
+    bridge: KeyframeOrdinal
+    links: tuple[PlaceLink, ...]
+    survivor_count: int
+    absorbed_counts: tuple[int, ...]
+    joined: tuple[PlaceOrdinal, ...] = ()
+    drives: tuple[MeanDrive, ...] = ()
+
+
+class MergeRefused(msgspec.Struct, frozen=True, gc=False):
+    """Two places touched and stay two, because a correction keeps them apart.
+
+    ``link`` is the pair of core points that would have joined them (of anchors, where a ``join``
+    is refused), ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept
+    apart, of ``a`` and of ``b``. ``a`` was founded before ``b``. There is one for each pair of
+    places, however often they touch.
+    """
+
+    offset: Offset
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    bridge: KeyframeOrdinal
+    link: PlaceLink
+    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+
+
+class PlaceNamed(msgspec.Struct, frozen=True, gc=False):
+    """A place has a name, or (None) has none any more. ``command`` is the offset of the command
+    that gives it, None if there is none."""
+
+    offset: Offset
+    place: PlaceOrdinal
+    name: str | None
+    command: Offset | None = None
+
+
+class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
+    """A keyframe (new, or noise until now) belongs to a place."""
+
+    offset: Offset
+    keyframe: KeyframeOrdinal
+    place: PlaceOrdinal
+
+
+class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
+    """A place's members changed: their number and the sums of their positions, in µm.
+
+    The centroid in metres is ``sum / (keyframe_count * 1_000_000)``, correctly rounded.
+    """
+
+    offset: Offset
+    place: PlaceOrdinal
+    keyframe_count: int
+    sum_x_um: int
+    sum_y_um: int
+
+
+class ObjectFound(msgspec.Struct, frozen=True, gc=False):
+    """A new Object, founded by an observation; its position is that keyframe's pose."""
+
+    offset: Offset
+    object: ObjectOrdinal
+    object_id: str
+    class_name: str
+    observation: ObservationOrdinal
+
+
+class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
+    """An observation was assigned to an Object (the founding one too); the Object's new values.
+
+    ``similarity_q40`` is the cosine with the Object's mean embedding before this observation, as an
+    exact multiple of 2⁻⁴⁰ (2⁴⁰ for the founding one). The mean position in metres is
+    ``sum / (obs_count * 1_000_000)``. ``first_seen`` and ``last_seen`` are robot timestamps.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    observation: ObservationOrdinal
+    similarity_q40: int
+    obs_count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+
+
+class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
+    """Two Objects became one; the survivor's new values.
+
+    All observations of ``absorbed`` belong to ``survivor`` from now on. No ObjectSeen is emitted
+    for them: code that keeps observations must move them all. ``evidence`` is None where a
+    ``same-object`` command did it.
+    """
+
+    offset: Offset
+    survivor: ObjectOrdinal
+    absorbed: ObjectOrdinal
+    obs_count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+    evidence: "MergeEvidence | None" = None
+
+
+class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
+    """Why fusion by evidence made two Objects one.
+
+    ``look`` and ``geometry`` are log-likelihood ratios in thousandths of a nat: same thing against
+    two things. ``distance_um`` is that of the two estimates, ``pictures_with_both`` of ``pictures``
+    showed both at once.
+    """
+
+    look: int
+    geometry: int
+    distance_um: int
+    pictures_with_both: int
+    pictures: int
+
+
+class ObjectEstimated(msgspec.Struct, frozen=True, gc=False):
+    """An Object's position, estimated from the bearings of its observations; new values.
+
+    Position in µm, covariance in µm² (rounded to integers), and the number of spots (places to
+    stand, 0.35 m apart) that it was seen from. Only fusion by evidence emits it.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    x_um: int
+    y_um: int
+    var_xx_um2: int
+    var_xy_um2: int
+    var_yy_um2: int
+    spots: int
+
+
+class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
+    """Most of an Object's observations are of this class now; ties go to the class seen first."""
+
+    offset: Offset
+    object: ObjectOrdinal
+    class_name: str
+
+
+class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
+    """An Object was not seen where it should have been; new values.
+
+    ``misses`` is the number of keyframes of the run that should show it and do not. ``missing`` is
+    whether it counts as missing by that; it is False again once it is seen there.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    run: RunOrdinal
+    misses: int
+    missing: bool
+
+
+class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
+    """An Object was found at another position; its estimate leaves out earlier observations.
+
+    ``from_x_um`` … is the estimate that it had, ``to_x_um`` … the first one at the new position.
+    """
+
+    offset: Offset
+    object: ObjectOrdinal
+    observation: ObservationOrdinal
+    from_x_um: int
+    from_y_um: int
+    to_x_um: int
+    to_y_um: int
+
+
+class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
+    """An Object is located in another place than before, or in none (None)."""
+
+    offset: Offset
+    object: ObjectOrdinal
+    place: PlaceOrdinal | None
+
+
+class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
+    """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
+
+    0 removes the edge (one of the two was absorbed, or relabelling moved the transitions).
+    """
+
+    offset: Offset
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    shared_transitions: int
+
+
+class MapGiven(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """An occupancy map holds for all events after this one, which is a map and no keyframe."""
+
+    offset: Offset
+    map: OccupancyMap
+
+
+Delta: TypeAlias = (
+    RunSeen
+    | KeyframeAdded
+    | ObservationAdded
+    | EventSkipped
+    | PlaceFormed
+    | PlacesMerged
+    | MergeRefused
+    | KeyframePlaced
+    | PlaceChanged
+    | PlaceNamed
+    | ObjectFound
+    | ObjectSeen
+    | ObjectsMerged
+    | ObjectEstimated
+    | ObjectClassified
+    | ObjectMissing
+    | ObjectRelocated
+    | ObjectMoved
+    | PlacesLinked
+    | MapGiven
+)

@@ -1,0 +1,129 @@
+"""Apply corrections to single events: leave out keyframes and detections, correct poses.
+
+An event is corrected before it is folded, so the map is that of a log with the corrected events:
+without forgotten keyframes, without dropped detections, with the corrected poses written in. A
+detection's position was computed from the recorded pose, so it moves and turns with that pose; in a
+keyframe without a pose it is left out.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from eventsrc.base.advised import command_line
+from eventsrc.base.text import visible
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, Offset
+
+from .corrections import Corrections
+from .envelope_evidence import small_angle
+from .errors import ImpossibleCommand
+from .exact import Units
+from .exact_functions import cos_sin
+
+
+class EditedEvent(NamedTuple):
+    """A corrected envelope; ``dropped`` are the det_ids it has lost."""
+
+    accepted: Accepted
+    units: Sequence[Units | None] | None
+    dropped: tuple[DetId, ...]
+
+
+def edits_events(corrections: Corrections) -> bool:
+    """Whether `edit_event` can change any event."""
+    c = corrections
+    return bool(c.forgotten_runs or c.forgotten_ranges or c.dropped or c.poses)
+
+
+def edit_event(
+    corrections: Corrections,
+    offset: Offset,
+    accepted: Accepted,
+    units: Sequence[Units | None] | None,
+) -> EditedEvent | None:
+    """The corrected event; None if it is left out. ``units`` runs parallel to the detections.
+
+    Raises ImpossibleCommand for a pose that a correction moves out of the map.
+    """
+    envelope, dropped = accepted.envelope, corrections.dropped
+    if corrections.is_forgotten(envelope.run_id, envelope.keyframe_id):
+        return None
+    gone: tuple[DetId, ...] = ()
+    if dropped and not dropped.isdisjoint(accepted.det_ids):
+        gone = tuple(det_id for det_id in accepted.det_ids if det_id in dropped)
+        kept = corrections.kept(accepted)
+        units = None if units is None else [units[i] for i in kept]
+        accepted = Accepted(
+            envelope.model_copy(update={"detections": tuple(envelope.detections[i] for i in kept)}),
+            tuple(accepted.det_ids[i] for i in kept),
+            tuple(accepted.vectors[i] for i in kept),
+        )
+    if envelope.run_id in corrections.poses:
+        accepted = _with_pose(corrections, offset, accepted)
+    return EditedEvent(accepted, units, gone)
+
+
+def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> Accepted:
+    envelope = accepted.envelope
+    pose = corrections.pose(envelope)
+    if pose is None or pose == (envelope.map_x, envelope.map_y, envelope.map_yaw):
+        return accepted
+    x, y, yaw = pose
+    if not is_in_bounds(pose):
+        by = corrections.pose_command(envelope, is_in_bounds)
+        command_id = visible(by.command.command_id)
+        raise ImpossibleCommand(
+            offset,
+            f"correct-poses {command_id} at offset {by.offset} moves keyframe "
+            f"{envelope.keyframe_id} of run {envelope.run_id!r} to x={x!r}, y={y!r}, yaw={yaw!r}, "
+            f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
+            f"{command_line('edit', 'LOG', 'undo', command_id, '--reason', 'WHY')}",
+        )
+    update: dict[str, object] = {"map_x": x, "map_y": y, "map_yaw": yaw}
+    if envelope.pose_covariance is not None:
+        update["pose_covariance"] = _turned_covariance(envelope, yaw)
+    if any(detection.position is not None for detection in envelope.detections):
+        update["detections"] = _with_positions(envelope, pose)
+    moved = envelope.model_copy(update=update)
+    return Accepted(moved, accepted.det_ids, accepted.vectors)
+
+
+def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tuple[Detection, ...]:
+    """The detections, with positions moved as the pose is."""
+    old_x, old_y, old_yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
+    if old_x is None or old_y is None or old_yaw is None:
+        return tuple(d.model_copy(update={"position": None}) for d in envelope.detections)
+    x, y, yaw = pose
+    cos, sin = cos_sin(small_angle(yaw) - small_angle(old_yaw))
+    moved = []
+    for detection in envelope.detections:
+        if detection.position is not None:
+            dx, dy = detection.position[0] - old_x, detection.position[1] - old_y
+            position = x + (cos * dx - sin * dy), y + (sin * dx + cos * dy)
+            detection = detection.model_copy(update={"position": position})
+        moved.append(detection)
+    return tuple(moved)
+
+
+def _turned_covariance(envelope: Envelope, yaw: float) -> tuple[float, ...] | None:
+    """The covariance of the pose, turned as the pose is; None if there was no pose."""
+    nine = envelope.pose_covariance
+    if nine is None or envelope.map_yaw is None:
+        return None
+    cos, sin = cos_sin(small_angle(yaw) - small_angle(envelope.map_yaw))
+    xx, xy, xw, _, yy, yw, _, _, ww = nine
+    across = 2.0 * cos * sin * xy
+    xx, yy = (
+        max(cos * cos * xx - across + sin * sin * yy, 0.0),
+        max(sin * sin * xx + across + cos * cos * yy, 0.0),
+    )
+    xy = cos * sin * (nine[0] - nine[4]) + (cos * cos - sin * sin) * xy
+    xw, yw = cos * xw - sin * yw, sin * xw + cos * yw
+    return xx, xy, xw, xy, yy, yw, xw, yw, ww
+
+
+def is_in_bounds(pose: tuple[float, float, float]) -> bool:
+    """Whether a pose is within the bounds of a map."""
+    x, y, yaw = pose
+    return abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)

@@ -1,0 +1,316 @@
+"""Observations fused into Objects with an estimated position: the rule of `fusion = "evidence"`.
+
+The rules, for the observations of one picture:
+
+1.  Each becomes a sight (`sights`) and a look (`looks`). Candidates are the Objects whose estimate
+    is within reach of the robot: the usual range times exp(1.5 spreads), and 1.5 m.
+2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
+    the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
+    is missing costs an eighth), and half of that of its label and the labels seen so far
+    (`label_counts`). Below −5 the sight alone rules a candidate out.
+3.  Each observation goes to one Object, and each Object gets one observation of a picture: two
+    things in one picture are not one. Of all such choices that with the largest sum of evidence is
+    taken, a pair's being above 0 (`assign`). What is left founds Objects. Where other Objects,
+    or a new one, or two observations exchanged were nearly as probable, the sight weighs only its
+    probability in the estimate, and below 0.85 the look is no exemplar.
+4.  The Object's estimate is solved again from its spots (`spots`), its class is that of most of its
+    observations.
+5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
+
+Under ``same-object`` and ``different-objects`` the rules of `constrained_objects` hold besides:
+Objects that are kept apart are no candidates for each other's observations, those that are one are
+merged at once, also within one picture.
+
+Everything is bit-exact: integers, and float64 by operations that IEEE 754 defines to the last bit,
+in one order; transcendental functions are those of `projections.fold.exact_functions`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+from eventsrc.envelope.model import DetId, Offset
+
+from . import State, part, prefixed
+from .agreement import Agreement, Slopes
+from .deltas import (
+    MergeEvidence,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    Pose,
+    RunOrdinal,
+)
+from .evidence import EvidenceConstants
+from .evidence_matching import Matching
+from .evidence_merging import Merging
+from .exact import MAX_IN_A_SUM, Q40
+from .label_counts import LabelCounts
+from .looks import LookRatios, LookScale, looks_of
+from .objects import object_id
+from .pair_groups import PairGroups
+from .relocations import Moved
+from .settings import Camera
+from .sights import PoseError, Sighting, Sights
+from .spots import Spots
+from .thing_index import ThingIndex
+from .things import Thing
+from .turned_looks import turned_looks
+
+ObjectDelta: TypeAlias = (
+    ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
+)
+_SURE = 0.85
+
+
+class EvidenceObjects:
+    """The reducer."""
+
+    def __init__(
+        self, constants: EvidenceConstants, groups: PairGroups[DetId] | None = None
+    ) -> None:
+        self._groups = groups
+        self._sights = Sights(constants)
+        self._look_ratios = LookRatios(constants)
+        self._scale = LookScale(constants.different)
+        self._slopes = Slopes()
+        self._labels = LabelCounts()
+        self._index = ThingIndex(constants)
+        self._object_of: dict[int, ObjectOrdinal] = {}  # group → its Object
+        self._matching = Matching(
+            Agreement(constants.range_m, constants.range_spread, self._index.reach_m),
+            self._index,
+            self._look_ratios,
+            self._scale,
+            self._slopes,
+            self._labels,
+            groups,
+        )
+        self._merging = Merging(self._index, self._look_ratios, self._scale, self._labels, groups)
+
+    def fold(
+        self,
+        offset: Offset,
+        run: RunOrdinal,
+        timestamp: float,
+        pose: Pose,
+        camera: Camera,
+        sightings: Sequence[Sighting],
+        error: PoseError | None = None,
+    ) -> list[ObjectDelta]:
+        """Fuse the observations of one picture; ``error`` is that of its pose, if it is known."""
+        if not sightings:
+            return []
+        labels = [sighting.class_name for sighting in sightings]
+        looks, inverses = looks_of([sighting.vector for sighting in sightings])
+        sights = self._sights.of(pose, camera, sightings, error)
+        self._scale.learn(labels, looks)
+        self._slopes.learn(sights)
+        self._labels.learn(labels)
+        chosen = self._matching.choose(
+            run, pose, labels, looks, inverses, sights, sightings, self._object_of
+        )
+        deltas: list[ObjectDelta] = []
+        seen: list[ObjectOrdinal] = []
+        named: dict[ObjectOrdinal, str] = {}  # the classes before
+        to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
+        index, groups, group, own = self._index, self._groups, None, None
+        for k, sighting in enumerate(sightings):
+            wanted, cosine, share = chosen[k]
+            if groups is not None:
+                group = groups.group_of.get(sighting.det_id)
+                own = None if group is None else self._object_of.get(group)
+                if group is not None:
+                    wanted = self._allowed(group, own, wanted)
+            if wanted is None:
+                ordinal, found = self._found(offset, sighting, pose, timestamp)
+                named[ordinal] = sighting.class_name
+                deltas.append(found)
+                thing = index.thing(ordinal)
+            else:
+                ordinal, thing = wanted, index.thing(wanted)
+                named.setdefault(ordinal, thing.class_name)
+                _count(thing, ordinal, sighting.class_name, pose, timestamp)
+            sight = sights[k]
+            spot = thing.spots.add(sight, share)
+            if share >= _SURE:
+                thing.keep(looks[k], inverses[k], sight.side_cos, sight.side_sin, run)
+            index.solve(ordinal, thing, spot)
+            seen.append(ordinal)
+            deltas.append(
+                ObjectSeen(
+                    offset,
+                    ordinal,
+                    sighting.observation,
+                    Q40 if wanted is None else round(cosine * Q40),
+                    thing.count,
+                    thing.sum_x_um,
+                    thing.sum_y_um,
+                    thing.first_seen,
+                    thing.last_seen,
+                )
+            )
+            if group is not None:
+                thing.groups.add(group)
+                if own is None:
+                    self._object_of[group] = ordinal
+                elif own != ordinal:
+                    to_unite.append((own, ordinal))
+        index.count_meetings(seen)
+        changed = set(seen)
+        for pair in to_unite:
+            one, other = map(index.survivor_of, pair)
+            if one != other:
+                deltas.append(self._unite(offset, one, other, changed, named, None))
+        for ordinal in sorted(changed):
+            if ordinal not in changed:
+                continue
+            thing = index.thing(ordinal)
+            if thing.count < thing.checked:
+                continue
+            partner = self._merging.partner_of(ordinal)
+            if partner is not None:
+                other, why = partner
+                deltas.append(self._unite(offset, ordinal, other, changed, named, why))
+        ascending = sorted(changed)
+        for ordinal in ascending:
+            class_name = index.thing(ordinal).class_name
+            if class_name != named[ordinal]:
+                deltas.append(ObjectClassified(offset, ordinal, class_name))
+        deltas += [index.estimated(offset, ordinal) for ordinal in ascending]
+        return deltas
+
+    def class_of(self, ordinal: ObjectOrdinal) -> str:
+        """The class of most of an Object's observations."""
+        return self._index.thing(ordinal).class_name
+
+    def observations_of(self, ordinal: ObjectOrdinal) -> int:
+        """How many observations an Object has."""
+        return self._index.thing(ordinal).count
+
+    def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
+        """The log-likelihood ratio of the looks of an Object and of each of several others,
+        whatever their headings (`turned_looks`); None where a command keeps them apart."""
+        thing, things = self._index.thing(one), [self._index.thing(other) for other in others]
+        looks = turned_looks(thing, things, self._look_ratios, self._scale)
+        groups = self._groups
+        if groups is None:
+            return [*looks]
+        return [
+            None if groups.conflicts(thing.groups, other.groups) else look
+            for look, other in zip(looks, things, strict=True)
+        ]
+
+    def relocate(self, offset: Offset, moved: Moved) -> list[ObjectDelta]:
+        """Merge an Object with the one found at its new position, and estimate it from the later
+        observations only."""
+        thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
+        before, after = thing.where()[:2], later.where()[:2]
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        evidence = MergeEvidence(
+            round(moved.look * 1000.0),
+            0,
+            round(math.sqrt(dx * dx + dy * dy) * 1e6),
+            thing.met.get(moved.new, 0),
+            thing.count + later.count,
+        )
+        thing.spots, thing.estimate = Spots(), later.estimate
+        class_name = thing.class_name
+        merged = self._unite(offset, moved.old, moved.new, set(), {}, evidence)
+        places = [round(number * 1e6) for number in (*before, *after)]
+        deltas: list[ObjectDelta] = [
+            merged,
+            ObjectRelocated(offset, moved.old, moved.observation, *places),
+        ]
+        if thing.class_name != class_name:
+            deltas.append(ObjectClassified(offset, moved.old, thing.class_name))
+        return [*deltas, self._index.estimated(offset, moved.old)]
+
+    def dump(self) -> State:
+        """The whole state, for a snapshot."""
+        return (
+            {"object_of": sorted(map(list, self._object_of.items()))}
+            | prefixed("scale", self._scale.dump())
+            | prefixed("slopes", self._slopes.dump())
+            | prefixed("labels", self._labels.dump())
+            | prefixed("things", self._index.dump())
+        )
+
+    def load(self, state: State) -> None:
+        """Restore the state of `dump`."""
+        self._object_of = {group: ObjectOrdinal(ordinal) for group, ordinal in state["object_of"]}
+        self._scale.load(part("scale", state))
+        self._slopes.load(part("slopes", state))
+        self._labels.load(part("labels", state))
+        self._index.load(part("things", state))
+
+    def _allowed(
+        self, group: int, own: ObjectOrdinal | None, wanted: ObjectOrdinal | None
+    ) -> ObjectOrdinal | None:
+        """The wanted Object, unless a command keeps it apart; then the group's own one, if any."""
+        if self._groups is None or wanted is None:
+            return own
+        inside = {group} if own is None else self._index.thing(own).groups
+        others = self._index.thing(wanted).groups
+        return own if wanted != own and self._groups.conflicts(inside, others) else wanted
+
+    def _found(
+        self, offset: Offset, sighting: Sighting, pose: Pose, timestamp: float
+    ) -> tuple[ObjectOrdinal, ObjectFound]:
+        """Found an Object."""
+        label, times = sighting.class_name, (timestamp, timestamp)
+        thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
+        ordinal = self._index.add(thing)
+        identity = object_id(sighting.det_id)
+        return ordinal, ObjectFound(offset, ordinal, identity, label, sighting.observation)
+
+    def _unite(
+        self,
+        offset: Offset,
+        one: ObjectOrdinal,
+        other: ObjectOrdinal,
+        changed: set[ObjectOrdinal],
+        named: dict[ObjectOrdinal, str],
+        evidence: MergeEvidence | None,
+    ) -> ObjectsMerged:
+        """Merge two Objects; the one founded first survives."""
+        survivor, absorbed = min(one, other), max(one, other)
+        moved = self._index.thing(absorbed).groups
+        self._object_of |= dict.fromkeys(moved, survivor)
+        named.setdefault(survivor, self._index.thing(survivor).class_name)
+        self._index.unite(survivor, absorbed)
+        changed.discard(absorbed)
+        changed.add(survivor)
+        thing = self._index.thing(survivor)
+        return ObjectsMerged(
+            offset,
+            survivor,
+            absorbed,
+            thing.count,
+            thing.sum_x_um,
+            thing.sum_y_um,
+            thing.first_seen,
+            thing.last_seen,
+            evidence,
+        )
+
+
+def _count(thing: Thing, ordinal: ObjectOrdinal, label: str, pose: Pose, timestamp: float) -> None:
+    """Add an observation to an Object's sums."""
+    if thing.count >= MAX_IN_A_SUM:
+        raise OverflowError(
+            f"object {ordinal} of class {thing.class_name!r} has {MAX_IN_A_SUM} observations, "
+            "the bound of its exact arithmetic"
+        )
+    thing.count += 1
+    thing.sum_x_um += pose.x_um
+    thing.sum_y_um += pose.y_um
+    if timestamp > thing.last_seen:
+        thing.last_seen = timestamp
+    elif timestamp < thing.first_seen:
+        thing.first_seen = timestamp
+    thing.count_label(label)

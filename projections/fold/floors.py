@@ -1,0 +1,160 @@
+"""Floors: the floor of a pose, and positions laid out so that reducers of x and y keep floors
+apart.
+
+An envelope names its floor (``floor``), or its height ``map_z`` gives it: floor n is nearest to
+n × ``floor_height_m``, a height half-way belongs to the upper one. So 2.8 m is floor "1" at 3 m a
+floor, and the same floor as that of an envelope with ``"floor": 1``. Poses without either are on a
+floor of their own, which has no name.
+
+The reducers of places and Objects are given *laid out* positions: those of each floor are moved
+by a multiple of `STEP_UM`, which is ten times what a map spans. So nothing on two floors is ever
+within reach of each other, whatever the rule, and the deltas are moved back. The floor that the
+first pose of a log is on is not moved: a map of one floor is as it would be without floors.
+
+A command that makes things on two floors one is obeyed for those on the floor whose detection, or
+keyframe, came first.
+"""
+
+from typing import Any, TypeVar
+
+import msgspec
+
+from eventsrc.envelope.model import Envelope
+
+from . import State
+from .deltas import (
+    Delta,
+    ObjectEstimated,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    PlaceChanged,
+    Pose,
+)
+from .exact import metres_to_um
+from .pair_groups import PairGroups
+from .sights import Sighting
+
+STEP_UM = 10**14
+"""Between floors laid out; poses are within ±10¹³ µm."""
+_FLOORS_A_ROW = 1024
+_THING = TypeVar("_THING", bound=tuple[object, ...] | str)
+
+
+def floor_name(envelope: Envelope, height_um: int) -> str | None:
+    """The floor of an envelope with a pose; None if the envelope has neither name nor height."""
+    if envelope.floor is not None:
+        return envelope.floor
+    if envelope.map_z is None:
+        return None
+    return str((2 * metres_to_um(envelope.map_z) + height_um) // (2 * height_um))
+
+
+def shift_um(ordinal: int) -> tuple[int, int]:
+    """The shift of the floor of this number, in x and y."""
+    return ordinal % _FLOORS_A_ROW * STEP_UM, ordinal // _FLOORS_A_ROW * STEP_UM
+
+
+def shift_of_sum(sum_x_um: int, sum_y_um: int, count: int) -> tuple[int, int]:
+    """The shift of the floor that ``count`` things are on, from the sums of their positions."""
+    step = STEP_UM * max(count, 1)
+    return (
+        (2 * sum_x_um + step) // (2 * step) * STEP_UM,
+        (2 * sum_y_um + step) // (2 * step) * STEP_UM,
+    )
+
+
+class Floors:
+    """The reducer. ``ordinals`` numbers the floors by their first pose, None for the one without a
+    name; ``names`` are in that order."""
+
+    def __init__(self, floor_height_m: float) -> None:
+        self._height_um = metres_to_um(floor_height_m)
+        self.ordinals: dict[str | None, int] = {}
+        self.names: list[str | None] = []
+        # The floor of each group of things joined by command, by kind and number of the group.
+        self._homes: dict[tuple[str, int], int] = {}
+
+    def enter(self, envelope: Envelope) -> tuple[str | None, int]:
+        """The floor of an envelope with a pose, and its number."""
+        name = floor_name(envelope, self._height_um)
+        if name not in self.ordinals:
+            self.ordinals[name] = len(self.names)
+            self.names.append(name)
+        return name, self.ordinals[name]
+
+    def number_at(self, x_um: int, y_um: int) -> int:
+        """The number of the floor of a laid out position."""
+        column, row = (x_um + STEP_UM // 2) // STEP_UM, (y_um + STEP_UM // 2) // STEP_UM
+        return row * _FLOORS_A_ROW + column
+
+    def keep_to_floor(self, groups: PairGroups[Any], thing: Any, kind: str, floor: int) -> None:
+        """Remove ``thing``, which is on this floor, from its group if that is on another one."""
+        group = groups.group_of.get(thing)
+        if group is not None and self._homes.setdefault((kind, group), floor) != floor:
+            del groups.group_of[thing]
+
+    def laid_out(self, pose: Pose, ordinal: int) -> Pose:
+        """The pose laid out, as reducers get it."""
+        dx, dy = shift_um(ordinal)
+        return Pose(pose.x_um + dx, pose.y_um + dy, pose.yaw_rad) if ordinal else pose
+
+    def sightings(self, sightings: list[Sighting], ordinal: int) -> list[Sighting]:
+        """The sightings with their stated positions laid out."""
+        if not ordinal:
+            return sightings
+        dx, dy = (each / 1e6 for each in shift_um(ordinal))
+        return [
+            seen
+            if seen.position is None
+            else seen._replace(
+                position=(seen.position[0] + dx, seen.position[1] + dy, seen.position[2])
+            )
+            for seen in sightings
+        ]
+
+    def put_back(self, deltas: list[Delta]) -> list[Delta]:
+        """The deltas with positions as they are on their floor."""
+        return [_put_back(delta) for delta in deltas] if len(self.ordinals) > 1 else deltas
+
+    def dump(self) -> State:
+        """The whole state, for a snapshot."""
+        homes = [[kind, group, floor] for (kind, group), floor in sorted(self._homes.items())]
+        return {"names": self.names, "homes": homes}
+
+    def load(self, state: State) -> None:
+        """Restore the state of `dump`; older snapshots have nothing, their maps one floor."""
+        self.names = list(state.get("names", [None]))
+        self.ordinals = {name: ordinal for ordinal, name in enumerate(self.names)}
+        self._homes = {(kind, group): floor for kind, group, floor in state.get("homes", ())}
+
+
+def _put_back(delta: Delta) -> Delta:
+    replace = msgspec.structs.replace
+    if isinstance(delta, PlaceChanged):
+        count = delta.keyframe_count
+        dx, dy = shift_of_sum(delta.sum_x_um, delta.sum_y_um, count)
+        if dx or dy:
+            x, y = delta.sum_x_um - count * dx, delta.sum_y_um - count * dy
+            return replace(delta, sum_x_um=x, sum_y_um=y)
+    elif isinstance(delta, ObjectSeen | ObjectsMerged):
+        count = delta.obs_count
+        dx, dy = shift_of_sum(delta.sum_x_um, delta.sum_y_um, count)
+        if dx or dy:
+            x, y = delta.sum_x_um - count * dx, delta.sum_y_um - count * dy
+            return replace(delta, sum_x_um=x, sum_y_um=y)
+    elif isinstance(delta, ObjectEstimated):
+        dx, dy = shift_of_sum(delta.x_um, delta.y_um, 1)
+        if dx or dy:
+            return replace(delta, x_um=delta.x_um - dx, y_um=delta.y_um - dy)
+    elif isinstance(delta, ObjectRelocated):
+        dx, dy = shift_of_sum(delta.to_x_um, delta.to_y_um, 1)
+        if dx or dy:
+            return replace(
+                delta,
+                from_x_um=delta.from_x_um - dx,
+                from_y_um=delta.from_y_um - dy,
+                to_x_um=delta.to_x_um - dx,
+                to_y_um=delta.to_y_um - dy,
+            )
+    return delta

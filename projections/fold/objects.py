@@ -1,0 +1,237 @@
+"""Repeated observations fused into Objects: the rule of `fusion = "page"`.
+
+The rules, for an observation of class C made from the pose (x, y):
+
+1.  Candidates are Objects of class C whose mean position is within ``fusion_radius_m`` of (x, y),
+    inclusive, and whose mean embedding has at least ``fusion_similarity`` cosine with the
+    observation's.
+2.  The highest cosine wins, compared as multiples of 2⁻⁴⁰; ties go to the Object founded first.
+3.  The winner's position and embedding become the means over all its observations; ``first_seen``
+    and ``last_seen`` span their timestamps. Without a candidate a new Object is founded.
+
+An Object's position is the mean of the *robot's* poses, for lack of depth.
+
+The mean embedding is never rounded to a unit vector: the sum S of the unit vectors has the mean's
+direction, so the cosine with u is S·u / (|S||u|). S, S·u, |S|² and |u|² are exact integers;
+|S + u|² = |S|² + 2 S·u + |u|² keeps the norm up to date without touching S again. S·u is at most
+count · 2⁴⁰; `projections.fold.exact` says how it is multiplied exactly, and its bound. A sum of
+zero, of opposite looks, has no direction; its cosine with anything is 0.
+
+Every Object is listed in the nine grid cells of side ``fusion_radius_m`` around its mean, so one
+look-up finds all candidates however large the map is.
+
+Under ``same-object`` and ``different-objects``, `projections.fold.constrained_objects` adds
+rules.
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope.model import DetId, Offset
+
+from . import State
+from .deltas import ObjectFound, ObjectOrdinal, ObjectSeen, ObservationOrdinal
+from .exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
+
+FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
+"""Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
+Bucket = tuple[str, int, int]
+"""Class name, column and row of a grid cell."""
+
+
+@dataclass(slots=True, eq=False)
+class ObjectSums:
+    """An Object's sums over its observations: of positions, µm, and of unit vectors, integers in
+    float64, shape (dim,). ``column`` and ``row`` are the grid cell of its mean position;
+    ``other_classes`` are the classes of members that a command joined to it."""
+
+    class_name: str
+    vector_sum: NDArray[np.float64]
+    norm2: int
+    count: int
+    sum_x_um: int
+    sum_y_um: int
+    first_seen: float
+    last_seen: float
+    column: int
+    row: int
+    other_classes: tuple[str, ...] = ()
+
+
+def object_id(det_id: DetId) -> str:
+    """The id of the Object that the observation ``det_id`` founds."""
+    return "obj-" + hashlib.sha256(det_id.encode()).hexdigest()[:16]
+
+
+class Objects:
+    """The reducer."""
+
+    def __init__(self, fusion_radius_m: float, fusion_similarity: float) -> None:
+        self._radius_um = max(metres_to_um(fusion_radius_m), 1)
+        self._least_q40 = fusion_similarity * Q40
+        self.sums: list[ObjectSums] = []  # by ordinal
+        self._near: dict[Bucket, list[ObjectOrdinal]] = {}
+
+    def fold(
+        self,
+        offset: Offset,
+        seen: FusibleObservation,
+        timestamp: float,
+        x_um: int,
+        y_um: int,
+        candidates: Sequence[ObjectOrdinal] | None = None,
+        otherwise: ObjectOrdinal | None = None,
+    ) -> list[ObjectFound | ObjectSeen]:
+        """Fuse one observation, seen from (x, y).
+
+        ``candidates`` are some of `candidates_at`, all by default; ``otherwise`` is the Object to
+        fuse with if none of them qualifies, a new one by default.
+        """
+        observation, det_id, class_name, vector, norm2 = seen
+        radius_um, objects = self._radius_um, self.sums
+        column, row = x_um // radius_um, y_um // radius_um
+        winner: ObjectOrdinal | None = None
+        best_q40, best_dot = -math.inf, 0
+        if candidates is None:
+            candidates = self._near.get((class_name, column, row), ())
+        for candidate in candidates:
+            sums = objects[candidate]
+            count = sums.count
+            dx = sums.sum_x_um - x_um * count
+            dy = sums.sum_y_um - y_um * count
+            if dx * dx + dy * dy > (radius_um * count) ** 2:
+                continue
+            if count <= MAX_IN_ONE_DOT:
+                dot = int(sums.vector_sum.dot(vector))
+            else:
+                dot = long_dot(sums.vector_sum, vector)
+            # Both conversions, √ and ÷ are correctly rounded.
+            q40 = round(dot / math.sqrt(sums.norm2 * norm2 or 1) * Q40)
+            if q40 > best_q40 or (q40 == best_q40 and winner is not None and candidate < winner):
+                winner, best_q40, best_dot = candidate, q40, dot
+        if winner is None or best_q40 < self._least_q40:
+            winner = otherwise
+            if winner is not None:
+                best_dot = long_dot(objects[winner].vector_sum, vector)
+                best_q40 = round(best_dot / math.sqrt(objects[winner].norm2 * norm2 or 1) * Q40)
+        if winner is None:
+            sums = ObjectSums(
+                class_name, vector.copy(), norm2, 1, x_um, y_um, timestamp, timestamp, column, row
+            )
+            return self._add_object(offset, observation, det_id, sums)
+        sums = objects[winner]
+        if sums.count >= MAX_IN_A_SUM:
+            raise OverflowError(
+                f"object {winner} of class {class_name!r} has {MAX_IN_A_SUM} observations, "
+                "the bound of its exact arithmetic"
+            )
+        sums.vector_sum += vector
+        sums.norm2 += 2 * best_dot + norm2
+        self._update(winner, sums, timestamp, x_um, y_um)
+        return [_object_seen(offset, winner, observation, int(best_q40), sums)]
+
+    def candidates_at(self, class_name: str, x_um: int, y_um: int) -> Sequence[ObjectOrdinal]:
+        """The Objects of a class whose mean position may be within the radius."""
+        radius_um = self._radius_um
+        return self._near.get((class_name, x_um // radius_um, y_um // radius_um), ())
+
+    def dump(self) -> State:
+        """The whole state, for a snapshot; the sums of vectors are one matrix, a row an Object."""
+        objects = self.sums
+        return {
+            "classes": [o.class_name for o in objects],
+            "vectors": np.array([o.vector_sum for o in objects]),
+            "norms2": [o.norm2 for o in objects],
+            "counts": [o.count for o in objects],
+            "sums_x_um": [o.sum_x_um for o in objects],
+            "sums_y_um": [o.sum_y_um for o in objects],
+            "seen": np.array([(o.first_seen, o.last_seen) for o in objects]).reshape(-1, 2),
+            "cells": [(o.column, o.row) for o in objects],
+        }
+
+    def load(self, state: State) -> None:
+        """Restore the state of `dump`."""
+        for index, (first, last) in enumerate(state["seen"].tolist()):
+            sums = ObjectSums(
+                state["classes"][index],
+                state["vectors"][index].copy(),
+                state["norms2"][index],
+                state["counts"][index],
+                state["sums_x_um"][index],
+                state["sums_y_um"][index],
+                first,
+                last,
+                *state["cells"][index],
+            )
+            self.sums.append(sums)
+            self._list(ObjectOrdinal(index), sums)
+
+    def _add_object(
+        self, offset: Offset, observation: ObservationOrdinal, det_id: DetId, sums: ObjectSums
+    ) -> list[ObjectFound | ObjectSeen]:
+        ordinal = ObjectOrdinal(len(self.sums))
+        self.sums.append(sums)
+        self._list(ordinal, sums)
+        found = ObjectFound(offset, ordinal, object_id(det_id), sums.class_name, observation)
+        return [found, _object_seen(offset, ordinal, observation, Q40, sums)]
+
+    def _update(
+        self, ordinal: ObjectOrdinal, sums: ObjectSums, timestamp: float, x_um: int, y_um: int
+    ) -> None:
+        sums.count += 1
+        sums.sum_x_um += x_um
+        sums.sum_y_um += y_um
+        if timestamp > sums.last_seen:
+            sums.last_seen = timestamp
+        elif timestamp < sums.first_seen:
+            sums.first_seen = timestamp
+        side = self._radius_um * sums.count
+        column, row = sums.sum_x_um // side, sums.sum_y_um // side
+        if (column, row) != (sums.column, sums.row):
+            self._unlist(ordinal, sums)
+            sums.column, sums.row = column, row
+            self._list(ordinal, sums)
+
+    def _list(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
+        """Enter it in the nine cells around its mean position."""
+        for bucket in _buckets(sums):
+            self._near.setdefault(bucket, []).append(ordinal)
+
+    def _unlist(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
+        for bucket in _buckets(sums):
+            self._near[bucket].remove(ordinal)
+
+
+def _buckets(sums: ObjectSums) -> list[Bucket]:
+    return [
+        (class_name, sums.column + dx, sums.row + dy)
+        for class_name in (sums.class_name, *sums.other_classes)
+        for dx in (-1, 0, 1)
+        for dy in (-1, 0, 1)
+    ]
+
+
+def _object_seen(
+    offset: Offset,
+    ordinal: ObjectOrdinal,
+    observation: ObservationOrdinal,
+    similarity_q40: int,
+    sums: ObjectSums,
+) -> ObjectSeen:
+    return ObjectSeen(
+        offset,
+        ordinal,
+        observation,
+        similarity_q40,
+        sums.count,
+        sums.sum_x_um,
+        sums.sum_y_um,
+        sums.first_seen,
+        sums.last_seen,
+    )

@@ -1,0 +1,138 @@
+"""The place that each keyframe joined, and each place's members: state that all rules of places
+share.
+
+Points are numbered by arrival among the keyframes that have a pose. Places only grow or merge. A
+place is named by the run of its founder and a counter of that run, and numbered in founding order;
+of places that merge the one founded first survives, whatever the text of its id.
+"""
+
+from bisect import bisect_left
+from collections.abc import MutableSequence
+from typing import NamedTuple
+
+import numpy as np
+
+from eventsrc.envelope.model import Offset, RunId
+
+from . import State, packed
+from .deltas import KeyframeOrdinal, PlaceChanged, PlaceFormed, PlaceOrdinal, RunOrdinal
+from .survivors import PlaceSurvivors
+
+NOISE = PlaceOrdinal(-1)
+"""The value for a point in no place, in the packed array of places."""
+
+
+class PosedKeyframe(NamedTuple):
+    """A keyframe with a pose, the input of the reducers of places; ``offset`` is its event."""
+
+    offset: Offset
+    keyframe: KeyframeOrdinal
+    run: RunOrdinal
+    run_id: RunId
+    x_um: int
+    y_um: int
+
+
+class PlaceMembers:
+    """The state that rules of places share, and the operations on it."""
+
+    def __init__(self) -> None:
+        # Per point: the place it joined, as of then; its keyframe; its run.
+        self.joined: MutableSequence[PlaceOrdinal] = packed("i")
+        self.keyframes: MutableSequence[KeyframeOrdinal] = packed("i")
+        self.runs: MutableSequence[RunOrdinal] = packed("i")
+        # Per run: its id, and how many places it has founded.
+        self.run_ids: dict[RunOrdinal, RunId] = {}
+        self.founded: dict[RunOrdinal, int] = {}
+        self.survivors = PlaceSurvivors()
+        # Per place, of its current members:
+        self.member_counts: list[int] = []
+        self.sums_x_um: list[int] = []
+        self.sums_y_um: list[int] = []
+
+    def add_point(self, keyframe: KeyframeOrdinal, run: RunOrdinal, run_id: RunId) -> int:
+        """Add a keyframe with a pose, in no place yet, and return its point."""
+        self.joined.append(NOISE)
+        self.keyframes.append(keyframe)
+        self.runs.append(run)
+        self.run_ids[run] = run_id
+        return len(self.joined) - 1
+
+    def label(self, point: int) -> PlaceOrdinal | None:
+        """The point's current place; None for noise."""
+        joined = self.joined[point]
+        return None if joined == NOISE else self.survivors.find(joined)
+
+    def place_of(self, keyframe: KeyframeOrdinal) -> PlaceOrdinal | None:
+        """A keyframe's current place; None for noise, or without a pose."""
+        point = self.point_of(keyframe)
+        is_there = point < len(self.keyframes) and self.keyframes[point] == keyframe
+        return self.label(point) if is_there else None
+
+    def point_of(self, keyframe: KeyframeOrdinal) -> int:
+        """A keyframe's point; for one without a pose the point of the next."""
+        return bisect_left(self.keyframes, keyframe)
+
+    def form_place(self, offset: Offset, founder: int) -> PlaceFormed:
+        """Add a place without members, founded by a point."""
+        place, run = PlaceOrdinal(len(self.member_counts)), self.runs[founder]
+        counter = self.founded.get(run, 0)
+        self.founded[run] = counter + 1
+        self.member_counts.append(0)
+        self.sums_x_um.append(0)
+        self.sums_y_um.append(0)
+        place_id = f"{self.run_ids[run]}_p{counter}"
+        return PlaceFormed(offset, place, place_id, self.keyframes[founder])
+
+    def join_place(self, point: int, place: PlaceOrdinal, x_um: int, y_um: int) -> None:
+        """Add a point at (x, y) to a place."""
+        self.joined[point] = place
+        self.member_counts[place] += 1
+        self.sums_x_um[place] += x_um
+        self.sums_y_um[place] += y_um
+
+    def absorb(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
+        """Move the members of ``absorbed`` to ``survivor``."""
+        self.survivors.merge(survivor, absorbed)
+        for place in absorbed:
+            self.member_counts[survivor] += self.member_counts[place]
+            self.sums_x_um[survivor] += self.sums_x_um[place]
+            self.sums_y_um[survivor] += self.sums_y_um[place]
+
+    def place_changed(self, offset: Offset, place: PlaceOrdinal) -> PlaceChanged:
+        """The delta with the current size and sums of a place."""
+        return PlaceChanged(
+            offset,
+            place,
+            self.member_counts[place],
+            self.sums_x_um[place],
+            self.sums_y_um[place],
+        )
+
+    def dump(self) -> State:
+        """The whole state, for a snapshot."""
+        absorbed_by, places = self.survivors.absorbed_by, range(len(self.member_counts))
+        return {
+            "joined": np.array(self.joined, np.int32),
+            "keyframes": np.array(self.keyframes, np.int32),
+            "runs": np.array(self.runs, np.int32),
+            "run_ids": [[run, run_id] for run, run_id in self.run_ids.items()],
+            "founded": [[run, count] for run, count in self.founded.items()],
+            "survivors": [absorbed_by.get(PlaceOrdinal(p), p) for p in places],
+            "member_counts": self.member_counts,
+            "sums_x_um": self.sums_x_um,
+            "sums_y_um": self.sums_y_um,
+        }
+
+    def load(self, state: State) -> None:
+        """Restore the state of `dump`."""
+        self.joined = packed("i", state["joined"].tobytes())
+        self.keyframes = packed("i", state["keyframes"].tobytes())
+        self.runs = packed("i", state["runs"].tobytes())
+        self.run_ids = dict(state["run_ids"])
+        self.founded = dict(state["founded"])
+        parents = enumerate(state["survivors"])
+        self.survivors.absorbed_by = {PlaceOrdinal(p): s for p, s in parents if p != s}
+        self.member_counts = state["member_counts"]
+        self.sums_x_um = state["sums_x_um"]
+        self.sums_y_um = state["sums_y_um"]

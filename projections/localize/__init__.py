@@ -1,0 +1,1 @@
+"""Where a robot is: re-localisation, its evaluation, and the constants of a map."""

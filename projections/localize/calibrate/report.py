@@ -1,0 +1,245 @@
+"""A calibration as text and as JSON: the constants, and re-localisation's scores on the map's own
+questions."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+from eventsrc.base.text import counted, table, visible
+from projections.localize.evaluate.own_scores import own_scores
+from projections.localize.relocalize import UNKNOWN_BELOW
+
+from .localiser import CROPS, OwnScores
+from .looks import FEWEST_DIFFERENT
+from .rounds import Calibration
+from .shrinking import Reading
+
+_MOST_SIZES = 8
+_RESTS_ON = {
+    "bearing_rad": "observation",
+    "bearing_cut_rad": "cut observation",
+    "size_spread": "thing",
+    "different": "pair",
+    "different_spread": "pair",
+    "same_class": "pair",
+    "same_class_spread": "pair",
+    "session_shift": "observation",
+}
+_SIZE = "sizes_m."
+_EDGES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_DECIMALS = 6
+FEW = 20
+"""The number of known questions below which the figures are unreliable."""
+
+
+def readings(calibration: Calibration) -> list[Reading]:
+    """All constants, in the order of `EvidenceConstants`, a class's size each by itself."""
+    return [*calibration.last.readings, *calibration.last.sizes]
+
+
+def document(calibration: Calibration) -> dict[str, Any]:
+    """JSON. ``name`` is what ``--set`` takes."""
+    last = calibration.last
+    return {
+        "keyframes": calibration.keyframes,
+        "observations": calibration.observations,
+        "objects": calibration.objects,
+        "runs": calibration.runs,
+        "things": last.things,
+        "observations_of_things": last.observations,
+        "fusion": calibration.settings.fusion,
+        "constants": [
+            {
+                "name": f"evidence.{each.name}",
+                "value": each.value,
+                "prior": each.prior,
+                "seen": each.seen,
+                "count": each.count,
+            }
+            for each in readings(calibration)
+        ],
+        "localiser": localiser_document(calibration.own),
+        "hints": list(hints(calibration)),
+    }
+
+
+def text(calibration: Calibration, *, all_: bool = False) -> str:
+    """A line on what it rests on, a table of the constants, and the hints."""
+    last = calibration.last
+    rests_on = (
+        f"{counted(calibration.keyframes, 'keyframe')} with a pose, "
+        f"{counted(calibration.observations, 'observation')} of "
+        f"{counted(calibration.objects, 'object')} in {counted(calibration.runs, 'run')}; "
+        f"{counted(last.things, 'thing')} with bearings that cross well, seen "
+        f"{last.observations:,} times"
+    )
+    rows = [_row(each) for each in last.readings]
+    sizes = sorted(last.sizes, key=lambda each: (-each.count, each.name))
+    shown = sizes if all_ else sizes[:_MOST_SIZES]
+    rows += [_row(each) for each in shown]
+    lines = [rests_on]
+    lines += table(
+        ("evidence.", "value", "prior", "this map", "rests on"),
+        rows,
+        right=("value", "prior", "this map"),
+    ).splitlines()
+    if len(shown) < len(sizes):
+        lines.append(f"… and the sizes of {len(sizes) - len(shown):,} more (--all shows them)")
+    lines += localiser_text(calibration.own).splitlines()
+    return "".join(f"{line}\n" for line in [*lines, *hints(calibration)])
+
+
+def _row(reading: Reading) -> tuple[str, ...]:
+    rests = _RESTS_ON.get(reading.name, "observation")
+    if reading.name.startswith(_SIZE):
+        rests = "whole box"
+    counts = f"{reading.count:,} {rests}{'' if reading.count == 1 else _plural(rests)}"
+    return (
+        visible(reading.name),
+        _number(reading.value),
+        _number(reading.prior),
+        _number(reading.seen),
+        counts,
+    )
+
+
+def _plural(word: str) -> str:
+    return "es" if word.endswith("x") else "s"
+
+
+def _number(value: float | str | None) -> str:
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def hints(calibration: Calibration) -> Iterator[str]:
+    """Obstacles to a better calibration, with the next step where there is one."""
+    last, camera = calibration.last, calibration.settings.camera
+    if not calibration.observations:
+        yield "no observation has a pose and an embedding: all constants are priors"
+        return
+    if calibration.unboxed:
+        yield (
+            f"{counted(calibration.unboxed, 'observation')} with an empty box: nothing is known of"
+            " their direction"
+        )
+    if not last.things:
+        yield (
+            "nothing was seen three times from spots 0.8 m apart with bearings that cross: ranges,"
+            " errors, sizes and the likeness of one thing are priors"
+        )
+    elif calibration.runs == 1:
+        yield "one run: session_shift, the loss of likeness between runs, is a prior"
+    pairs = next(each.count for each in last.readings if each.name == "different")
+    if pairs < FEWEST_DIFFERENT:
+        yield (
+            f"{counted(pairs, 'pair')} of different classes in one picture, fewer than"
+            f" {FEWEST_DIFFERENT}: `different` stays unset, so the fold measures it on the pictures"
+        )
+    if calibration.beyond:
+        boxes = f"{calibration.beyond:,} box{'' if calibration.beyond == 1 else 'es'}"
+        yield (
+            f"{boxes} beyond the picture of {camera.width_px:g} × {camera.height_px:g} pixels: give"
+            " the camera, --set camera.width_px=… --set camera.height_px=… --set camera.hfov_deg=…"
+        )
+    for fault in last.camera:
+        yield _camera_hint(fault, camera.hfov_deg)
+    if calibration.settings.fusion != "evidence":
+        yield (
+            "the map is folded with fusion=page, so its objects do not depend on these, only"
+            " re-localisation does; --set fusion=evidence --write switches the log to fusion by"
+            " evidence"
+        )
+
+
+def _camera_hint(fault: Reading, hfov_deg: float) -> str:
+    value = fault.value if isinstance(fault.value, float) else 0.0
+    if fault.name == "yaw_rad":
+        return (
+            f"bearings are off by {value:+.3g} rad on the whole: the camera may be turned; compare"
+            " camera.yaw_rad"
+        )
+    which = "too wide" if value > 0 else "too narrow"
+    return (
+        f"bearings are off by {abs(value):.0%} of the angle from the picture's middle: "
+        f"camera.hfov_deg={hfov_deg:g} seems {which}"
+    )
+
+
+def localiser_document(own: OwnScores) -> dict[str, Any]:
+    """JSON: scores on the map's own questions with the correction, by number of crops, and the
+    correction as it is set.
+
+    Scores have six decimals; beyond, machines may differ in the errors and in `confidence`.
+    """
+    constants = own.constants.model_dump(exclude={"text_shift"})
+    return {
+        "questions": {str(crops): _rounded(_scores(own, crops)) for crops in CROPS},
+        "constants": {f"localizer.{name}": value for name, value in constants.items()},
+    }
+
+
+def localiser_text(own: OwnScores) -> str:
+    """Two tables: errors and shares, and the share of right answers by stated probability."""
+    if not own.answers:
+        return "re-localisation: no keyframe to ask from\n"
+    rows = [
+        (
+            counted(crops, "crop"),
+            str(scores["questions"] // 2),
+            str(scores["known"]),
+            _two_decimals(scores["pose_error_m"]["p50"]),
+            _two_decimals(scores["pose_error_m"]["p90"]),
+            _two_decimals(scores["plain"]["pose_error_m"]["p50"]),
+            _two_decimals(scores["within_1_5_m"]),
+            _two_decimals(scores["known_called_unknown"]),
+            _two_decimals(scores["taken_out_called_known"]),
+        )
+        for crops in CROPS
+        if (scores := _scores(own, crops))["questions"]
+    ]
+    header = (
+        "re-localisation", "asked", "known", "p50 m", "p90 m", "plain p50", "within 1.5 m",
+        "called unknown", "taken out, called known",
+    )  # fmt: skip
+    bins = [f"said {low:g} to {high:g}" for low, high in pairwise(_EDGES)]
+    known = ("known", *_right([(own.known(a), a.known) for a in own.answers]))
+    sure = ("confidence", *_right([(own.confidence(a), a.correct) for a in own.answers]))
+    tables = table(header, rows, right=header[1:])
+    tables += table(("right, of how many", *bins), [known, sure], right=bins)
+    count = sum(answer.known for answer in own.answers)
+    if count < FEW:
+        seen = "question" if count == 1 else "questions"
+        tables += (
+            f"{count} {seen} about what was seen at another time: too few for reliable figures, so"
+            " re-localisation is hardly corrected\n"
+        )
+    return tables
+
+
+def _scores(own: OwnScores, crops: int) -> dict[str, Any]:
+    answers = [each for each in own.answers if each.crops == crops]
+    return own_scores(answers, own.known, own.confidence, UNKNOWN_BELOW)
+
+
+def _rounded(value: Any) -> Any:
+    """A JSON value, its numbers rounded to `_DECIMALS`."""
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    return round(value, _DECIMALS) if isinstance(value, float) else value
+
+
+def _right(said: Sequence[tuple[float, bool]]) -> list[str]:
+    """For each bin the share of right answers, and their number."""
+    cells = []
+    for low, high in pairwise(_EDGES):
+        right = [each for p, each in said if low <= p < high or p == high == 1.0]
+        cells.append(f"{sum(right) / len(right):.2f} of {len(right)}" if right else "-")
+    return cells
+
+
+def _two_decimals(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

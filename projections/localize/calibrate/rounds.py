@@ -1,0 +1,222 @@
+"""A calibration: fold the log by evidence, read the constants, fold with them, read again.
+
+The first fold uses the priors, and both readings are drawn towards them, never towards constants
+read before: each observation counts once, and a calibrated map gives the same constants again. Then
+the map as its settings make it, with the constants read, is asked its own questions (`localiser`).
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import FIRST_OFFSET, Envelope, Offset
+from eventsrc.log import LogReader
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.deltas import Delta, KeyframeAdded, KeyframeOrdinal
+from projections.fold.envelope_evidence import camera_of
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import Camera, LocalizerConstants, Settings
+from projections.map.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+
+from .geometry import camera_faults, errors, ranges, sizes
+from .localiser import NOT_ASKED, OwnScores, read_localiser
+from .looks import different, in_pictures, of_things, same, scale
+from .shrinking import Reading, unread
+from .sightings import Row, Sightings, sightings_of
+from .things import qualified
+
+ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """The result of one round: the constants with their evidence, and the numbers of qualified
+    things and observations. ``camera`` are significant faults of the camera."""
+
+    constants: EvidenceConstants
+    readings: tuple[Reading, ...]
+    sizes: tuple[Reading, ...]
+    things: int
+    observations: int
+    camera: tuple[Reading, ...]
+
+
+def read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
+    """Estimate the constants from a map that was folded with ``used``, drawn towards ``prior``."""
+    with np.errstate(all="ignore"):  # a value that is not finite is replaced by the prior
+        return _read(seen, used, prior)
+
+
+def _read(seen: Sightings, used: EvidenceConstants, prior: EvidenceConstants) -> Round:
+    things = qualified(seen, used.bearing_rad, used.bearing_cut_rad, used.pose_m)
+    found: list[Reading] = [*ranges(things, prior), *errors(things, seen, prior)]
+    by_class, about = sizes(things, seen, prior)
+    found.append(about)
+    cosines, same_class = in_pictures(seen)
+    scaled_by = scale(cosines, same_class)
+    found.append(scaled_by)
+    zero = scaled_by.value if isinstance(scaled_by.value, float) else prior.different
+    if zero is None:
+        names = (
+            "different_spread", "same_class", "same_class_spread", "same_back", "same_side",
+            "same_kappa", "same_spread", "side_by", "session_shift",
+        )  # fmt: skip
+        found += [unread(name, getattr(prior, name)) for name in names]
+    else:
+        found += different((cosines - zero) / (1.0 - zero), same_class, prior)
+        found += same(of_things(seen, things, zero), prior).values()
+    found = [_bounded(reading) for reading in found]
+    by_class = {name: _bounded(reading, "sizes_m") for name, reading in by_class.items()}
+    values: dict[str, Any] = {reading.name: reading.value for reading in found}
+    values["sizes_m"] = {name: reading.value for name, reading in by_class.items()}
+    return Round(
+        EvidenceConstants(**values),
+        tuple(found),
+        tuple(by_class.values()),
+        len(things),
+        sum(len(thing.rows) for thing in things),
+        tuple(camera_faults(things, seen)),
+    )
+
+
+def _bounded(reading: Reading, group: str | None = None) -> Reading:
+    """The reading with its value limited to what the settings allow."""
+    if not isinstance(reading.value, float):
+        return reading
+    least, most = _bounds(group or reading.name)
+    return replace(reading, value=min(max(reading.value, least), most))
+
+
+_FIELDS: dict[str, Any] = EvidenceConstants.model_json_schema()["properties"]
+
+
+def _bounds(name: str) -> tuple[float, float]:
+    """The least and the greatest value of a constant; of each entry's value where it is a table."""
+    (rule,) = _FIELDS[name].get("patternProperties", {name: _FIELDS[name]}).values()
+    return rule.get("minimum", -math.inf), rule.get("maximum", math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """The calibration of a log. ``settings`` are those that it was calibrated under; `calibrated`
+    are the same with its constants. Counts are of the last fold: keyframes with a pose,
+    observations that were fused, Objects, runs. ``unboxed`` observations have an empty box;
+    ``beyond`` boxes reach beyond the picture. ``own`` are the results of its own questions."""
+
+    settings: Settings
+    last: Round
+    runs: int
+    keyframes: int
+    observations: int
+    objects: int
+    unboxed: int
+    beyond: int
+    own: OwnScores
+
+    @property
+    def calibrated(self) -> Settings:
+        """The settings with the constants that were read."""
+        text_shift = self.settings.localizer.text_shift
+        localizer = self.own.constants.model_copy(update={"text_shift": text_shift})
+        changed = {"evidence": self.last.constants, "localizer": localizer}
+        return self.settings.model_copy(update=changed)
+
+
+Cameras = dict[KeyframeOrdinal, Camera]
+"""The cameras of keyframes whose envelopes state one."""
+Fold = Callable[[Settings], tuple[MapView, Cameras]]
+"""A function that folds a log under settings; the view has the embeddings."""
+
+
+def calibrate(
+    reader: LogReader,
+    settings: Settings,
+    corrections: Corrections = NO_CORRECTIONS,
+    until: Offset | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Calibration:
+    """Calibrate the map of a log's first ``until`` events, all of them for None; folded by
+    evidence whatever rule the settings name. ``progress`` is called with the number of events
+    folded and the number to fold, both over all rounds. Raises FoldError, LogDamaged."""
+    end = reader.next_offset if until is None else min(until, reader.next_offset)
+    before = 0
+
+    def fold(used: Settings) -> tuple[MapView, Cameras]:
+        nonlocal before
+        semantic_map = new_map(reader, used, corrections)
+        view, cameras = MapView(used, corrections=corrections), Cameras()
+        coming = iter(reader.read(FIRST_OFFSET, end))
+        with gc_paused():
+            while chunk := list(islice(coming, READ_AHEAD)):
+                for event in parse_events(chunk):
+                    deltas = fold_parsed(event, semantic_map)
+                    view.apply_event(event.offset, deltas)
+                    if isinstance(event.parsed, Accepted):
+                        note_camera(cameras, event.parsed.envelope, deltas, used.camera)
+                progress(before + view.next_offset, (ROUNDS + 1) * end)
+        before += end
+        return view, cameras
+
+    return calibrate_by(fold, settings)
+
+
+def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibration:
+    """Calibrate what ``fold`` folds, in rounds. Without ``ask`` the map is asked nothing, and
+    re-localisation keeps its defaults."""
+    constants = prior = EvidenceConstants()
+    for _ in range(ROUNDS):
+        view, cameras = fold(
+            settings.model_copy(update={"fusion": "evidence", "evidence": constants})
+        )
+        seen = sightings_of(_rows(view, cameras, settings.camera))
+        last = read(seen, constants, prior)
+        constants = last.constants
+    plain = LocalizerConstants(text_shift=settings.localizer.text_shift)
+    changed = {"evidence": constants, "localizer": plain}
+    own = read_localiser(fold(settings.model_copy(update=changed))[0]) if ask else NOT_ASKED
+    return Calibration(
+        settings,
+        last,
+        runs=len(view.runs),
+        keyframes=sum(keyframe.pose is not None for keyframe in view.keyframes),
+        observations=len(seen),
+        objects=len(view.objects),
+        unboxed=int((~seen.boxed).sum()),
+        beyond=seen.beyond,
+        own=own,
+    )
+
+
+def note_camera(
+    cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta], default: Camera
+) -> None:
+    """Keep the camera that an envelope states, if ``deltas`` are those of a new keyframe."""
+    if envelope.camera is None:
+        return
+    for delta in deltas:
+        if isinstance(delta, KeyframeAdded):
+            cameras[delta.keyframe] = camera_of(envelope, default)
+
+
+def _rows(view: MapView, cameras: Cameras, default: Camera) -> Iterator[Row]:
+    for observation in view.observations:
+        keyframe = view.keyframes[observation.keyframe]
+        if observation.object is None or keyframe.pose is None or observation.embedding is None:
+            continue
+        yield Row(
+            picture=keyframe.ordinal,
+            run=keyframe.run,
+            pose=keyframe.pose,
+            camera=cameras.get(keyframe.ordinal, default),
+            class_name=observation.class_name,
+            bbox=observation.bbox,
+            look=observation.embedding,
+            thing=observation.object,
+        )

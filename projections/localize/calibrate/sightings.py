@@ -1,0 +1,119 @@
+"""The observations of a folded map as columns: pose, direction, class, box and look of each.
+
+All constants are estimated from `Sightings`. Cosines of looks are exact: unit vectors are whole
+multiples of 2⁻²⁰ (`projections.fold.exact`), so a product of two does not depend on the machine.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from projections.fold.deltas import Pose, UnitVector
+from projections.fold.exact import Q40
+from projections.fold.settings import Camera
+from projections.localize.relocalize import camera as pinhole
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+_BEYOND_PX = 2.0
+"""Most pixels that a box may reach beyond the picture; more means another camera."""
+
+
+class Row(NamedTuple):
+    """One observation that was fused. ``picture`` and ``run`` are numbers of keyframe
+    and run, ``thing`` that of the Object it was fused into."""
+
+    picture: int
+    run: int
+    pose: Pose
+    camera: Camera
+    class_name: str
+    bbox: tuple[float, float, float, float]
+    look: UnitVector
+    thing: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sightings:
+    """Columns of equal length, one entry an observation, in the order of the fold.
+
+    ``sight`` is the direction from the robot to the thing in the map frame, ``off_axis`` its angle
+    from the picture's axis, left positive, radians. ``height`` is the box's height divided by the
+    focal length, NaN where the picture's border cuts it at top or bottom. ``boxed`` is False where
+    the box is empty: nothing is known of its direction then. ``beyond`` counts the boxes that reach
+    beyond the picture.
+    """
+
+    picture: Ints
+    run: Ints
+    x: Floats
+    y: Floats
+    heading: Floats
+    sight: Floats
+    off_axis: Floats
+    cut: Flags
+    height: Floats
+    boxed: Flags
+    classes: Sequence[str]
+    thing: Ints
+    looks: Sequence[UnitVector]
+    beyond: int
+
+    def __len__(self) -> int:
+        return len(self.picture)
+
+    def cosines(self, a: Ints, b: Ints) -> Floats:
+        """The cosine of each pair of observations."""
+        found = np.empty(len(a))
+        for start in range(0, len(a), _PAIRS_AT_ONCE):
+            part = slice(start, start + _PAIRS_AT_ONCE)
+            left = np.array([self.looks[i] for i in a[part]], dtype=np.float64)
+            right = np.array([self.looks[i] for i in b[part]], dtype=np.float64)
+            found[part] = np.einsum("ij,ij->i", left, right) / Q40
+        return found
+
+
+_PAIRS_AT_ONCE = 4096
+
+
+def sightings_of(rows: Iterable[Row]) -> Sightings:
+    """The columns of observations."""
+    rows = list(rows)
+    n = len(rows)
+    off_axis, height = np.zeros(n), np.full(n, np.nan)
+    cut, boxed = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    mounted, beyond = np.zeros(n), 0
+    by_camera: dict[Camera, list[int]] = {}
+    for i, row in enumerate(rows):
+        by_camera.setdefault(row.camera, []).append(i)
+    for camera, of in by_camera.items():
+        lens = pinhole.Camera(camera.width_px, camera.height_px, camera.hfov_deg)
+        read = pinhole.views(lens, pinhole.box_rows([rows[i].bbox for i in of]))
+        off_axis[of], cut[of], boxed[of] = np.arctan(read.slope), read.cut_x, read.known
+        whole = read.known & ~read.cut_y
+        height[of] = np.where(whole, read.height_px / lens.focal_px, np.nan)
+        mounted[of] = camera.yaw_rad
+        boxes = np.array([rows[i].bbox for i in of])
+        over = boxes - [0.0, 0.0, camera.width_px, camera.height_px]
+        beyond += int(((over[:, :2] < -_BEYOND_PX) | (over[:, 2:] > _BEYOND_PX)).any(axis=1).sum())
+    heading = np.array([row.pose.yaw_rad for row in rows], dtype=np.float64)
+    return Sightings(
+        picture=np.array([row.picture for row in rows], dtype=np.int64),
+        run=np.array([row.run for row in rows], dtype=np.int64),
+        x=np.array([row.pose.x_m for row in rows], dtype=np.float64),
+        y=np.array([row.pose.y_m for row in rows], dtype=np.float64),
+        heading=heading,
+        sight=heading + mounted + off_axis,
+        off_axis=off_axis,
+        cut=cut,
+        height=height,
+        boxed=boxed,
+        classes=[row.class_name for row in rows],
+        thing=np.array([row.thing for row in rows], dtype=np.int64),
+        looks=[row.look for row in rows],
+        beyond=beyond,
+    )

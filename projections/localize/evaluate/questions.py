@@ -1,0 +1,209 @@
+"""Questions for the evaluation, one from each query keyframe with enough crops; repeatable.
+
+Which crops of a keyframe are asked with is drawn by hashing ``seed`` and each det_id; the one-crop
+question's crop is among the two-crop question's, and so on. The truth only scores the answer.
+
+A question of several views has the keyframe and those before it in its run, and how the robot moved
+between them by the poses that it reported.
+"""
+
+import hashlib
+import math
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.log import LogReader
+from eventsrc.log.reader import OnGap
+from projections.fold.embedding_space import Reembedded
+from projections.fold.exact import quantise, to_float32
+from projections.fold.settings import Settings
+from projections.localize import relocalize
+from projections.localize.relocalize import Crop, View
+from projections.map.log_commands import read_corrections
+from projections.map.space_vectors import vectors_of
+
+from .truth import Key, Truth
+
+DEFAULT_SEED = 20260321
+
+
+T = TypeVar("T")
+VIEW_CROPS = 3
+"""The most crops of a view."""
+_NEAR_BY = 4
+"""The views of a question are among its last keyframes, this number times the number of views."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question with its true pose, room and instances; pose, room and key are those of the last
+    view."""
+
+    key: Key
+    asked: relocalize.Question
+    x: float
+    y: float
+    yaw: float
+    room: str | None
+    instances: tuple[str | None, ...]
+
+    @property
+    def crops(self) -> tuple[Crop, ...]:
+        """The crops of all views."""
+        return self.asked.crops
+
+
+def read_keyframes(
+    logs: Iterable[Path], settings: Settings | None = None, on_gap: OnGap | None = None
+) -> Iterator[Accepted]:
+    """Every valid keyframe of the logs with a pose, each (run, keyframe) once; where the settings
+    name a space, with the vectors of that space alone, also those given later. Raises LogDamaged,
+    or calls ``on_gap``, for damage."""
+    model = None if settings is None else settings.embedding_model
+    seen: set[Key] = set()
+    for log in logs:
+        with LogReader(log) as reader:
+            later = None
+            if settings is not None and model is not None:
+                later = vectors_of(reader, settings, read_corrections(reader))
+            for event in reader.read(on_gap=on_gap):
+                if not event.is_envelope:
+                    continue
+                found = ingest(event.payload, max_bytes=sys.maxsize)
+                if not isinstance(found, Accepted) or found.envelope.map_x is None:
+                    continue
+                key = (found.envelope.run_id, found.envelope.keyframe_id)
+                if key not in seen:
+                    seen.add(key)
+                    yield found if model is None else _in_space(found, model, later)
+
+
+def _in_space(keyframe: Accepted, model: str, later: Reembedded | None) -> Accepted:
+    """A keyframe with the vectors of one model, and those of ``later``."""
+    if later is not None:
+        keyframe, _ = later.applied(keyframe, [None] * len(keyframe.vectors))
+    detections = keyframe.envelope.detections
+    vectors = tuple(
+        vector if detection.embedding_model == model else None
+        for detection, vector in zip(detections, keyframe.vectors, strict=True)
+    )
+    return Accepted(keyframe.envelope, keyframe.det_ids, vectors)
+
+
+def make_questions(
+    keyframes: Iterable[Accepted], truth: Truth, crops: int, seed: int = DEFAULT_SEED
+) -> list[Question]:
+    """One question of ``crops`` crops from each keyframe that has truth and as many embeddings."""
+    found = []
+    for keyframe in keyframes:
+        drawn = _draw(keyframe, crops, seed)
+        if _key(keyframe) in truth.keyframes and len(drawn) == crops:
+            found.append(_question([(keyframe, drawn)], truth))
+    return found
+
+
+def make_view_questions(
+    keyframes: Iterable[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
+) -> list[Question]:
+    """One question from each keyframe that has truth and an embedding: it and the keyframes before
+    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each.
+
+    None from one before which there are too few within 4 · ``views`` keyframes of its run.
+    """
+    found: list[Question] = []
+    recent: deque[tuple[int, Accepted, list[int]]] = deque(maxlen=views)
+    for number, keyframe in enumerate(keyframes):
+        if recent and recent[-1][1].envelope.run_id != keyframe.envelope.run_id:
+            recent.clear()
+        drawn = _draw(keyframe, VIEW_CROPS, seed)
+        if not drawn or _key(keyframe) not in truth.keyframes:
+            continue
+        recent.append((number, keyframe, drawn))
+        if len(recent) == views and number - recent[0][0] < _NEAR_BY * views:
+            found.append(_question([(each, crops) for _, each, crops in recent], truth))
+    return found
+
+
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """``most`` of the items, evenly; all if there are no more."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i * len(items) // most] for i in range(most)]
+
+
+def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
+    """Raise MisuseError when no keyframe of the query logs has truth: nothing could be scored."""
+    runs = set()
+    for keyframe in keyframes:
+        runs.add(keyframe.envelope.run_id)
+        if (keyframe.envelope.run_id, keyframe.envelope.keyframe_id) in truth.keyframes:
+            return
+    raise MisuseError(
+        f"no truth for any query keyframe of {', '.join(sorted(runs)) or 'any run'}; give the"
+        " runs' truth files with --truth"
+    )
+
+
+def _key(keyframe: Accepted) -> Key:
+    return keyframe.envelope.run_id, keyframe.envelope.keyframe_id
+
+
+def _draw(keyframe: Accepted, most: int, seed: int) -> list[int]:
+    """Up to ``most`` of the detections that have an embedding."""
+    usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
+    return sorted(usable, key=lambda i: draw_key(seed, keyframe.det_ids[i]))[:most]
+
+
+def draw_key(seed: int, det_id: str) -> bytes:
+    """A key that orders the crops of a keyframe; questions have the first ones."""
+    return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
+
+
+def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> Question:
+    views = []
+    before = drawn[0][0]
+    for keyframe, indices in drawn:
+        crops = tuple(_crop(keyframe, index) for index in indices)
+        views.append(View(*_moved(_pose(before), _pose(keyframe)), crops))
+        before = keyframe
+    key = _key(before)
+    return Question(
+        key,
+        relocalize.Question(tuple(views)),
+        *_pose(before),
+        truth.room(key),
+        tuple(truth.instance(_key(k), index) for k, indices in drawn for index in indices),
+    )
+
+
+def _pose(keyframe: Accepted) -> tuple[float, float, float]:
+    envelope = keyframe.envelope
+    return envelope.map_x or 0.0, envelope.map_y or 0.0, envelope.map_yaw or 0.0
+
+
+def _moved(
+    before: tuple[float, float, float], after: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Metres ahead and to the left, and radians to the left, in the frame of the first pose."""
+    dx, dy, yaw = after[0] - before[0], after[1] - before[1], before[2]
+    turned = math.remainder(after[2] - yaw, math.tau)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return cos * dx + sin * dy, cos * dy - sin * dx, turned
+
+
+def _crop(keyframe: Accepted, index: int) -> Crop:
+    detection, vector = keyframe.envelope.detections[index], keyframe.vectors[index]
+    assert vector is not None  # noqa: S101 - drawn among those that have one
+    return Crop(
+        to_float32(quantise(vector)),
+        detection.bbox,
+        detection.class_name,
+        keyframe.det_ids[index],
+        detection.embedding_model,
+    )

@@ -1,0 +1,185 @@
+"""The evaluation: fold the map's log, ask questions from the query logs, score everything.
+
+Accuracy and errors are over *known* questions (some true instance of theirs is in the map), errors
+over those that have a pose. ``auroc`` is that of `known` between known and unknown questions.
+Calibration counts all questions: an answer is right when the question is known and the pose is
+within 1.5 m of the truth. ``plain`` and ``best_cosine`` are simple baselines (`baselines`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+from eventsrc.log import LogReader
+from eventsrc.log.seek import Note, resolve
+from projections.fold.corrections import Corrections
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Camera, Method
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.parsed_log import default_workers
+from projections.map.view import MapView
+
+from .own_questions import ask_own_questions
+from .own_scores import own_scores
+from .questions import (
+    DEFAULT_SEED,
+    check_truth,
+    make_questions,
+    make_view_questions,
+    read_keyframes,
+    spread,
+)
+from .scores import (
+    auroc,
+    calibration_floor,
+    expected_calibration_error,
+    object_scores,
+    percentile,
+    place_scores,
+    reliability,
+)
+from .trials import RIGHT_WITHIN_M, RoomIndex, Trial, TrialRunner
+from .truth import Truth
+
+CROPS, VIEWS = (1, 2, 3, 5), (1, 3, 5)
+MOST_VIEWS = 200
+"""The most questions of each number of views, spread evenly; they take longer."""
+OWN_CROPS = (1, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Scores in the shape of ``evaluate --json``, and what the picture is drawn from."""
+
+    scores: dict[str, Any]
+    trials: dict[int, list[Trial]]
+    view: MapView
+
+
+def evaluate(
+    map_log: Path,
+    query_logs: Sequence[Path],
+    truth: Truth,
+    settings: Settings | Callable[[Corrections], Settings],
+    *,
+    until: str = "end",
+    method: Method = "joint",
+    camera: Camera | None = None,
+    seed: int = DEFAULT_SEED,
+    own: bool = False,
+    workers: int | None = None,
+    note: Note | None = None,
+) -> Evaluation:
+    """Score the map of ``map_log`` (folded to ``until`` under its corrections) and questions from
+    ``query_logs``. ``settings`` may depend on the log's corrections. With ``own`` the map is asked
+    questions of its own too, which need no truth. ``workers`` is how many processes may ask many
+    questions beside this one, 0 for none, by default `default_workers`; the scores do not depend on
+    it.
+
+    ``note`` is called with remarks for the user about ``until`` (`eventsrc.log.seek.resolve`), and
+    when a process has died. Deterministic but for ``latency_ms``, which is of exact search in
+    memory plus the ranking.
+    """
+    with LogReader(map_log) as reader:
+        end = resolve(reader, until, note=note)
+        corrections = read_corrections(reader, end)
+        if not isinstance(settings, Settings):
+            settings = settings(corrections)
+        _, view = fold_log(reader, settings, end, corrections=corrections)
+    keyframes = list(read_keyframes(query_logs, settings))
+    if query_logs:
+        check_truth(keyframes, truth)
+    # Damage before `end` has been raised by the fold.
+    mapped = list(read_keyframes([map_log], on_gap=lambda _: None))
+    rooms = RoomIndex(mapped, keyframes, truth)
+    runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
+    if workers is None:
+        workers = default_workers()
+    asked = [make_questions(keyframes, truth, n, seed) for n in CROPS]
+    asked += [spread(make_view_questions(keyframes, truth, n, seed), MOST_VIEWS) for n in VIEWS]
+    answered = iter(runner.run(chain.from_iterable(asked), workers, note))
+    each = [list(islice(answered, len(questions))) for questions in asked]
+    trials = dict(zip(CROPS, each, strict=False))
+    views = dict(zip(VIEWS, each[len(CROPS) :], strict=True))
+    scores: dict[str, Any] = {
+        "places": place_scores(view, truth),
+        "objects": object_scores(view, truth),
+        "relocalization": {str(n): _summarise(found) for n, found in trials.items()},
+        "views": {str(n): _summarise(found) for n, found in views.items()},
+        "method": method,
+        "seed": seed,
+        "offset": view.next_offset,
+    }
+    if own:
+        scores["self"] = {
+            str(crops): own_scores(
+                ask_own_questions(view, crops, seed=seed, workers=workers, note=note)
+            )
+            for crops in OWN_CROPS
+        }
+    return Evaluation(scores, trials, view)
+
+
+def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Scores of re-localisation with one number of crops."""
+    known = [t for t in trials if t.known]
+    unknown = [t for t in trials if not t.known]
+    roomed = [t for t in known if t.question.room is not None]
+    confidence = [t.answer.confidence for t in trials]
+    in_map = [t.answer.known for t in trials]
+    correct = [t.correct for t in trials]
+    return {
+        "questions": len(trials),
+        "known": len(known),
+        "top1_room": _share(roomed, lambda t: t.question.room in t.rooms_of_places[:1]),
+        "top3_room": _share(roomed, lambda t: t.question.room in t.rooms_of_places[:3]),
+        "top1_contains_room": _share(roomed, lambda t: any(t.contains[:1])),
+        "top3_contains_room": _share(roomed, lambda t: any(t.contains[:3])),
+        "pose_room": _share(roomed, lambda t: t.question.room == t.room_of_pose),
+        "room_at_pose": _share(roomed, lambda t: t.question.room == t.room_at_pose),
+        "room_ceiling": _share(roomed, lambda t: t.room_has_place),
+        "nearest_place": _share(
+            [t for t in known if t.nearest_place is not None], lambda t: bool(t.nearest_place)
+        ),
+        "pose_error_m": _percentiles([t.pose_error_m for t in known]),
+        "yaw_error_rad": _percentiles([t.yaw_error_rad for t in known]),
+        "centroid_error_m": _percentiles([t.centroid_error_m for t in known]),
+        "within_1_5_m": _share(known, lambda t: t.correct),
+        "known_called_unknown": _share(known, lambda t: t.answer.unknown),
+        "unknown_called_unknown": _share(unknown, lambda t: t.answer.unknown),
+        "auroc": auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
+        "ece": expected_calibration_error(confidence, correct),
+        "ece_floor": calibration_floor(confidence),
+        "known_ece": expected_calibration_error(in_map, [t.known for t in trials]),
+        "known_ece_floor": calibration_floor(in_map),
+        "reliability": reliability(confidence, correct),
+        "plain": {
+            "pose_error_m": _percentiles([t.plain_error_m for t in known]),
+            "within_1_5_m": _share(known, _plain_is_near),
+        },
+        "best_cosine": {
+            "auroc": auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown])
+        },
+        "latency_ms": _latency(trials),
+    }
+
+
+def _plain_is_near(trial: Trial) -> bool:
+    return trial.plain_error_m is not None and trial.plain_error_m <= RIGHT_WITHIN_M
+
+
+def _share(trials: Sequence[Trial], holds: Callable[[Trial], bool]) -> float | None:
+    return sum(holds(t) for t in trials) / len(trials) if trials else None
+
+
+def _percentiles(values: Sequence[float | None]) -> dict[str, float | None]:
+    present = [value for value in values if value is not None]
+    return {"p50": percentile(present, 0.5), "p90": percentile(present, 0.9)}
+
+
+def _latency(trials: Sequence[Trial]) -> dict[str, float | None]:
+    milliseconds = [t.seconds * 1000.0 for t in trials]
+    return {"p50": percentile(milliseconds, 0.5), "p99": percentile(milliseconds, 0.99)}

@@ -1,0 +1,220 @@
+"""Trials: each question asked of the map, and its answer compared with the truth."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.log.seek import Note
+from projections.localize import relocalize
+from projections.localize.relocalize import Answer, Camera, ExactIndex, Method, rank
+from projections.map.view import MapView
+
+from .baselines import best_cosine, plain_position
+from .parallel import call_all
+from .questions import Question
+from .scores import instances_of
+from .truth import Key, Truth
+
+RIGHT_WITHIN_M = 1.5
+
+
+class RoomIndex:
+    """The room at a position: that of the nearest keyframe whose room is known.
+
+    A pose may lie in a room that none of the map's keyframes entered. So all keyframes of the map's
+    log count, those after ``--at`` too, and those of query runs that share an instance with it;
+    runs of another building, in another frame, do not.
+    """
+
+    def __init__(
+        self, mapped: Sequence[Accepted], asking: Sequence[Accepted], truth: Truth
+    ) -> None:
+        in_map = _instances(mapped, truth)
+        runs = {_key(k)[0] for k in asking if in_map & _instances([k], truth)}
+        here = [*mapped, *(k for k in asking if _key(k)[0] in runs)]
+        known = {key: k for k in here if truth.room(key := _key(k)) is not None}
+        self._keys = list(known)
+        self._rooms = [truth.room(key) for key in self._keys]
+        poses = [(k.envelope.map_x or 0.0, k.envelope.map_y or 0.0) for k in known.values()]
+        self._positions = np.array(poses, dtype=np.float64).reshape(-1, 2)
+
+    def room(self, x: float, y: float, asking: Key) -> str | None:
+        """The room at a position in metres, without the keyframe ``asking``; None if unknown."""
+        squared = ((self._positions - (x, y)) ** 2).sum(1)
+        nearest = np.argsort(squared, kind="stable")[:2]
+        return next((self._rooms[i] for i in nearest if self._keys[i] != asking), None)
+
+
+def _key(keyframe: Accepted) -> Key:
+    return keyframe.envelope.run_id, keyframe.envelope.keyframe_id
+
+
+def _instances(keyframes: Sequence[Accepted], truth: Truth) -> set[str]:
+    found = (truth.keyframes.get(_key(k)) for k in keyframes)
+    return {i for line in found if line is not None for i in line.instances if i is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One question's outcome. Lengths in metres; None where truth or answer lacks the value.
+
+    ``known`` is whether at least one of the crops' true instances is in the map. A place *is* a
+    room when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` is
+    whether some place contains the true room: without one no place can be the right answer.
+    ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
+    room there by the `RoomIndex`, None without one. ``plain_error_m`` and ``best_cosine`` are those
+    of `baselines`; ``plain_place_error_m`` is the plain method's, a place's centroid.
+    """
+
+    question: Question
+    answer: Answer
+    known: bool
+    pose_error_m: float | None
+    yaw_error_rad: float | None
+    centroid_error_m: float | None
+    room_of_pose: str | None
+    room_at_pose: str | None
+    room_has_place: bool
+    rooms_of_places: tuple[str | None, ...]
+    contains: tuple[bool, ...]
+    nearest_place: bool | None
+    plain_error_m: float | None
+    plain_place_error_m: float | None
+    best_cosine: float
+    seconds: float
+
+    @property
+    def correct(self) -> bool:
+        """Whether the question is known and its pose within 1.5 m of the truth."""
+        return self.known and self.pose_error_m is not None and self.pose_error_m <= RIGHT_WITHIN_M
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The answer of a map, without the truth: see `Trial`. Positions are in metres."""
+
+    answer: Answer
+    plain_at: tuple[float, float] | None
+    plain_place_at: tuple[float, float] | None
+    best_cosine: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Asks a map by exact search."""
+
+    index: ExactIndex
+    camera: Camera | None
+    method: Method
+
+    def ask(self, question: relocalize.Question) -> Asked:
+        """The answer, without the poses that it was chosen from; three places asked for."""
+        began = time.perf_counter()
+        candidates = self.index.search(question.crops)
+        answer = rank(question, candidates, top=3, method=self.method, camera=self.camera)
+        seconds = time.perf_counter() - began
+        plain = rank(question, candidates, top=1, method="plain").pose
+        return Asked(
+            replace(answer, hypotheses=None),
+            plain_position(candidates.matches),
+            None if plain is None else (plain.x, plain.y),
+            best_cosine(candidates.matches),
+            seconds,
+        )
+
+
+class TrialRunner:
+    """Asks questions of a folded map, and scores them with the map's own truth."""
+
+    def __init__(
+        self,
+        view: MapView,
+        truth: Truth,
+        *,
+        camera: Camera | None,
+        method: Method,
+        room_index: RoomIndex | None = None,
+    ) -> None:
+        self._room_index = room_index
+        self._asker = Asker(ExactIndex(view), camera, method)
+        self._instances = {i for _, i in instances_of(view, truth) if i is not None}
+        self._rooms: dict[str, Counter[str]] = {p.place_id: Counter() for p in view.places.values()}
+        self._keyframes: list[tuple[str | None, str | None]] = []
+        positions = []
+        for keyframe in view.keyframes:
+            if keyframe.pose is None:
+                continue
+            room = truth.room((keyframe.run_id, keyframe.keyframe_id))
+            place_id = view.place_id(keyframe.place)
+            if room is not None and place_id is not None:
+                self._rooms[place_id][room] += 1
+            self._keyframes.append((room, place_id))
+            positions.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6))
+        self._positions = np.array(positions, dtype=np.float64).reshape(-1, 2)
+        self._rooms_in_map = {room for rooms in self._rooms.values() for room in rooms}
+
+    def run(
+        self, questions: Iterable[Question], workers: int = 0, note: Note | None = None
+    ) -> list[Trial]:
+        """One trial for each question. ``workers`` and ``note``: see `call_all`."""
+        asked = list(questions)
+        for question in asked:
+            self._asker.index.check_spaces(question.crops)
+        calls = [partial(self._asker.ask, question.asked) for question in asked]
+        answers = call_all(calls, workers, "asking", "questions", note)
+        return [self._scored(*each) for each in zip(asked, answers, strict=True)]
+
+    def _scored(self, question: Question, asked: Asked) -> Trial:
+        answer = asked.answer
+        pose, places = answer.pose, answer.places
+        known = any(i in self._instances for i in question.instances if i is not None)
+        true_place = self._nearest(question.x, question.y)[1]
+        return Trial(
+            question,
+            answer,
+            known,
+            _distance(None if pose is None else (pose.x, pose.y), question),
+            None if pose is None or pose.yaw is None else _angle_size(pose.yaw - question.yaw),
+            _distance((places[0].centroid_x, places[0].centroid_y) if places else None, question),
+            None if pose is None else self._nearest(pose.x, pose.y)[0],
+            None
+            if pose is None or self._room_index is None
+            else self._room_index.room(pose.x, pose.y, question.key),
+            question.room in self._rooms_in_map,
+            tuple(self._room_of(place.place_id) for place in places),
+            tuple((question.room or "") in self._rooms[place.place_id] for place in places),
+            None if true_place is None or not places else places[0].place_id == true_place,
+            _distance(asked.plain_at, question),
+            _distance(asked.plain_place_at, question),
+            asked.best_cosine,
+            asked.seconds,
+        )
+
+    def _nearest(self, x: float, y: float) -> tuple[str | None, str | None]:
+        """Room and place of the map keyframe nearest to a position; ties go to the earlier one."""
+        if not self._keyframes:
+            return None, None
+        return self._keyframes[int(((self._positions - (x, y)) ** 2).sum(1).argmin())]
+
+    def _room_of(self, place_id: str) -> str | None:
+        rooms = self._rooms[place_id]
+        return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
+
+
+def _distance(position: tuple[float, float] | None, question: Question) -> float | None:
+    """The distance in metres from the question's true position."""
+    if position is None:
+        return None
+    return math.hypot(position[0] - question.x, position[1] - question.y)
+
+
+def _angle_size(angle: float) -> float:
+    """The size of an angle, 0 … π."""
+    return abs(math.remainder(angle, 2.0 * math.pi))

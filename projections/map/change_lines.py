@@ -1,0 +1,64 @@
+"""The changes of an event as lines of text."""
+
+from collections.abc import Iterable, Iterator
+
+from eventsrc.base.text import visible
+from projections.fold.deltas import (
+    Delta,
+    MapGiven,
+    MergeRefused,
+    ObjectFound,
+    ObjectMissing,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectsMerged,
+    PlaceFormed,
+    PlaceNamed,
+    PlaceOrdinal,
+    PlacesMerged,
+)
+from projections.fold.exact import UM_PER_M
+
+from .view import MapView
+
+
+def change_lines(view: MapView, deltas: Iterable[Delta]) -> Iterator[str]:
+    """A line for each change of a place, an object's identity or a map; ``view`` has the deltas
+    applied."""
+
+    def place(ordinal: PlaceOrdinal) -> str:
+        return view.all_places[ordinal].place_id
+
+    def thing(ordinal: ObjectOrdinal) -> str:
+        found = view.all_objects[ordinal]
+        return f"{visible(found.class_name)} {found.object_id}"
+
+    for delta in deltas:
+        match delta:
+            case PlaceFormed():
+                yield f"place {delta.place_id} founded"
+            case PlacesMerged():
+                bridge = view.keyframes[delta.bridge]
+                absorbed = ", ".join(map(place, delta.absorbed))
+                yield (
+                    f"place {absorbed} merged into {place(delta.survivor)}"
+                    f" by {visible(bridge.run_id)}:{bridge.keyframe_id}"
+                )
+            case MergeRefused():
+                yield f"places {place(delta.a)} and {place(delta.b)} kept apart by a command"
+            case PlaceNamed():
+                named = "has no name" if delta.name is None else f"is called {visible(delta.name)}"
+                yield f"place {place(delta.place)} {named}"
+            case ObjectFound():
+                yield f"object {thing(delta.object)} found"
+            case ObjectsMerged():
+                yield f"object {thing(delta.absorbed)} merged into {thing(delta.survivor)}"
+            case ObjectMissing(missing=True):
+                yield f"object {thing(delta.object)} missing after {delta.misses} misses"
+            case ObjectRelocated():
+                x, y = delta.to_x_um / UM_PER_M, delta.to_y_um / UM_PER_M
+                yield f"object {thing(delta.object)} relocated to ({x:.2f}, {y:.2f})"
+            case MapGiven():
+                yield f"occupancy map of {delta.map.width} × {delta.map.height} cells given"
+            case _:
+                pass

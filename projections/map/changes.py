@@ -1,0 +1,179 @@
+"""The rows of a `MapView` that a batch of events added or changed.
+
+`ChangeTracker` applies events to a view and collects the ordinals that they touch; a sink reads the
+values from the view afterwards. So a thousand changes of one Object in a batch are one ordinal.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import (
+    Delta,
+    KeyframeOrdinal,
+    KeyframePlaced,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectMissing,
+    ObjectMoved,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    ObservationAdded,
+    ObservationOrdinal,
+    PlaceChanged,
+    PlaceFormed,
+    PlaceNamed,
+    PlaceOrdinal,
+    PlacesLinked,
+    PlacesMerged,
+    RunOrdinal,
+    RunSeen,
+)
+
+from .view import MapView
+
+Embedded: TypeAlias = tuple[ObservationAdded, int]
+"""An observation with an embedding of the map's space, and the log time of its event, in ns. There
+are none if the view keeps no embeddings."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchChanges:
+    """The changes of a batch, as ordinals in ascending order; `MapView` has the values.
+
+    ``keyframes`` and ``observations`` are new. They never change later, except for the place of a
+    keyframe and the object of an observation: ``placed`` are the keyframes that joined a place or
+    whose place was absorbed, ``reassigned`` the observations whose object was absorbed. ``runs``,
+    ``objects`` and ``places`` are new or changed, places also by what is in them; one that is not
+    in `MapView.objects` or `MapView.places` any more was absorbed. ``located`` are objects that
+    moved to another place or out of one, absorbed ones among them. ``links`` are pairs of places
+    whose shared transitions changed; one that is not in `MapView.adjacency` any more is gone.
+    ``embedded`` is in the order of the observations. ``formed`` are the places that are new,
+    ``floors`` the numbers of new floors. ``maps`` is whether `MapView.maps_in_force` changed.
+    """
+
+    keyframes: range
+    observations: range
+    embedded: list[Embedded]
+    runs: list[RunOrdinal]
+    objects: list[ObjectOrdinal]
+    places: list[PlaceOrdinal]
+    located: list[ObjectOrdinal]
+    placed: list[KeyframeOrdinal]
+    links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
+    reassigned: list[ObservationOrdinal]
+    formed: list[PlaceOrdinal]
+    floors: range
+    maps: bool = False
+
+
+class ChangeTracker:
+    """Applies events to ``view`` and collects what they change."""
+
+    def __init__(self, view: MapView) -> None:
+        self.view = view
+        self._start()
+
+    def apply_event(self, offset: Offset, deltas: Sequence[Delta], logged_ns: int) -> None:
+        """Apply the deltas of the event at ``offset``, which was logged at ``logged_ns``."""
+        collectors = self._COLLECTORS
+        for delta in deltas:
+            if type(delta) is ObservationAdded:
+                if delta.embedding is not None:
+                    self._embedded.append((delta, logged_ns))
+            elif (collect := collectors.get(type(delta))) is not None:
+                collect(self, delta)
+        self.view.apply_event(offset, deltas)
+
+    def apply_names(self, deltas: Sequence[PlaceNamed]) -> None:
+        """Apply the deltas of `SemanticMap.use_names`, which are of no event's fold."""
+        for delta in deltas:
+            self._places.add(delta.place)
+            self.view.apply(delta)
+
+    @property
+    def added(self) -> int:
+        """The number of new keyframes and observations since the last `drain`."""
+        view = self.view
+        return len(view.keyframes) - self._keyframes + len(view.observations) - self._observations
+
+    def drain(self) -> BatchChanges:
+        """All changes since the last drain."""
+        self._places.update(filter(self.view.places.__contains__, self.view.contents.touched))
+        changes = BatchChanges(
+            range(self._keyframes, len(self.view.keyframes)),
+            range(self._observations, len(self.view.observations)),
+            self._embedded,
+            sorted(self._runs),
+            sorted(self._objects),
+            sorted(self._places),
+            sorted(self._located),
+            sorted(self._placed),
+            sorted(self._links),
+            sorted(self._reassigned),
+            sorted(self._formed),
+            range(self._floors, len(self.view.floors)),
+            self._maps != self.view.maps_in_force(),
+        )
+        self._start()
+        return changes
+
+    def _start(self) -> None:
+        self._keyframes = len(self.view.keyframes)
+        self._observations = len(self.view.observations)
+        self._embedded: list[Embedded] = []
+        self._runs: set[RunOrdinal] = set()
+        self._objects: set[ObjectOrdinal] = set()
+        self._places: set[PlaceOrdinal] = set()
+        self._located: set[ObjectOrdinal] = set()
+        self._placed: set[KeyframeOrdinal] = set()
+        self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
+        self._reassigned: set[ObservationOrdinal] = set()
+        self._formed: set[PlaceOrdinal] = set()
+        self._floors = len(self.view.floors)
+        self._maps = self.view.maps_in_force()
+        self.view.contents.touched.clear()
+
+    def _place_formed(self, delta: PlaceFormed) -> None:
+        self._places.add(delta.place)
+        self._formed.add(delta.place)
+
+    def _places_merged(self, delta: PlacesMerged) -> None:
+        self._places.add(delta.survivor)
+        self._places.update(delta.absorbed)
+        for place in delta.absorbed:
+            # Read before the view applies the delta: afterwards they are members of the survivor. A
+            # place that this event has formed is not there yet; a command may join it at once.
+            if place < len(self.view.all_places):
+                self._placed.update(self.view.all_places[place].unordered_members)
+
+    def _objects_merged(self, delta: ObjectsMerged) -> None:
+        self._objects.update((delta.survivor, delta.absorbed))
+        self._located.add(delta.absorbed)
+        # Before the view applies it, as above. An Object that this event has found is not there
+        # yet: all its observations are new.
+        if delta.absorbed < len(self.view.all_objects):
+            self._reassigned.update(self.view.all_objects[delta.absorbed].observations)
+
+    # Of the class, not bound to the tracker; `MapView` says why.
+    _COLLECTORS: ClassVar[dict[type, Callable[["ChangeTracker", Any], None]]] = {
+        RunSeen: lambda self, d: self._runs.add(d.run),
+        ObjectFound: lambda self, d: self._objects.add(d.object),
+        ObjectSeen: lambda self, d: self._objects.add(d.object),
+        ObjectsMerged: _objects_merged,
+        ObjectEstimated: lambda self, d: self._objects.add(d.object),
+        ObjectClassified: lambda self, d: self._objects.add(d.object),
+        ObjectMissing: lambda self, d: self._objects.add(d.object),
+        ObjectRelocated: lambda self, d: self._objects.add(d.object),
+        ObjectMoved: lambda self, d: self._located.add(d.object),
+        PlaceFormed: _place_formed,
+        PlaceChanged: lambda self, d: self._places.add(d.place),
+        PlaceNamed: lambda self, d: self._places.add(d.place),
+        KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),
+        PlacesMerged: _places_merged,
+        PlacesLinked: lambda self, d: self._links.add((d.a, d.b)),
+    }

@@ -1,0 +1,289 @@
+"""Output of ``mapfold state``: the map as a JSON document or as text."""
+
+from statistics import median
+from typing import Any
+
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import MapGiven, PlaceOrdinal
+from projections.fold.exact import UM_PER_M
+from projections.fold.place_types import PlaceType
+from projections.fold.settings import Settings, assignment_texts
+
+from .command_text import command_document
+from .records import ObjectRecord
+from .view import MapView
+
+
+def state_document(
+    view: MapView, digest: str | None, known_at: Offset | None = None
+) -> dict[str, Any]:
+    """The JSON document. Every list is ordered by ordinal. ``digest`` may be left out.
+
+    ``known_at`` is the point before which commands were known, by default the map's own.
+    """
+    return {
+        "offset": view.next_offset,
+        "settings": view.settings.model_dump(),
+        "digest": digest,
+        "counts": view.counts(),
+        "keyframes": _keyframes(view),
+        "places": _places(view),
+        "objects": _objects(view),
+        "adjacency": [
+            {"a": view.place_id(a), "b": view.place_id(b), "shared_transitions": transitions}
+            | ({"between_floors": True} if view.is_between_floors(a, b) else {})
+            for a, b, transitions in view.edges()
+        ],
+        **({"floors": list(view.floors)} if view.floors else {}),
+        **_map(view),
+        **_corrections(view, known_at),
+    }
+
+
+def _map(view: MapView) -> dict[str, Any]:
+    """The occupancy map in force on the first floor, and where maps name floors all of them;
+    nothing where there is none."""
+    first = view.map
+    named = any(floor is not None for floor in view.maps)
+    return {
+        **({} if first is None else {"map": _given(first)}),
+        **({"maps": [_given(each) for each in view.maps_in_force().values()]} if named else {}),
+    }
+
+
+def _given(delta: MapGiven) -> dict[str, Any]:
+    given = delta.map
+    return {
+        "offset": delta.offset,
+        "map_id": given.map_id,
+        "source": given.source,
+        "resolution": given.resolution,
+        "origin": list(given.origin),
+        "width": given.width,
+        "height": given.height,
+        "digest": given.digest(),
+        **_floor(given.floor),
+    }
+
+
+def _corrections(view: MapView, known_at: Offset | None) -> dict[str, Any]:
+    """The commands in force; nothing where there are none."""
+    corrections = view.corrections
+    if not corrections.in_force:
+        return {}
+    return {
+        "corrections": {
+            "known_at": view.next_offset if known_at is None else known_at,
+            "fingerprint": corrections.fingerprint(),
+            "commands": [command_document(recorded) for recorded in corrections.in_force],
+        }
+    }
+
+
+def _keyframes(view: MapView) -> list[dict[str, Any]]:
+    return [
+        {
+            "run_id": k.run_id,
+            "keyframe_id": k.keyframe_id,
+            "map_x": None if k.pose is None else k.pose.x_m,
+            "map_y": None if k.pose is None else k.pose.y_m,
+            "map_yaw": None if k.pose is None else k.pose.yaw_rad,
+            "place_id": view.place_id(k.place),
+            **_floor(k.floor),
+        }
+        for k in view.keyframes
+    ]
+
+
+def _places(view: MapView) -> list[dict[str, Any]]:
+    return [
+        {
+            "place_id": p.place_id,
+            "centroid_x": p.centroid_x,
+            "centroid_y": p.centroid_y,
+            "keyframe_count": p.keyframe_count,
+            **({} if p.name is None else {"name": p.name}),
+            **_floor(view.floor_of(p.ordinal)),
+            **_type(view.type_of(p.ordinal)),
+        }
+        for p in view.places.values()
+    ]
+
+
+def _floor(name: str | None) -> dict[str, str]:
+    """The floor's name, where the log has it."""
+    return {} if name is None else {"floor": name}
+
+
+def _type(found: PlaceType | None) -> dict[str, Any]:
+    """The type of room; None where unsure. Nothing where no Object of a known class is in it."""
+    if found is None:
+        return {}
+    return {
+        "type": found.type,
+        "type_probability": found.probability,
+        "type_candidates": [{"type": t, "probability": p} for t, p in found.candidates],
+    }
+
+
+def _objects(view: MapView) -> list[dict[str, Any]]:
+    det_ids = view.det_ids()
+    return [
+        {
+            "object_id": o.object_id,
+            "class_name": o.class_name,
+            "mean_x": o.mean_x,
+            "mean_y": o.mean_y,
+            "obs_count": o.obs_count,
+            "place_id": view.place_id(o.place),
+            "first_seen": o.first_seen,
+            "last_seen": o.last_seen,
+            "det_ids": [det_ids[i] for i in o.observations],
+            **(_evidence(view, o) if view.settings.fusion == "evidence" else {}),
+        }
+        for o in view.objects.values()
+    ]
+
+
+def _evidence(view: MapView, found: ObjectRecord) -> dict[str, Any]:
+    """Facts of fusion by evidence about an Object."""
+    at = found.estimate
+    return {
+        "est_x": None if at is None else at.est_x,
+        "est_y": None if at is None else at.est_y,
+        "est_sigma_m": None if at is None else at.est_sigma_m,
+        "spots": None if at is None else at.spots,
+        "class_counts": view.class_counts(found),
+        "missing": found.missing_in is not None,
+        "relocations": [
+            {
+                "offset": r.offset,
+                "from": [r.from_x_um / UM_PER_M, r.from_y_um / UM_PER_M],
+                "to": [r.to_x_um / UM_PER_M, r.to_y_um / UM_PER_M],
+            }
+            for r in found.relocations
+        ],
+    }
+
+
+_MAX_PLACES = 40
+
+
+def state_text(view: MapView, digest: str | None, known_at: Offset | None = None) -> str:
+    """Counts, settings, digest and the first 40 places, for people; ends in a newline."""
+    lines = [
+        f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
+        f"settings {_settings(view.settings)}",
+        *([] if digest is None else [f"digest   {digest}"]),
+    ]
+    if view.settings.fusion == "evidence":
+        lines.append(f"objects  {_standing(view)}")
+    lines += [_walls(floor, given, view) for floor, given in view.maps_in_force().items()]
+    if in_force := view.corrections.in_force:
+        known = view.next_offset if known_at is None else known_at
+        lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
+    lines += _place_lines(view)
+    return "\n".join(lines) + "\n"
+
+
+def _walls(floor: str | None, delta: MapGiven, view: MapView) -> str:
+    given = delta.map
+    size = f"{given.width:,} × {given.height:,} cells of {given.resolution:g} m"
+    where = "" if floor is None else f" of floor {visible(floor)}"
+    line = f"walls    {size}{where}, from {given.source} at offset {delta.offset:,}"
+    if view.settings.places == "rooms":
+        return line
+    return f"{line}; places=page does not use them for places, --preset rooms does"
+
+
+def _standing(view: MapView) -> str:
+    """``12 seen from two spots or more (median standard error 0.14 m), 3 from one, 1 missing``."""
+    found = view.objects.values()
+    seen = [o.estimate for o in found if o.estimate is not None and o.estimate.spots > 1]
+    error = f" (median standard error {median(e.est_sigma_m for e in seen):.2f} m)" if seen else ""
+    rest = {
+        "missing": sum(o.missing_in is not None for o in found),
+        "moved": sum(bool(o.relocations) for o in found),
+    }
+    more = "".join(f", {count:,} {word}" for word, count in rest.items() if count)
+    once = len(found) - len(seen)
+    return f"{len(seen):,} seen from two spots or more{error}, {once:,} from one{more}"
+
+
+def _counts(view: MapView) -> str:
+    counts = view.counts()
+    words = ("run", "keyframe", "observation", "object", "place")
+    text = ", ".join(counted(counts[f"{word}s"], word) for word in words)
+    rare = {
+        "noise": "{} in no place",
+        "duplicates": "{} seen twice",
+        "conflicts": "{} with other content ignored",
+        "det_ids_reused": "{} left out for a det_id used before",
+        "foreign_embeddings": "{} of another embedding space",
+        "forgotten": "{} forgotten",
+        "dropped": "{} dropped",
+    }
+    things = {
+        "det_ids_reused": "observation",
+        "foreign_embeddings": "observation",
+        "dropped": "detection",
+    }
+    for key, phrase in rare.items():
+        if counts.get(key):
+            text += ", " + phrase.format(counted(counts[key], things.get(key, "keyframe")))
+    return text
+
+
+def _settings(settings: Settings) -> str:
+    changed = settings.changed_from(Settings())
+    shown = changed or {k: v for k, v in Settings().model_dump().items() if v is not None}
+    text = ", ".join(assignment_texts(shown))
+    return text if changed else f"default: {text}"
+
+
+def _shown_type(found: PlaceType | None) -> str:
+    """``kitchen 87 %``; empty where unsure, or where the name says it."""
+    if found is None or found.type is None or found.named:
+        return ""
+    return f"{found.type} {found.probability:.0%}".replace("%", " %")
+
+
+def _shown_floor(name: str | None) -> str:
+    return "-" if name is None else visible(name)
+
+
+def _place_lines(view: MapView) -> list[str]:
+    if not view.places:
+        return ["no places yet"]
+    neighbours: dict[PlaceOrdinal, list[str]] = {place: [] for place in view.places}
+    for a, b, transitions in view.edges():
+        neighbours[a].append(f"{view.place_id(b)} ×{transitions}")
+        neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
+    objects = dict.fromkeys(view.places, 0)
+    for record in view.objects.values():
+        if record.place is not None:
+            objects[record.place] += 1
+    shown = list(view.places.items())[:_MAX_PLACES]
+    width = max(len(place.place_id) for place in view.places.values())
+    name_width = max((len(place.name) for _, place in shown if place.name is not None), default=0)
+    named = f"  {'name':<{max(name_width, 4)}}" if name_width else ""
+    floors = {ordinal: _shown_floor(view.floor_of(ordinal)) for ordinal, _ in shown}
+    floor_width = max(5, *map(len, floors.values())) if view.floors else 0
+    named += f"  {'floor':<{floor_width}}" if floor_width else ""
+    types = {ordinal: _shown_type(view.type_of(ordinal)) for ordinal, _ in shown}
+    type_width = max(4, *map(len, types.values())) if any(types.values()) else 0
+    named += f"  {'type':<{type_width}}" if type_width else ""
+    lines = [f"{'place':<{width}}{named}  keyframes  objects  centroid (m)        next to"]
+    for ordinal, place in shown:
+        centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
+        name = f"  {place.name or '':<{max(name_width, 4)}}" if name_width else ""
+        name += f"  {floors[ordinal]:<{floor_width}}" if floor_width else ""
+        name += f"  {types[ordinal]:<{type_width}}" if type_width else ""
+        lines.append(
+            f"{place.place_id:<{width}}{name}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
+            f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
+        )
+    if len(view.places) > _MAX_PLACES:
+        lines.append(f"… and {len(view.places) - _MAX_PLACES} more places; --json lists all")
+    return lines

@@ -1,0 +1,138 @@
+"""Folding a log: reads and validates events, and passes them to the pure fold."""
+
+import gc
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from eventsrc.envelope.ingest import Rejected
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.log import Event, LogReader
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.deltas import Delta
+from projections.fold.errors import FoldError
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+
+from .parsing import READ_AHEAD as READ_AHEAD
+from .parsing import ParsedEvent as ParsedEvent
+from .parsing import parse_events as parse_events
+from .parsing import parsed_stretches
+from .snapshot_cache import SnapshotCache
+from .space_vectors import new_map, with_vectors
+from .view import MapView
+
+SNAPSHOT_MIN_EVENTS = 5_000
+"""Events; folding fewer takes about as long as reading a snapshot of them."""
+
+
+class FoldedEvent(NamedTuple):
+    """The deltas of the event at ``offset``; of mapfold's own events only maps have any."""
+
+    offset: Offset
+    deltas: list[Delta]
+
+
+def fold_events(
+    events: Iterable[Event], semantic_map: SemanticMap, *, ahead: int = 1
+) -> Iterator[FoldedEvent]:
+    """Fold events in offset order.
+
+    Up to ``ahead`` of them are read and validated together before the first is folded, which is
+    quicker. With 1, for a live log, each is read when its deltas are asked for.
+
+    Raises LogDamaged behind the last event before damage, and FoldError at an envelope that does
+    not validate. The map is as before it then: its
+    ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
+    Continue with another call from the offset after it; events read ahead are lost with this one.
+    """
+    for stretch in parsed_stretches(events, ahead):
+        for event in stretch:
+            yield FoldedEvent(event.offset, fold_parsed(event, semantic_map))
+
+
+def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
+    """Fold one event; see `fold_events`."""
+    return next(fold_events([event], semantic_map)).deltas
+
+
+def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:
+    """Fold one event of `parse_events`. Raises FoldError for a rejected one; see `fold_events`."""
+    if event.parsed is None:
+        semantic_map.skip(event.offset)
+        return []
+    if isinstance(event.parsed, Rejected):
+        raise FoldError(event.offset, event.parsed.reason)
+    if isinstance(event.parsed, OccupancyMap):
+        return semantic_map.use_map(event.offset, event.parsed)
+    return semantic_map.fold(event.offset, event.parsed, event.units)
+
+
+def fold_log(
+    reader: LogReader,
+    settings: Settings,
+    until: Offset | None = None,
+    *,
+    keep_embeddings: bool = True,
+    corrections: Corrections = NO_CORRECTIONS,
+) -> tuple[SemanticMap, MapView]:
+    """Fold the first ``until`` events of a log, all of them for None."""
+    semantic_map = new_map(reader, settings, corrections)
+    view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
+    _fold_into(reader, semantic_map, view, until)
+    return semantic_map, view
+
+
+def fold_log_cached(
+    reader: LogReader,
+    settings: Settings,
+    until: Offset | None = None,
+    *,
+    note: Callable[[str], None] = lambda _: None,
+    corrections: Corrections = NO_CORRECTIONS,
+) -> tuple[SemanticMap, MapView]:
+    """`fold_log` without embeddings, from the nearest snapshot beside the log.
+
+    Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is
+    called with a message for each snapshot that could not be used or kept; the result is the same.
+    """
+    end = reader.next_offset if until is None else min(until, reader.next_offset)
+    cache = SnapshotCache(reader.path, reader.log_id, settings, note, corrections=corrections)
+    semantic_map, view = cache.latest(end) or (
+        SemanticMap(settings, corrections),
+        MapView(settings, keep_embeddings=False, corrections=corrections),
+    )
+    with_vectors(semantic_map, reader)
+    start = semantic_map.next_offset
+    _fold_into(reader, semantic_map, view, end)
+    if end - start >= SNAPSHOT_MIN_EVENTS:
+        cache.keep(semantic_map, view)
+    return semantic_map, view
+
+
+def _fold_into(
+    reader: LogReader, semantic_map: SemanticMap, view: MapView, until: Offset | None
+) -> None:
+    events = reader.read(semantic_map.next_offset, until)
+    with gc_paused():
+        for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
+            view.apply_event(folded.offset, folded.deltas)
+
+
+@contextmanager
+def gc_paused() -> Iterator[None]:
+    """Pause the search for reference cycles: a fold makes none and frees next to nothing.
+
+    The search would traverse all records again and again as a map grows, a fifth of the whole time.
+    Afterwards all objects are in the oldest generation, so that the next search skips them.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.freeze()
+            gc.unfreeze()
+            gc.enable()

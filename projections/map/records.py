@@ -1,0 +1,211 @@
+"""The records of a `MapView`: its runs, keyframes, observations, places and Objects.
+
+Records are written by `MapView.apply` only. ``ordinal`` numbers the things of a kind in the order
+in which the fold met or founded them. Positions are integer micrometres (``_um``) and exact; ``_m``
+and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import msgspec
+
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from projections.fold.deltas import (
+    KeyframeOrdinal,
+    ObjectOrdinal,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    Pose,
+    RunOrdinal,
+    UnitVector,
+)
+from projections.fold.exact import UM_PER_M, mean_m
+from projections.fold.survivors import PlaceSurvivors
+
+_UM2_PER_M2 = UM_PER_M * UM_PER_M
+
+
+@dataclass(slots=True, eq=False)
+class RunRecord:
+    """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
+
+    ordinal: RunOrdinal
+    run_id: RunId
+    started_at: float
+    keyframe_count: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class PlaceRecord:
+    """A region of the building. ``founder`` is its first core keyframe; ``name`` the name that the
+    command at ``name_offset`` gave it.
+
+    `MapView.places` lists those that were not absorbed.
+    """
+
+    ordinal: PlaceOrdinal
+    place_id: str
+    founder: KeyframeOrdinal
+    founded_offset: Offset
+    keyframe_count: int = 0
+    sum_x_um: int = 0
+    sum_y_um: int = 0
+    name: str | None = None
+    name_offset: Offset | None = None
+    unordered_members: list[KeyframeOrdinal] = field(default_factory=list)
+
+    @property
+    def members(self) -> list[KeyframeOrdinal]:
+        """Ordinals of its keyframes, ascending; a new list each time."""
+        return sorted(self.unordered_members)
+
+    @property
+    def centroid_x(self) -> float:
+        """Metres; the mean of its members."""
+        return mean_m(self.sum_x_um, self.keyframe_count)
+
+    @property
+    def centroid_y(self) -> float:
+        """Metres; the mean of its members."""
+        return mean_m(self.sum_y_um, self.keyframe_count)
+
+
+class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
+    """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
+
+    ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
+    name of the floor that the pose is on, where the log states it.
+    """
+
+    ordinal: KeyframeOrdinal
+    offset: Offset
+    run: RunOrdinal
+    run_id: RunId
+    keyframe_id: KeyframeId
+    timestamp: float
+    pose: Pose | None
+    survivors: PlaceSurvivors
+    observations: list[ObservationOrdinal] | tuple[()] = ()
+    joined: PlaceOrdinal | None = None
+    floor: str | None = None
+
+    @property
+    def place(self) -> PlaceOrdinal | None:
+        """The place it belongs to now; None for noise or without a pose."""
+        return None if self.joined is None else self.survivors.find(self.joined)
+
+
+class ObservationRecord(msgspec.Struct, eq=False, gc=False):
+    """One detection. ``object`` and ``similarity_q40`` are None when it was not fused.
+
+    ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
+    made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.
+    """
+
+    ordinal: ObservationOrdinal
+    keyframe: KeyframeOrdinal
+    det_id: DetId
+    class_name: str
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding_model: str | None
+    embedding: UnitVector | None
+    embedding_crc: int | None
+    foreign_space: bool
+    object: ObjectOrdinal | None = None
+    similarity_q40: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """An Object's estimated position with its covariance in µm²; it was seen from ``spots``
+    spots."""
+
+    x_um: int
+    y_um: int
+    var_xx_um2: int
+    var_xy_um2: int
+    var_yy_um2: int
+    spots: int
+
+    @property
+    def est_x(self) -> float:
+        """Metres."""
+        return self.x_um / UM_PER_M
+
+    @property
+    def est_y(self) -> float:
+        """Metres."""
+        return self.y_um / UM_PER_M
+
+    @property
+    def covariance_m2(self) -> tuple[float, float, float]:
+        """Its xx, xy and yy in m²."""
+        return (
+            self.var_xx_um2 / _UM2_PER_M2,
+            self.var_xy_um2 / _UM2_PER_M2,
+            self.var_yy_um2 / _UM2_PER_M2,
+        )
+
+    @property
+    def est_sigma_m(self) -> float:
+        """Metres; the standard error in the direction in which it is largest."""
+        half = (self.var_xx_um2 + self.var_yy_um2) / 2
+        apart = (self.var_xx_um2 - self.var_yy_um2) / 2
+        return math.sqrt(half + math.sqrt(apart * apart + self.var_xy_um2**2)) / UM_PER_M
+
+
+@dataclass(frozen=True, slots=True)
+class Relocation:
+    """An Object was found at another position by ``observation``, of the event at ``offset``."""
+
+    offset: Offset
+    observation: ObservationOrdinal
+    from_x_um: int
+    from_y_um: int
+    to_x_um: int
+    to_y_um: int
+
+
+@dataclass(slots=True, eq=False)
+class ObjectRecord:
+    """A landmark. ``observations`` are ordinals in the order in which they were fused.
+
+    `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
+    those of fusion by evidence: ``misses`` is the number of keyframes of a run that should show it
+    and do not, ``missing_in`` the run by which it is missing. ``counted_as`` is how `PlaceContents`
+    counts it.
+    """
+
+    ordinal: ObjectOrdinal
+    object_id: str
+    class_name: str
+    obs_count: int = 0
+    sum_x_um: int = 0
+    sum_y_um: int = 0
+    first_seen: float = 0.0
+    last_seen: float = 0.0
+    place: PlaceOrdinal | None = None
+    observations: list[ObservationOrdinal] = field(default_factory=list)
+    estimate: Estimate | None = None
+    misses: int = 0
+    missing_in: RunOrdinal | None = None
+    relocations: list[Relocation] = field(default_factory=list)
+    counted_as: tuple[PlaceOrdinal, str, bool] | None = None
+
+    @property
+    def spot(self) -> tuple[float, float]:
+        """The estimated position in metres; without an estimate `mean_x` and `mean_y`."""
+        at = self.estimate
+        return (self.mean_x, self.mean_y) if at is None else (at.est_x, at.est_y)
+
+    @property
+    def mean_x(self) -> float:
+        """Metres; the mean of the positions the robot observed it from."""
+        return mean_m(self.sum_x_um, self.obs_count)
+
+    @property
+    def mean_y(self) -> float:
+        """Metres; the mean of the positions the robot observed it from."""
+        return mean_m(self.sum_y_um, self.obs_count)

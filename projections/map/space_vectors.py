@@ -1,0 +1,137 @@
+"""Embedding spaces of a log: the vectors added by its ``reembed`` commands, and the number of
+detections with a vector of each space."""
+
+import hashlib
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.base.advised import advised
+from eventsrc.envelope.commands import Reembed
+from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import DetId
+from eventsrc.envelope.system_events import EMBEDDINGS_KEY
+from eventsrc.envelope.upcast import read_envelope
+from eventsrc.log import LogReader
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.embedding_space import Reembedded
+from projections.fold.errors import FoldError
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+
+from .log_commands import read_corrections
+
+
+def new_map(
+    reader: LogReader, settings: Settings, corrections: Corrections = NO_CORRECTIONS
+) -> SemanticMap:
+    """A fold of this log that has folded nothing yet. Raises FoldError, LogDamaged."""
+    return with_vectors(SemanticMap(settings, corrections), reader)
+
+
+def with_vectors(semantic_map: SemanticMap, reader: LogReader) -> SemanticMap:
+    """The map, with the vectors of its space that the log has beside those in envelopes. Raises
+    FoldError, LogDamaged."""
+    known = vectors_of(reader, semantic_map.settings, semantic_map.corrections)
+    semantic_map.reembedded = known
+    return semantic_map
+
+
+def vectors_of(
+    reader: LogReader, settings: Settings, corrections: Corrections
+) -> Reembedded | None:
+    """The vectors of the settings' space that the log has beside those in envelopes; None if none
+    are in force. Raises FoldError, LogDamaged."""
+    commands = corrections.reembedded_for(settings)
+    return _read(reader.path, reader.log_id, commands) if commands else None
+
+
+@lru_cache(maxsize=2)
+def _read(log: Path, _log_id: str, commands: tuple[Reembed, ...]) -> Reembedded:
+    vectors: dict[DetId, NDArray[np.float32]] = {}
+    with LogReader(log) as reader:
+        for command in commands:
+            digest = hashlib.sha256()
+            for event in reader.read(command.first, command.end, keys={EMBEDDINGS_KEY}):
+                try:
+                    found = decode_embeddings(event.payload)
+                except InvalidEmbeddings as error:
+                    raise FoldError(event.offset, f"it is on {EMBEDDINGS_KEY}: {error}") from None
+                if found.space == command.space:
+                    digest.update(event.payload)
+                    for det_id, row in zip(found.det_ids, found.vectors, strict=True):
+                        vectors.setdefault(det_id, row)
+            if digest.hexdigest() != command.sha256:
+                raise FoldError(
+                    command.first,
+                    f"the vectors of {command.space!r} from here to offset {command.end} are not"
+                    f" those that command {command.command_id} was given for; run"
+                    f" `{advised('log', 'verify')}`, and undo the command to map without them",
+                )
+    return Reembedded(commands[0].space, vectors)
+
+
+@dataclass(frozen=True, slots=True)
+class LogSpace:
+    """A space: its model, None where detections name none, and its dimension. ``recorded``
+    detections have a vector of it in their envelope, ``reembedded`` others by commands in force."""
+
+    model: str | None
+    dim: int
+    recorded: int
+    reembedded: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogSpaces:
+    """``spaces`` by their first vector, those without a recorded one last; ``bare`` of the
+    ``detections`` were recorded without a vector. Each det_id counts once."""
+
+    detections: int
+    bare: int
+    spaces: tuple[LogSpace, ...]
+
+
+def log_spaces(
+    reader: LogReader, progress: Callable[[int, int], None] = lambda *_: None
+) -> LogSpaces:
+    """Count the spaces of a log, from all its envelopes. Raises FoldError, LogDamaged."""
+    corrections = read_corrections(reader)
+    recorded: Counter[tuple[str | None, int]] = Counter()
+    spaces: dict[DetId, tuple[str | None, int] | None] = {}
+    for event in reader.read():
+        progress(event.offset + 1, reader.next_offset)
+        if not event.is_envelope:
+            continue
+        accepted = read_envelope(event, max_bytes=sys.maxsize)
+        if not isinstance(accepted, Accepted):
+            continue
+        detections = accepted.envelope.detections
+        for det_id, detection, vector in zip(
+            accepted.det_ids, detections, accepted.vectors, strict=True
+        ):
+            if det_id not in spaces:
+                space = None if vector is None else (detection.embedding_model, len(vector))
+                spaces[det_id] = space
+                if space is not None:
+                    recorded[space] += 1
+    given: Counter[tuple[str | None, int]] = Counter()
+    for model, dim in dict.fromkeys((each.space, each.dim) for each in corrections.reembedded):
+        chosen = Settings(embedding_model=model, embedding_dim=dim)
+        vectors = vectors_of(reader, chosen, corrections)
+        given[model, dim] = sum(
+            space != (model, dim) and vectors is not None and det_id in vectors
+            for det_id, space in spaces.items()
+        )
+    found = tuple(
+        LogSpace(model, dim, recorded[model, dim], given[model, dim])
+        for model, dim in dict.fromkeys((*recorded, *given))
+    )
+    return LogSpaces(len(spaces), sum(space is None for space in spaces.values()), found)

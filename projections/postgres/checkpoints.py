@@ -1,0 +1,235 @@
+"""Checkpoints, dead letters and the one-writer lock of a database, in its schema ``mapfold``."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from typing import Final
+
+import psycopg
+
+from eventsrc.base.advised import advised
+from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
+from eventsrc.log import Event
+from projections.fold.errors import CheckpointMoved, DatabaseError, ProjectionBusy
+
+from .connection import Connection, describe_connection
+from .inputs import MapInputs
+from .labels import GRAPH, LABELS, TABLE
+from .sink import Checkpoint, SinkName
+from .statements import statements
+
+_LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
+_FIRST_TABLES: Final[dict[SinkName, str]] = {
+    "graph": f'{GRAPH}."{LABELS[0]}"',
+    "vectors": f"public.{TABLE}",
+}
+_COMMENT_PREFIX: Final = "mapfold"
+LOCK_GRACE_S: Final = 1.0
+"""Wait for the writer's lock: a server takes a moment to notice that the last writer's connection
+has ended."""
+LOCK_POLL_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class DeadLetter:
+    """An event that could not be folded and was left out. ``run_id`` is None when unreadable."""
+
+    offset: Offset
+    key: str
+    run_id: RunId | None
+    reason: str
+
+
+def lock_writer(connection: Connection, sink: SinkName) -> None:
+    """Lock a sink for writing until the connection ends. Raises ProjectionBusy."""
+    number = {"number": _LOCK_NUMBERS[sink]}
+    deadline = time.monotonic() + LOCK_GRACE_S
+    while True:
+        row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
+        if row is not None and row[0]:
+            return
+        if time.monotonic() > deadline:
+            break
+        time.sleep(LOCK_POLL_S)
+    holder = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
+    # The writer may run on any machine; the database only knows its session.
+    who = f" ({holder[1]}; PostgreSQL serves it in process {holder[0]})" if holder else ""
+    raise ProjectionBusy(
+        f"{describe_connection(connection)}: another rebuild or tail{who} is writing the {sink}"
+        " there; wait for it or stop it"
+    )
+
+
+def writer(connection: Connection, sink: SinkName) -> str | None:
+    """Name of the application that holds the sink's lock; None when it is free."""
+    number = {"number": _LOCK_NUMBERS[sink]}
+    row = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
+    return None if row is None else str(row[1])
+
+
+def has_schema(connection: Connection) -> bool:
+    """Whether the schema ``mapfold`` exists. Raises DatabaseError when it is not ours."""
+    row = connection.execute(statements("checkpoint")["schema_owner"]).fetchone()
+    if row is None:
+        return False
+    if not str(row[0]).startswith(_COMMENT_PREFIX):
+        raise DatabaseError(
+            f"{describe_connection(connection)}: has a schema mapfold that mapfold did not make;"
+            " use another database"
+        )
+    return True
+
+
+def ensure_schema(connection: Connection) -> None:
+    """Create the schema ``mapfold`` and its tables, or the columns that an older version lacks."""
+    if not has_schema(connection):
+        connection.execute(statements("checkpoint")["create"])
+    elif connection.execute(statements("checkpoint")["lacks_columns"]).fetchone() is None:
+        _add_columns(connection)
+
+
+def _add_columns(connection: Connection) -> None:
+    try:
+        with connection.transaction():
+            connection.execute(statements("checkpoint")["add_columns"])
+    except psycopg.errors.InsufficientPrivilege:
+        raise DatabaseError(
+            f"{describe_connection(connection)}: mapfold.checkpoint was made by an older version,"
+            " and only its owner may change that; have the owner run"
+            f" `{advised('replay')}`, then start again"
+        ) from None
+
+
+def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
+    """The sink's checkpoint; None when nothing has been projected."""
+    if not has_schema(connection):
+        return None
+    row = connection.execute(statements("checkpoint")["load"], {"sink": sink}).fetchone()
+    return None if row is None else Checkpoint(*row)
+
+
+def rows_exist(connection: Connection, sink: SinkName) -> bool:
+    """Whether the sink's graph or table still exists."""
+    row = connection.execute(
+        statements("checkpoint")["rows_exist"], {"table": _FIRST_TABLES[sink]}
+    ).fetchone()
+    return row is not None and bool(row[0])
+
+
+def at_offset(
+    log_id: str,
+    inputs: MapInputs,
+    next_offset: Offset,
+    last_event: str,
+    digest: str | None = None,
+    maps: str | None = None,
+) -> Checkpoint:
+    """The checkpoint of a map of ``inputs`` with ``next_offset`` events."""
+    return Checkpoint(
+        log_id,
+        inputs.fingerprint,
+        inputs.settings.model_dump_json(),
+        next_offset,
+        last_event,
+        digest,
+        inputs.known_at,
+        inputs.observed,
+        maps,
+    )
+
+
+def create(connection: Connection, sink: SinkName, log_id: str, inputs: MapInputs) -> None:
+    """Insert a checkpoint at offset 0, if there is none."""
+    first = at_offset(log_id, inputs, FIRST_OFFSET, "")
+    connection.execute(statements("checkpoint")["create_first"], {"sink": sink, **asdict(first)})
+
+
+def advance(
+    connection: Connection, sink: SinkName, before: Checkpoint, after: Checkpoint
+) -> Checkpoint:
+    """Move the checkpoint, in the transaction of the rows. Raises CheckpointMoved."""
+    cursor = connection.execute(
+        statements("checkpoint")["advance"],
+        {
+            "sink": sink,
+            **asdict(after),
+            "expected": before.next_offset,
+            "expected_fingerprint": before.fingerprint,
+        },
+    )
+    if cursor.fetchone() is not None:
+        return after
+    found = load(connection, sink)
+    raise CheckpointMoved(
+        f"{describe_connection(connection)}: the checkpoint of the {sink} was expected at offset"
+        f" {before.next_offset:,} of log {before.log_id}, but is"
+        f" {f'at {found.next_offset:,} of log {found.log_id}' if found else 'gone'}: something else"
+        " writes there; stop it, then start again"
+    )
+
+
+def replace(connection: Connection, sink: SinkName, checkpoint: Checkpoint) -> None:
+    """Write a rebuild's checkpoint and delete the dead letters."""
+    connection.execute(statements("checkpoint")["replace"], {"sink": sink, **asdict(checkpoint)})
+    connection.execute(statements("checkpoint")["unpark"], {"sink": sink})
+
+
+def park(connection: Connection, sink: SinkName, letter: DeadLetter) -> None:
+    """Record an event that was left out, in the transaction that moves past it."""
+    connection.execute(
+        statements("checkpoint")["park"],
+        {
+            "sink": sink,
+            "log_offset": letter.offset,
+            "key": letter.key,
+            "run_id": letter.run_id,
+            "reason": letter.reason,
+        },
+    )
+
+
+def parked(connection: Connection, sink: SinkName) -> list[DeadLetter]:
+    """The dead letters, by offset."""
+    if not has_schema(connection):
+        return []
+    rows = connection.execute(statements("checkpoint")["parked"], {"sink": sink}).fetchall()
+    return [DeadLetter(*row) for row in rows]
+
+
+def write_heartbeat(connection: Connection, sink: SinkName) -> None:
+    """Record that the sink's tail is alive."""
+    connection.execute(statements("checkpoint")["write_heartbeat"], {"sink": sink})
+
+
+def write_refold(
+    connection: Connection, sink: SinkName, done: int | None, total: int | None
+) -> None:
+    """Record that the sink's tail is alive, and how far its refold is; None for no refold."""
+    values = {"sink": sink, "done": done, "total": total}
+    connection.execute(statements("checkpoint")["write_refold"], values)
+
+
+def refold(connection: Connection, sink: SinkName) -> tuple[int, int] | None:
+    """The number of events that a tail has refolded, and of all; None when it is not refolding."""
+    row = connection.execute(statements("checkpoint")["refold"], {"sink": sink}).fetchone()
+    return None if row is None or row[0] is None or row[1] is None else (row[0], row[1])
+
+
+def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:
+    """Seconds since the checkpoint moved, and since its tail's last heartbeat (None: never)."""
+    row = connection.execute(statements("checkpoint")["ages"], {"sink": sink}).fetchone()
+    return (0.0, None) if row is None else (row[0], row[1])
+
+
+def dead_letter(event: Event, reason: str) -> DeadLetter:
+    """The dead letter of an event."""
+    return DeadLetter(event.offset, event.key, _run_id(event.payload), reason)
+
+
+def _run_id(payload: bytes) -> RunId | None:
+    try:
+        document = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    run_id = document.get("run_id") if isinstance(document, dict) else None
+    return RunId(run_id) if isinstance(run_id, str) and "\0" not in run_id else None

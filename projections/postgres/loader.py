@@ -1,0 +1,268 @@
+"""Bulk insertion of new rows: the port `Loader` and its two implementations.
+
+`CopyLoader` streams COPY, for rebuilds and large batches. `InsertLoader` sends ``INSERT … SELECT
+unnest``, for servers and proxies that do not let COPY through, and for batches so small that COPY's
+own round trips would cost more. Both write the same rows: one contract test class runs on both.
+
+A loader makes a `Load` of the rows: all work of this process is done then, and only sending is
+left. A rebuild sends in a thread; if the thread encoded rows too, it and the fold would take the
+interpreter from each other tens of thousands of times, a fifth of the time of both.
+
+Rows of ``detection_embeddings`` are encoded here in COPY's binary format, as they are most of a
+rebuild's bytes: 2 KiB of float32 per row go through one numpy byte swap instead of a type adapter
+per field (18k rows/s there, several times that here).
+
+The format (PostgreSQL manual, "COPY", Binary Format): a signature, flags and a header length; then
+for each row an int16 number of fields and for each field an int32 length (-1 for NULL) and its
+bytes as the type's ``recv`` function takes them; an int16 -1 ends it. All big-endian.
+
+    bigint int64 · text UTF-8 · double precision float64 · timestamptz int64 µs since 2000-01-01
+    real[] int32 dimensions, flags, element type's oid, length, lower bound, then length + float32
+    vector int16 dimension, int16 0, float32 … (pgvector's vector_recv)
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Final, Literal, Protocol, TypeAlias
+
+import numpy as np
+from psycopg import sql
+
+from projections.fold.deltas import ObservationAdded
+from projections.fold.exact import to_float32
+
+from .connection import Connection
+from .graph_render import EdgeRow, VertexRow
+from .labels import EdgeLabel, VertexLabel
+from .statements import statements
+from .vector_rows import VectorRow
+
+COPIED: Final = (
+    "run_id", "keyframe_id", "map_x", "map_y", "map_yaw", "ingested_at",
+    "det_pk", "confidence", "bbox", "det_id", "class_name", "embedding_model", "embedding",
+)  # fmt: skip
+"""The columns in the order of the fields: first those that all rows of a keyframe share."""
+_HEADER: Final = b"PGCOPY\n\xff\r\n\0" + struct.pack(">ii", 0, 0)
+_TRAILER: Final = struct.pack(">h", -1)
+_NULL: Final = struct.pack(">i", -1)
+_POSTGRES_EPOCH_US: Final = 946_684_800_000_000
+_FLOAT4_OID: Final = 700
+
+_count = struct.Struct(">h").pack
+_length = struct.Struct(">i").pack
+_int64 = struct.Struct(">iq").pack
+_pose = struct.Struct(">ididid").pack
+_REALS: Final = struct.pack(">iiiiii", 52, 1, 0, _FLOAT4_OID, 4, 1)
+"""The field of a ``real[]`` of four, up to its first element."""
+_fixed = struct.Struct(f">iqid{len(_REALS)}sififififi").pack
+_vector = struct.Struct(">ihh").pack
+
+
+def copy_document(rows: Sequence[VectorRow], first: bool, last: bool) -> bytes:
+    """``rows`` as bytes, with the header if they are the ``first``, the trailer if the ``last``."""
+    parts: list[bytes | memoryview] = [_HEADER] if first else []
+    keyframe, shared = -1, b""
+    for row, vector in zip(rows, _vectors(rows), strict=True):
+        added = row.added
+        if added.keyframe != keyframe:
+            keyframe, shared = added.keyframe, _shared_fields(row)
+        det_id = added.det_id.encode()
+        try:
+            numbers = _numbers(added, added.bbox, len(det_id))
+        except OverflowError:  # a corner beyond float32
+            numbers = _numbers(added, row.bbox, len(det_id))
+        names = _name_fields(added.class_name, added.embedding_model)
+        parts += (shared, numbers, det_id, names, vector)
+    if last:
+        parts.append(_TRAILER)
+    return b"".join(parts)
+
+
+def _vectors(rows: Sequence[VectorRow]) -> list[memoryview]:
+    """The fields of the vectors, encoded together; all have the table's dimension."""
+    if not rows:
+        return []
+    units = np.array([row.unit for row in rows])
+    dim = units.shape[1]
+    fields = np.empty((len(rows), 8 + 4 * dim), np.uint8)
+    fields[:, :8] = np.frombuffer(_vector(4 + 4 * dim, dim, 0), np.uint8)
+    fields[:, 8:].view(">f4")[:] = to_float32(units)
+    flat, size = fields.reshape(-1).data, fields.shape[1]
+    return [flat[start : start + size] for start in range(0, len(flat), size)]
+
+
+def _shared_fields(row: VectorRow) -> bytes:
+    return b"".join((
+        _count(len(COPIED)),
+        _text(row.added.run_id),
+        _int64(8, row.added.keyframe_id),
+        _NULL * 3 if row.pose is None else _pose_fields(row.pose),
+        _int64(8, row.ingested_us - _POSTGRES_EPOCH_US),
+    ))  # fmt: skip
+
+
+def _numbers(
+    added: ObservationAdded, bbox: tuple[float, float, float, float], id_length: int
+) -> bytes:
+    """The fields of numbers, and the length of the det_id, whose field is the next."""
+    x0, y0, x1, y1 = bbox
+    key = added.observation + 1
+    return _fixed(8, key, 8, added.confidence, _REALS, 4, x0, 4, y0, 4, x1, 4, y1, id_length)
+
+
+def _pose_fields(pose: tuple[float, float, float]) -> bytes:
+    x, y, yaw = pose
+    return _pose(8, x, 8, y, 8, yaw)
+
+
+def _text(value: str) -> bytes:
+    data = value.encode()
+    return _length(len(data)) + data
+
+
+@lru_cache(maxsize=4096)
+def _name_fields(class_name: str, model: str | None) -> bytes:
+    """Cached, as many rows have the same."""
+    return _text(class_name) + (_NULL if model is None else _text(model))
+
+
+LoaderName: TypeAlias = Literal["copy", "insert"]
+Load: TypeAlias = Callable[[Connection], None]
+"""Sends rows that are not in the table yet, inside a transaction."""
+TypeName: TypeAlias = Callable[[], sql.Composable]
+"""Returns pgvector's type. Called when rows are sent: when they are encoded, a rebuild's thread may
+not have read yet in which schema the server has it."""
+INSERT_CHUNK: Final = 5_000
+"""Rows of one INSERT: client and server hold all of a statement's parameters in memory."""
+VECTOR_CHUNK: Final = 500
+COPY_CHUNK: Final = 60
+"""Vectors encoded and sent together: 128 kB, psycopg's own size. Larger ones are slower, as their
+memory is allocated by the system each time."""
+
+
+class Loader(Protocol):
+    """Makes functions that insert rows not yet in the table."""
+
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
+        """Add vertices of one label."""
+
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
+        """Add edges of one label."""
+
+    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
+        """Add rows of ``detection_embeddings``."""
+
+
+class CopyLoader:
+    """COPY: text for the graph (agtype has no binary form), binary for the vectors."""
+
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
+        """Add vertices of one label."""
+        lines = [f"{i}\t{properties}\n" for i, properties in rows]
+        return _copy(_graph_statement("copy_vertex", graph, label), [_text_document(lines)])
+
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
+        """Add edges of one label."""
+        lines = [f"{i}\t{start}\t{end}\t{properties}\n" for i, start, end, properties in rows]
+        return _copy(_graph_statement("copy_edge", graph, label), [_text_document(lines)])
+
+    def vectors(
+        self,
+        schema: str,
+        vector: TypeName,  # noqa: ARG002 - COPY takes the type from the table
+        rows: Sequence[VectorRow],
+    ) -> Load:
+        """Add rows of ``detection_embeddings``."""
+        statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
+            sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COPIED))
+        )
+        starts = range(0, len(rows), COPY_CHUNK)
+        return _copy(
+            statement,
+            [
+                copy_document(rows[i : i + COPY_CHUNK], i == 0, i + COPY_CHUNK >= len(rows))
+                for i in starts
+            ],
+        )
+
+
+class InsertLoader:
+    """``INSERT … SELECT unnest(…)`` with the columns as bound arrays."""
+
+    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
+        """Add vertices of one label."""
+        return unnest_columns("insert_vertex", graph, label, rows)
+
+    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
+        """Add edges of one label."""
+        return unnest_columns("insert_edge", graph, label, rows)
+
+    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
+        """Add rows of ``detection_embeddings``."""
+        insert, where = statements("vectors")["insert"], sql.Identifier(schema)
+        fields = [_vector_fields(row) for row in rows]
+        return _unnest(lambda: insert.format(schema=where, vector=vector()), fields, VECTOR_CHUNK)
+
+
+def unnest_columns(
+    statement: str, graph: str, label: str, rows: Sequence[VertexRow] | Sequence[EdgeRow]
+) -> Load:
+    """Runs one of the unnest statements of ``sql/graph.sql`` with the columns of ``rows``."""
+    as_text = [tuple(map(str, row)) for row in rows]
+    query = _graph_statement(statement, graph, label)
+    return _unnest(lambda: query, as_text, INSERT_CHUNK)
+
+
+def loader_of(name: LoaderName) -> Loader:
+    """The loader called ``name``."""
+    return CopyLoader() if name == "copy" else InsertLoader()
+
+
+def _graph_statement(statement: str, graph: str, label: str) -> sql.Composed:
+    return statements("graph")[statement].format(
+        graph=sql.Identifier(graph), label=sql.Identifier(label)
+    )
+
+
+def _text_document(lines: list[str]) -> bytes:
+    # agtype text holds no raw tab or line end (they are escaped in strings), so the backslash is
+    # the only character that COPY's own format still has to escape.
+    return "".join(lines).replace("\\", "\\\\").encode()
+
+
+def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:
+    def load(connection: Connection) -> None:
+        with connection.cursor() as cursor, cursor.copy(statement) as copy:
+            for document in documents:
+                copy.write(document)
+
+    return load
+
+
+def _unnest(
+    statement: Callable[[], sql.Composed], rows: Sequence[tuple[object, ...]], size: int
+) -> Load:
+    """One statement for each ``size`` rows."""
+    chunks = [
+        [list(column) for column in zip(*rows[start : start + size], strict=True)]
+        for start in range(0, len(rows), size)
+    ]
+
+    def load(connection: Connection) -> None:
+        query = statement()
+        for columns in chunks:
+            connection.execute(query, columns)
+
+    return load
+
+
+def _vector_fields(row: VectorRow) -> tuple[object, ...]:
+    pose = row.pose or (None, None, None)
+    bbox = "{" + ",".join(map(repr, row.bbox)) + "}"
+    embedding = "[" + ",".join(map(repr, row.embedding.tolist())) + "]"
+    added = row.added
+    return (
+        row.det_pk, added.run_id, added.det_id, added.keyframe_id, added.class_name,
+        added.confidence, bbox, *pose, added.embedding_model, embedding, row.ingested_at,
+    )  # fmt: skip

@@ -1,0 +1,240 @@
+"""Queries of the map for `mapfold query`, as documents for JSON: of the live databases or a fold.
+
+A `MapSource` has the data they need: `LiveMap` in the graph's database, `FoldedMap` in a view.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from eventsrc.base.advised import advised
+from projections.fold.deltas import PlaceOrdinal
+from projections.fold.errors import QuestionError
+from projections.fold.place_types import type_of_name
+from projections.localize.relocalize import CandidatePlace, Candidates, Crop
+from projections.map.records import ObjectRecord
+from projections.map.view import MapView
+from projections.postgres.connection import Connection
+
+from .graph_reads import read_object, read_object_counts, read_objects_of_place, read_place_graph
+from .place_graph import PlaceGraph, PlaceNode
+
+_OBJECT_FIELDS = (
+    "object_id",
+    "class_name",
+    "mean_x",
+    "mean_y",
+    "obs_count",
+    "first_seen",
+    "last_seen",
+    "est_x",
+    "est_y",
+    "est_sigma_m",
+    "missing",
+    "place_id",
+    "place_name",
+)
+"""The fields of an Object in the order of the documents; agtype has its own order. Only an Object
+in a Place that has a name has the last one; only fusion by evidence gives ``est_x`` to
+``missing``."""
+
+
+class MapSource(Protocol):
+    """The data of a map."""
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+
+
+class LiveMap:
+    """The graph's database; ``connection`` was set up by `prepare_graph`."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+        return read_place_graph(self._connection)
+
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+        return read_object_counts(self._connection, class_name)
+
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+        found = read_object(self._connection, object_id)
+        return None if found is None else _ordered(found)
+
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+        return [_ordered(thing) for thing in read_objects_of_place(self._connection, place_id)]
+
+
+class FoldedMap:
+    """A folded map."""
+
+    def __init__(self, view: MapView) -> None:
+        self._view = view
+
+    def place_graph(self) -> PlaceGraph:
+        """All Places and their adjacency."""
+        return PlaceGraph.of_view(self._view)
+
+    def count_objects(self, class_name: str) -> dict[int, int]:
+        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+        counts: dict[int, int] = {}
+        for thing in self._view.objects.values():
+            if thing.class_name == class_name and thing.place is not None:
+                counts[thing.place] = counts.get(thing.place, 0) + 1
+        return counts
+
+    def find_object(self, object_id: str) -> dict[str, Any] | None:
+        """An Object with its place_id."""
+        return next(
+            (
+                self._document(o.ordinal)
+                for o in self._view.objects.values()
+                if o.object_id == object_id
+            ),
+            None,
+        )
+
+    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
+        """The Objects of a Place."""
+        return [
+            self._document(o.ordinal)
+            for o in self._view.objects.values()
+            if self._view.place_id(o.place) == place_id
+        ]
+
+    def _document(self, ordinal: int) -> dict[str, Any]:
+        thing = self._view.all_objects[ordinal]
+        return {
+            "object_id": thing.object_id,
+            "class_name": thing.class_name,
+            "mean_x": thing.mean_x,
+            "mean_y": thing.mean_y,
+            "obs_count": thing.obs_count,
+            "first_seen": thing.first_seen,
+            "last_seen": thing.last_seen,
+            **self._evidence(thing),
+            "place_id": self._view.place_id(thing.place),
+        } | self._place_name(thing.place)
+
+    def _evidence(self, thing: ObjectRecord) -> dict[str, Any]:
+        if self._view.settings.fusion != "evidence":
+            return {}
+        at, missing = thing.estimate, {"missing": thing.missing_in is not None}
+        if at is None:
+            return missing
+        return {"est_x": at.est_x, "est_y": at.est_y, "est_sigma_m": at.est_sigma_m} | missing
+
+    def _place_name(self, place: PlaceOrdinal | None) -> dict[str, str]:
+        name = None if place is None else self._view.all_places[place].name
+        return {} if name is None else {"place_name": name}
+
+
+def _ordered(thing: dict[str, Any]) -> dict[str, Any]:
+    return {name: thing[name] for name in _OBJECT_FIELDS if name in thing}
+
+
+def _named(place: PlaceNode | CandidatePlace | None, key: str = "name") -> dict[str, str]:
+    """A Place's name under ``key``, nothing if it has none."""
+    return {} if place is None or place.name is None else {key: place.name}
+
+
+def where_is(source: MapSource, wanted: str) -> dict[str, Any] | list[dict[str, Any]]:
+    """An Object by its id and the Place it is located in; or the Places that are of this type or
+    have this name, likeliest first. Raises QuestionError if there is neither."""
+    thing = source.find_object(wanted)
+    if thing is not None:
+        return thing
+    places = source.place_graph().places.values()
+    kind = type_of_name(wanted)
+    found = [p for p in places if p.name == wanted or (kind is not None and p.type == kind)]
+    if not found:
+        types = sorted({place.type for place in places if place.type is not None})
+        known = f"; there are places of type {', '.join(types)}" if types else ""
+        raise QuestionError(
+            f"no object {wanted!r} in this map, and no place of that type or name{known}; "
+            f"`{advised('state', '--json')}` lists objects and places"
+        )
+    found.sort(key=lambda p: (p.name != wanted, -(p.type_probability or 0.0), p.ordinal))
+    return [
+        {"place_id": p.place_id, "centroid_x": p.x, "centroid_y": p.y}
+        | ({} if p.type is None else {"type": p.type, "type_probability": p.type_probability})
+        | _named(p)
+        for p in found
+    ]
+
+
+def objects_of(source: MapSource, place_id: str) -> list[dict[str, Any]]:
+    """The Objects of a Place. Raises QuestionError if there is no such Place."""
+    found = source.objects_in(place_id)
+    if not found:
+        source.place_graph().find(place_id)
+    return found
+
+
+def places_holding(
+    source: MapSource, class_name: str, start: str, hops: int
+) -> list[dict[str, Any]]:
+    """Places within ``hops`` steps of ``start`` with an Object of a class, nearest first."""
+    graph = source.place_graph()
+    within = graph.hops_from(graph.find(start), hops)
+    counts = source.count_objects(class_name)
+    order = sorted((p for p in within if p in counts), key=lambda p: (within[p], p))
+    return [
+        {"place_id": graph.places[p].place_id, "hops": within[p], "objects": counts[p]}
+        | _named(graph.places[p])
+        for p in order
+    ]
+
+
+def path_between(source: MapSource, start: str, goal: str) -> list[dict[str, Any]]:
+    """The Places on the shortest path, both ends included; empty if there is no path."""
+    graph = source.place_graph()
+    way = graph.path(graph.find(start), graph.find(goal)) or []
+    return [
+        {
+            "place_id": graph.places[p].place_id,
+            "centroid_x": graph.places[p].x,
+            "centroid_y": graph.places[p].y,
+            "shared_transitions": None if i == 0 else graph.shared(way[i - 1], p),
+        }
+        | _named(graph.places[p])
+        for i, p in enumerate(way)
+    ]
+
+
+def similar_objects(
+    crops: Sequence[Crop], candidates: Candidates, top: int
+) -> list[dict[str, Any]]:
+    """Objects most like any of the crops, by their most similar observation."""
+    best: dict[str, dict[str, Any]] = {}
+    for row in candidates.matches[: len(crops)]:
+        for match in row:
+            if match.object_id is None:
+                continue
+            earlier = best.get(match.object_id)
+            if earlier is None or match.similarity > earlier["similarity"]:
+                place = (
+                    None if match.object_place is None else candidates.places[match.object_place]
+                )
+                best[match.object_id] = {
+                    "object_id": match.object_id,
+                    "class_name": match.class_name,
+                    "similarity": match.similarity,
+                    "det_id": match.det_id,
+                    "place_id": None if place is None else place.place_id,
+                } | _named(place, "place_name")
+    ordered = sorted(best.values(), key=lambda o: (-o["similarity"], o["object_id"]))
+    return ordered[:top]

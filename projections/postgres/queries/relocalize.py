@@ -1,0 +1,121 @@
+"""Re-localisation with the live databases.
+
+`relocalize` answers a whole question; a `CandidateReader` keeps the connections for several. The
+candidates (`projections.postgres.queries.candidates`) are ranked in
+`projections.localize.relocalize`.
+"""
+
+from collections.abc import Sequence
+from typing import Self
+
+import psycopg
+from pgvector.psycopg import register_vector
+from psycopg import sql
+
+from eventsrc.base.advised import advised
+from projections.fold.errors import ExtensionMissing
+from projections.localize.relocalize import (
+    NEIGHBOURS,
+    Answer,
+    Camera,
+    Candidates,
+    Crop,
+    Method,
+    Question,
+    rank,
+)
+from projections.postgres.connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_connection,
+)
+
+from .candidates import CandidateSearch
+from .known_constants import ConstantsMemory
+
+_EF_SEARCH = max(100, NEIGHBOURS)
+
+
+def relocalize(
+    targets: Targets,
+    question: Question | Sequence[Crop],
+    *,
+    top: int = 3,
+    method: Method = "joint",
+    camera: Camera | None = None,
+) -> Answer:
+    """Answer a question for re-localisation from the databases as they are now."""
+    crops = question.crops if isinstance(question, Question) else question
+    with CandidateReader(targets) as reader:
+        return rank(question, reader.candidates(crops), top=top, method=method, camera=camera)
+
+
+def prepare_graph(connection: Connection) -> None:
+    """Set up a session for joins of the graph's tables by id; ag_catalog comes last in the path.
+
+    A question joins a few hundred ids. By default the planner reads whole tables into hashes for
+    that: 300 ms instead of 10 at 300,000 observations.
+    """
+    connection.execute('SET search_path = "$user", public, ag_catalog')
+    for setting in ("jit", "enable_hashjoin", "enable_mergejoin"):
+        connection.execute(sql.SQL("SET {} = off").format(sql.Identifier(setting)))
+
+
+def prepare_vectors(connection: Connection) -> None:
+    """Set up a session for vector search: vectors in binary, a wider HNSW search.
+
+    Without a wider ``ef_search`` an HNSW index silently returns fewer rows than asked for.
+    """
+    try:
+        register_vector(connection)
+    except psycopg.ProgrammingError:
+        raise ExtensionMissing(
+            f"{describe_connection(connection)}: nothing has been projected there yet, not even"
+            f" the extension vector is created; run `{advised('replay')}`"
+        ) from None
+    connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
+    connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
+
+
+class CandidateReader:
+    """Connections to the databases of one projection, for one question after the other."""
+
+    def __init__(self, targets: Targets) -> None:
+        self._targets, self._memory = targets, ConstantsMemory()
+        self._vectors = connect(targets.vector_url, application="mapfold query", autocommit=True)
+        self._graph = self._vectors
+        try:
+            with database_errors(targets.vector_url):
+                prepare_vectors(self._vectors)
+            if not targets.one_database:
+                self._graph = connect(
+                    targets.graph_url, application="mapfold query", autocommit=True
+                )
+            prepare_graph(self._graph)
+        except BaseException:
+            self._vectors.close()
+            raise
+
+    def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+        """The ``neighbours`` observations most similar to each crop, with their Places."""
+        search = CandidateSearch(self._targets, self._vectors, self._graph, self._memory)
+        return search.candidates(crops, neighbours)
+
+    def disable_index(self) -> None:
+        """From now on search exactly, without the HNSW index: slow."""
+        self._vectors.execute("SET enable_indexscan = off")
+        # plans made before would still use the index
+        self._vectors.execute("SET plan_cache_mode = force_custom_plan")
+
+    def close(self) -> None:
+        """Close the connections. May be called twice."""
+        self._vectors.close()
+        self._graph.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

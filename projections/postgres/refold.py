@@ -1,0 +1,289 @@
+"""Refold: a tail folds the log again under other corrections while readers use the old map.
+
+It is a rebuild (`shadows`) over the tail's own connections and locks, with three differences. It
+continues until it has folded all events recorded meanwhile. An event that cannot be folded is
+parked, as by a tail; but one that cannot be folded only because of a command ends the refold, and
+the old map stays. And it polls for commands recorded during the refold: those that only name places
+are included; another one restarts it once. After that it is completed before the next refold
+begins, so that frequent commands cannot prevent every change of the map. Rows of vectors that no
+correction changes are kept (`KeptVectors`).
+
+The transaction of the swap records in the checkpoint which commands the new map includes. However a
+refold ends, a command that the map does not include makes the next tail refold.
+
+Its progress is in the checkpoints, for other processes to read. The refold's own connections are in
+the transaction of the swap, whose writes are not visible before it ends, so a thread writes the
+progress over connections of its own.
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+from typing import Final, Self
+
+from eventsrc.base.advised import advised
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader
+from projections.fold.errors import DatabaseError, ImpossibleCommand
+from projections.map.changes import BatchChanges
+from projections.map.fold import gc_paused
+from projections.map.view import MapView
+
+from . import checkpoints, vector_table
+from .checkpoints import DeadLetter, dead_letter
+from .connection import Connection, database_errors, describe_connection
+from .inputs import LogInputs, MapInputs, commands_between
+from .labels import TABLE
+from .live_fold import LiveFold, batches
+from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
+from .sink import Checkpoint, Shadow, SinkName
+from .statements import statements
+from .stores import DatabaseSink, Store
+from .vector_table import READERS, has_hnsw
+
+BEAT_S: Final = 1.0
+
+
+class RefoldProgress:
+    """A context manager around a refold of ``stores``. ``update`` raises what the thread raised."""
+
+    def __init__(self, stores: Sequence[Store]) -> None:
+        self._stores = stores
+        self._at: tuple[int, int] | tuple[None, None] = (0, 0)
+        self._held = threading.Lock()
+        self._ended = threading.Event()
+        self._failed: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="refold-progress", daemon=True)
+        self._stack = contextlib.ExitStack()
+        self._connections: list[tuple[Store, Connection]] = []
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            for store in self._stores:
+                connection = stack.enter_context(store.throwaway_connection())
+                self._connections.append((store, connection))
+            self._write()
+            self._stack = stack.pop_all()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._stack.close()
+
+    def update(self, done: int, total: int) -> None:
+        """``done`` of ``total`` events are folded. Raises what the thread raised."""
+        self._at = (done, total)
+        if self._failed is not None:
+            raise self._failed
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Pause writing progress during the block, which changes the checkpoints and ends the
+        refold."""
+        with self._held:
+            yield
+            self._at = (None, None)
+
+    def _work(self) -> None:
+        try:
+            while not self._ended.wait(BEAT_S):
+                with self._held:
+                    self._write()
+        except BaseException as error:  # noqa: BLE001 - raised by `update`
+            self._failed = error
+
+    def _write(self) -> None:
+        for store, connection in self._connections:
+            with database_errors(store.url):
+                for sink in store.sinks:
+                    checkpoints.write_refold(connection, sink.name, *self._at)
+
+
+TICK_EVENTS: Final = 256
+LOOK_S: Final = 0.5
+"""Seconds between two polls for new commands."""
+
+
+class CommandsCame(Exception):
+    """Commands that change more than names were recorded during a refold."""
+
+
+class RefoldStopped(Exception):
+    """The tail was stopped during a refold; the old map stays."""
+
+
+@dataclass(slots=True)
+class Refold:
+    """One refold. ``found`` are the checkpoints of the old map, ``parked`` its dead letters.
+
+    With ``goes_through`` commands recorded meanwhile are left to the next refold.
+    """
+
+    stores: Sequence[Store]
+    reader: LogReader
+    inputs: LogInputs
+    found: dict[SinkName, Checkpoint]
+    parked: bool
+    stop: threading.Event
+    goes_through: bool
+    on_progress: Callable[[int, int], None]
+    base: MapInputs = field(init=False)
+    _letters: list[DeadLetter] = field(default_factory=list)
+    _looked_at: float = 0.0
+
+    def run(self) -> FoldedLog:
+        """Fold the log again and swap the new map in.
+
+        Raises CommandsCame, RefoldStopped, ImpossibleCommand.
+        """
+        self.base = self.inputs.latest
+        folded: list[FoldedLog] = []
+
+        def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:
+            folded.append(self._fold(writers, progress))
+            return folded[0]
+
+        indexed = self._swaps_indexed_vectors()
+        with gc_paused(), RefoldProgress(self.stores) as progress:
+            swap_in_new_map(
+                self.stores,
+                self.reader.log_id,
+                fold_into,
+                lambda _: None,
+                shadow_of=self._shadow_of(),
+                while_swapping=progress.held(),
+            )
+            drop_replaced(self.stores, lambda _: None, hnsw=indexed)
+        return folded[0]
+
+    def _fold(self, writers: Sequence[ShadowWriter], progress: RefoldProgress) -> FoldedLog:
+        fold = LiveFold(self.base.settings, corrections=self.base.corrections, reader=self.reader)
+        last: Event | None = None
+        at, end = FIRST_OFFSET, self.inputs.end
+        with LogReader(self.reader.path) as events:
+            while at < end:
+                for batch in batches(events.read(at, end), TICK_EVENTS):
+                    self._feed(fold, batch)
+                    last = batch[-1]
+                    stream(fold, writers)
+                    progress.update(last.offset + 1, end)
+                    self.on_progress(last.offset + 1, end)
+                    if time.monotonic() - self._looked_at > LOOK_S:
+                        self._look()
+                at, end = end, self._look()
+                events.refresh()
+        return FoldedLog(fold, last, self._named(fold, last), tuple(self._letters))
+
+    def _feed(self, fold: LiveFold, batch: list[Event]) -> None:
+        if self.stop.is_set():
+            raise RefoldStopped
+        for event, error in zip(batch, fold.feed(batch), strict=True):
+            if isinstance(error, ImpossibleCommand):
+                raise error
+            if error is not None:
+                self._letters.append(dead_letter(event, error.reason))
+
+    def _look(self) -> Offset:
+        """Read new commands; returns the log's current end."""
+        self._looked_at = time.monotonic()
+        start, end = self.inputs.end, self.reader.refresh()
+        self.inputs.extend(commands_between(self.reader, start, end), end)
+        if not self.goes_through and not self.base.differs_only_in_names(self.inputs.latest):
+            raise CommandsCame
+        return end
+
+    def _named(self, fold: LiveFold, last: Event | None) -> MapInputs:
+        """The inputs of the map, with names recorded meanwhile."""
+        latest = self.inputs.latest
+        if last is None or not self.base.differs_only_in_names(latest):
+            return self.base
+        fold.use_names(last.offset, latest.corrections)
+        return latest
+
+    def _shadow_of(self) -> ShadowOf:
+        def shadow_of(sink: DatabaseSink) -> Shadow[Connection]:
+            if self._keeps(sink.name):
+                return KeptVectors(sink, self.found[sink.name].next_offset)
+            return sink.shadow()
+
+        return shadow_of
+
+    def _keeps(self, sink: SinkName) -> bool:
+        """Whether the new map has the same rows of this sink.
+
+        Parked events are tried again, and one that can be folded now would move all later rows.
+        """
+        found = self.found[sink]
+        observed = found.fingerprint if found.observed is None else found.observed
+        return sink == "vectors" and observed == self.base.observed and not self.parked
+
+    def _swaps_indexed_vectors(self) -> bool:
+        return any(
+            has_hnsw(store.connection)
+            for store in self.stores
+            for sink in store.sinks
+            if sink.name == "vectors" and not self._keeps("vectors")
+        )
+
+
+def refuse_if_not_allowed(stores: Sequence[Store], advice: str) -> None:
+    """Raise DatabaseError when this role may not make the tables of a refold."""
+    for store in stores:
+        with database_errors(store.url):
+            row = store.connection.execute(statements("checkpoint")["may_create"]).fetchone()
+        if row is None or not row[0]:
+            raise DatabaseError(
+                f"{store.place}: the log has commands that the map there does not know yet, and"
+                " this role may not make the tables of a new one; have their owner make it, then"
+                f" start again; {advice}"
+            )
+
+
+class KeptVectors:
+    """Implements `Shadow` for vectors that have the events before ``start``, without a shadow.
+
+    Rows of later events are added to the readers' table, in the transaction of the swap.
+    """
+
+    def __init__(self, sink: DatabaseSink, start: Offset) -> None:
+        self._sink: Final = sink
+        self._start: Final = start
+
+    def create(self, connection: Connection) -> None:
+        """Nothing to do."""
+
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Connection], None]:
+        """Returns a function that adds the rows of events that came since."""
+        missing = [row for row in changes.embedded if row[0].offset >= self._start]
+        if not missing:
+            return lambda _: None
+        return self._sink.prepare(replace(changes, embedded=missing), view).send
+
+    def finish(self, view: MapView) -> Callable[[Connection], Mapping[str, int]]:
+        """Returns a function that compares numbers."""
+        expected = sum(o.embedding_crc is not None for o in view.observations)
+
+        def finish(connection: Connection) -> Mapping[str, int]:
+            found = vector_table.count(connection, READERS)
+            if found != expected:
+                raise DatabaseError(
+                    f"{describe_connection(connection)}: {TABLE} has {found:,} rows, the map"
+                    f" {expected:,} searchable detections; run `{advised('replay')}`, which makes"
+                    " both again"
+                )
+            return {TABLE: found}
+
+        return finish
+
+    def lock_readers(self, connection: Connection) -> None:
+        """Nothing to do: readers see the added rows when the transaction is committed."""
+
+    def swap_in(self, connection: Connection) -> None:
+        """Nothing to do."""

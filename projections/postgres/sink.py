@@ -1,0 +1,132 @@
+"""The interface (port) between the fold and the places to which the map is written.
+
+A sink that follows a log implements `LiveSink`. For each batch of events `tail_pass` calls
+`prepare` with the ids that the batch changed and the view; `writer` opens a transaction, calls
+``send`` of the prepared write, moves the sink's checkpoint and commits: both are written or none.
+After a lost connection it calls `ensure` and, if the batch was not committed, the same ``send``
+again.
+
+A sink that can also be rebuilt from the start of a log implements `RebuildSink`; a sink of the
+databases (`stores.DatabaseSink`) does both. `shadows` calls, in this order:
+
+1. `RebuildSink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
+2. `Shadow.create`
+3. while the log is folded: `Shadow.load`, several times; at its end: `Shadow.finish`
+4. `Shadow.lock_readers`, for all shadows before any is swapped in; again for all if one fails
+5. `Shadow.swap_in`; then it commits, with a new checkpoint. Readers see the old map until then
+6. `RebuildSink.drop_replaced`, outside a transaction
+
+``Conn`` is what the sink writes through: a psycopg connection for the databases, `MemoryTables` for
+memory. It is in a transaction, except in steps 1 and 6. A method that gets the view gets no
+connection: it returns a function that gets one, so that the fold can go on while a thread calls
+that function.
+
+Each event's changes reach a sink once. Ordinals are the same in every fold of a log: a sink that
+computes its ids from them has the same rows after a tail and a rebuild, and never looks an id up.
+docs/architecture.md ("Where to add") lists the other files that name each sink.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
+
+from eventsrc.envelope.model import Offset
+from projections.map.changes import BatchChanges
+from projections.map.view import MapView
+
+SinkName: TypeAlias = Literal["graph", "vectors"]
+"""The ``name`` of a sink of the databases: the key of its checkpoint, dead letters and locks."""
+Conn = TypeVar("Conn", contravariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A sink's position in the log, and its origin.
+
+    ``next_offset`` events of the log ``log_id`` are in, folded with ``settings`` (canonical JSON)
+    under the corrections of the commands before ``known_at``; ``fingerprint`` is of both.
+    ``last_event`` is `event_hash` of the last event, "" for none: it detects a log that was cut and
+    continued differently. ``digest`` is the map's, when known. ``observed`` is as in
+    `inputs.MapInputs`. ``maps`` identifies the occupancy maps, None for none. Checkpoints of older
+    versions have neither ``known_at`` nor ``observed`` nor ``maps``.
+    """
+
+    log_id: str
+    fingerprint: str
+    settings: str
+    next_offset: Offset
+    last_event: str
+    digest: str | None = None
+    known_at: Offset | None = None
+    observed: str | None = None
+    maps: str | None = None
+
+    @property
+    def known_to(self) -> Offset:
+        """``known_at``, for older versions ``next_offset``."""
+        return self.next_offset if self.known_at is None else self.known_at
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedWrite(Generic[Conn]):
+    """The rows of a batch. ``send`` writes them, again if the first transaction failed.
+
+    ``is_small`` says that ``send`` executes plain statements only, no COPY: a database can then
+    take them in one round trip (a pipeline).
+    """
+
+    send: Callable[[Conn], None]
+    is_small: bool
+
+
+class LiveSink(Protocol[Conn]):
+    """A sink that follows the log."""
+
+    def ensure(self, connection: Conn) -> bool:
+        """Create what rows are written to, if it is missing; returns whether it was.
+
+        Raises DatabaseError when something that mapfold did not make has its name.
+        """
+
+    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
+        """The write that brings the rows up to date with ``view`` after a batch's ``changes``."""
+
+
+class Shadow(Protocol[Conn]):
+    """The new rows of one rebuild, beside those that readers see."""
+
+    def create(self, connection: Conn) -> None:
+        """Create it, empty."""
+
+    def load(self, changes: BatchChanges, view: MapView) -> Callable[[Conn], None]:
+        """Returns a function that inserts rows of new keyframes and observations, those rows that
+        never change again."""
+
+    def finish(self, view: MapView) -> Callable[[Conn], Mapping[str, int]]:
+        """Returns a function that inserts all other rows, builds indexes and counts rows by table.
+
+        The function raises DatabaseError when the view has other numbers.
+        """
+
+    def lock_readers(self, connection: Conn) -> None:
+        """Lock what `swap_in` replaces against readers, until the transaction ends."""
+
+    def swap_in(self, connection: Conn) -> None:
+        """Put the shadow in the place of what readers see."""
+
+
+class RebuildSink(Protocol[Conn]):
+    """A sink that can be rebuilt while readers use the old rows."""
+
+    def drop_leftovers(self, connection: Conn) -> None:
+        """Drop tables that an earlier rebuild replaced or left behind. Raises DatabaseError like
+        `ensure`."""
+
+    def shadow(self) -> Shadow[Conn]:
+        """A shadow, not created yet."""
+
+    def drop_replaced(self, connection: Conn) -> None:
+        """Drop the replaced tables, now or once their last reader has ended.
+
+        May close the connection while the server still drops.
+        """

@@ -1,0 +1,200 @@
+"""The table ``detection_embeddings``: create, find, change, lock and replace it, and index it.
+
+The readers' table is in the schema ``public``, a rebuild's shadow in ``mapfold``, and a replaced
+table in ``mapfold_old`` until it is dropped. A table or schema of ours carries our mark as its
+comment. Anything else under our names is refused, never touched.
+
+The HNSW index of a large table is built after the swap. Up to `EXACT_ROWS` exact search is fast
+enough (measured: docs/projections.md) and gives the true answer. Beyond that the index is built
+while readers go on with exact search and no tail runs. It is built by one process: pgvector before
+0.8.2 can overflow a buffer in a parallel build (CVE-2026-3172), and the bundled one is 0.8.1. And
+with enough memory: a graph that outgrows ``maintenance_work_mem`` is finished on disk, many times
+slower.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import psycopg
+from psycopg import sql
+from psycopg.rows import TupleRow
+
+from eventsrc.base.text import counted
+from projections.fold.errors import DatabaseError
+
+from . import replaced_tables
+from .connection import Connection, describe_connection, extension_version
+from .labels import TABLE
+from .statements import statements
+
+READERS: Final = "public"
+"""The schema of the table that readers see."""
+SHADOW: Final = "mapfold"
+"""The schema of a rebuild's shadow."""
+PLAIN_DIMENSION: Final = 1_900
+"""Dimension up to which a row fits one page of 8 kB and can be kept out of TOAST."""
+EXACT_ROWS: Final = 50_000
+"""Rows up to which the table is searched exactly."""
+INDEX_DIMENSION: Final = 2_000
+"""pgvector's limit for an HNSW index on ``vector``."""
+SAFE_PARALLEL: Final = (0, 8, 2)
+"""The first version of pgvector whose parallel build is safe."""
+_MARK: Final = "mapfold"
+_MEGABYTE: Final = 1 << 20
+_MAX_MEMORY_MB: Final = 4_096
+
+
+def vector_type(connection: Connection) -> sql.Identifier:
+    """pgvector's type, with the schema that the extension is in."""
+    return sql.Identifier(_extension_schema(connection), "vector")
+
+
+def dimension(connection: Connection) -> int | None:
+    """Declared dimension of the readers' table, or None. Raises DatabaseError if it is not ours."""
+    row = connection.execute(
+        statements("vectors")["state"], {"table": f"{READERS}.{TABLE}"}
+    ).fetchone()
+    if row is None:
+        return None
+    if not str(row[0]).startswith(_MARK):
+        raise DatabaseError(
+            f"{describe_connection(connection)}: has a table {TABLE} that mapfold did not"
+            " make; rename or drop it, or use another database"
+        )
+    return int(row[1])
+
+
+def create(connection: Connection, schema: str, vector: sql.Composable, dimension: int) -> None:
+    """An empty table. ``vector`` is `vector_type`."""
+    _execute(connection, "create", schema, vector=vector, dimension=sql.Literal(dimension))
+    _set_storage(connection, schema, dimension)
+
+
+def redimension(
+    connection: Connection, schema: str, vector: sql.Composable, dimension: int
+) -> None:
+    """Change the dimension of an empty table; the server refuses if rows of another are there."""
+    _execute(connection, "redimension", schema, vector=vector, dimension=sql.Literal(dimension))
+    _set_storage(connection, schema, dimension)
+
+
+def is_owner(connection: Connection) -> bool:
+    """Whether we may change the readers' table."""
+    row = connection.execute(statements("vectors")["is_owner"]).fetchone()
+    return row is None or bool(row[0])
+
+
+def has_hnsw(connection: Connection) -> bool:
+    """Whether the readers' table has the index of `build_hnsw`."""
+    row = connection.execute(statements("vectors")["has_hnsw"]).fetchone()
+    return row is not None and bool(row[0])
+
+
+def count(connection: Connection, schema: str) -> int:
+    """Rows."""
+    row = _execute(connection, "count", schema).fetchone()
+    return int(row[0]) if row else 0
+
+
+def analyze(connection: Connection, schema: str) -> None:
+    """Gather statistics. Inside a transaction."""
+    connection.execute(statements("vectors")["sample"])
+    _execute(connection, "analyze", schema)
+
+
+def lock(connection: Connection) -> None:
+    """Lock the readers' table exclusively."""
+    _execute(connection, "lock", READERS)
+
+
+def set_aside(connection: Connection) -> None:
+    """Move the readers' table to ``mapfold_old``. Refuses if something depends on it."""
+    try:
+        with connection.transaction(force_rollback=True):
+            _execute(connection, "drop", READERS)
+    except psycopg.errors.DependentObjectsStillExist as error:
+        raise DatabaseError(
+            f"{describe_connection(connection)}: something else depends on {TABLE}"
+            f" ({error.diag.message_detail}); drop it, then run the rebuild again"
+        ) from None
+    connection.execute(statements("vectors")["put_aside"])
+
+
+def move_in(connection: Connection) -> None:
+    """Make the shadow the readers' table."""
+    connection.execute(statements("vectors")["move"])
+
+
+def has_old(connection: Connection) -> bool:
+    """Whether there is a replaced table. Raises DatabaseError if the schema is not ours."""
+    row = connection.execute(statements("vectors")["old_state"]).fetchone()
+    if row is not None and not str(row[0]).startswith(_MARK):
+        raise DatabaseError(
+            f"{describe_connection(connection)}: has a schema mapfold_old that mapfold did not"
+            " make; rename or drop it, or use another database"
+        )
+    return row is not None
+
+
+def drop_old(connection: Connection) -> None:
+    """Drop the replaced table."""
+    connection.execute(statements("vectors")["drop_old"])
+
+
+def drop_old_in_background(connection: Connection) -> None:
+    """Have the server drop the replaced table in the background; closes the connection."""
+    replaced_tables.send_and_close(connection, statements("vectors")["drop_old"].format())
+
+
+def _set_storage(connection: Connection, schema: str, dimension: int) -> None:
+    _execute(connection, "plain" if dimension <= PLAIN_DIMENSION else "external", schema)
+
+
+def _execute(
+    connection: Connection, name: str, schema: str, **values: sql.Composable
+) -> psycopg.Cursor[TupleRow]:
+    statement = statements("vectors")[name]
+    return connection.execute(statement.format(schema=sql.Identifier(schema), **values))
+
+
+def _extension_schema(connection: Connection) -> str:
+    row = connection.execute(statements("vectors")["extension_schema"]).fetchone()
+    return str(row[0]) if row else "public"
+
+
+@dataclass(frozen=True, slots=True)
+class HnswReport:
+    """``built`` is whether the index was made, ``reason`` why or why not, ``seconds`` the time it
+    took."""
+
+    built: bool
+    reason: str
+    seconds: float = 0.0
+
+
+def build_hnsw(connection: Connection, *, threshold: int = EXACT_ROWS) -> HnswReport:
+    """Build the index if the table is large enough for one. ``connection`` is in autocommit."""
+    row = connection.execute(statements("vectors")["shape"]).fetchone()
+    rows, dimension = (0, 0) if row is None else (int(row[0]), int(row[1]))
+    if rows < threshold:
+        searched = f"{counted(rows, 'row')} {'is' if rows == 1 else 'are'} searched exactly"
+        return HnswReport(False, f"{searched} (index from {threshold:,})")
+    if dimension > INDEX_DIMENSION:
+        return HnswReport(False, f"{dimension:,} dimensions are beyond HNSW's {INDEX_DIMENSION}")
+    started = time.monotonic()
+    opclass = sql.Identifier(_extension_schema(connection), "vector_cosine_ops")
+    with connection.transaction():
+        _prepare(connection, rows, dimension)
+        connection.execute(statements("vectors")["hnsw"].format(opclass=opclass))
+    return HnswReport(True, f"HNSW index over {counted(rows, 'row')}", time.monotonic() - started)
+
+
+def _prepare(connection: Connection, rows: int, dimension: int) -> None:
+    # A vector and its neighbour lists (m = 16) in memory, and a quarter on top.
+    need = int(rows * (4 * dimension + 800) * 1.25) // _MEGABYTE + 64
+    memory = sql.Literal(f"{min(need, _MAX_MEMORY_MB)}MB")
+    connection.execute(sql.SQL("SET LOCAL maintenance_work_mem = {}").format(memory))
+    version = extension_version(connection, "vector") or "0"
+    if tuple(int(part) for part in version.split(".") if part.isdigit()) < SAFE_PARALLEL:
+        connection.execute("SET LOCAL max_parallel_maintenance_workers = 0")

@@ -1,0 +1,172 @@
+"""Deltas as rows of a history's tables, added while events are folded."""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from eventsrc.base.crc import crc32
+from eventsrc.envelope.model import Offset
+from projections.fold.deltas import (
+    Delta,
+    EventSkipped,
+    KeyframeAdded,
+    KeyframePlaced,
+    MapGiven,
+    MergeRefused,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectMissing,
+    ObjectMoved,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    ObservationAdded,
+    PlaceChanged,
+    PlaceFormed,
+    PlaceNamed,
+    PlaceOrdinal,
+    PlacesLinked,
+    PlacesMerged,
+    RunSeen,
+)
+
+from .columns import STRIPE_EVENTS, stripe_of
+from .records import EdgeChange, Merge, ObjectMerge, Refusal, cause_of
+from .tables import Tables, last_rows
+
+Row = Sequence[Any]
+Pair = tuple[PlaceOrdinal, PlaceOrdinal]
+
+
+def _keyframe(delta: KeyframeAdded) -> Row:
+    at = delta.pose
+    pose = (0, 0, 0, 0.0) if at is None else (1, at.x_um, at.y_um, at.yaw_rad)
+    named = (delta.offset, delta.run, delta.run_id, delta.keyframe_id, delta.timestamp)
+    return (*named, *pose, delta.floor)
+
+
+def _observation(delta: ObservationAdded) -> Row:
+    vector = delta.embedding
+    return (
+        delta.offset,
+        delta.keyframe,
+        delta.det_id,
+        delta.class_name,
+        delta.confidence,
+        *delta.bbox,
+        delta.embedding_model,
+        None if vector is None else crc32(vector.data),
+        delta.foreign_space,
+    )
+
+
+_all: Final = msgspec.structs.astuple
+_ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
+    RunSeen: ("run", _all),
+    KeyframeAdded: ("keyframe", _keyframe),
+    ObservationAdded: ("observation", _observation),
+    EventSkipped: (
+        "skipped",
+        lambda d: (d.offset, d.kind, d.run_id, d.keyframe_id, d.det_id, d.first_offset),
+    ),
+    MapGiven: ("map", lambda d: (d.offset,)),
+    PlaceFormed: ("formed", lambda d: (d.offset, d.place_id, d.founder)),
+    KeyframePlaced: ("placed", _all),
+    PlaceChanged: ("changed", _all),
+    PlaceNamed: ("named", _all),
+    ObjectFound: ("found", lambda d: (d.offset, d.object_id, d.class_name, d.observation)),
+    ObjectSeen: ("seen", _all),
+    ObjectEstimated: ("estimated", _all),
+    ObjectClassified: ("classified", _all),
+    ObjectMissing: ("missing", _all),
+    ObjectRelocated: ("relocated", _all),
+    ObjectMoved: ("moved", _all),
+    PlacesLinked: ("linked", _all),
+}
+
+
+class TableWriter:
+    """Adds the rows of further events to ``tables``, in stripes of `STRIPE_EVENTS`."""
+
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._start = self._end = tables.end
+        moved = tables.column("moved", "object")
+        last = last_rows(moved, tables.count("found"))
+        places = tables.rows_at("moved", last[last >= 0])
+        self._located = {found: place for _, found, place in places}
+        linked = tables.rows("linked", 0, tables.count("linked"))
+        self._links: dict[Pair, int] = {(a, b): count for _, a, b, count in linked}
+        self._merges = tables.count("merge")
+        self._rows: defaultdict[str, list[Row]] = defaultdict(list)
+
+    def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:
+        """Add the deltas of the event at ``offset``."""
+        self._end = Offset(offset + 1)
+        merges: list[PlacesMerged] = []
+        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]] = []
+        links: list[EdgeChange] = []
+        for delta in deltas:
+            if (found := _ROWS.get(type(delta))) is not None:
+                table, row_of = found
+                self._rows[table].append(row_of(delta))
+            if isinstance(delta, ObjectMoved):
+                moves.append((delta.object, self._located.get(delta.object)))
+                self._located[delta.object] = delta.place
+            elif isinstance(delta, PlacesLinked):
+                pair, after = (delta.a, delta.b), delta.shared_transitions
+                links.append(EdgeChange(*pair, self._links.get(pair, 0), after))
+                self._links[pair] = after
+            elif isinstance(delta, PlacesMerged):
+                merges.append(delta)
+            elif isinstance(delta, ObjectsMerged):
+                self._document("object_merge", ObjectMerge(cause_of(offset, deltas), delta))
+            elif isinstance(delta, MergeRefused):
+                cause = cause_of(offset, deltas)
+                refusal = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
+                self._document("refusal", refusal)
+        for merge in merges:
+            self._places_merged(offset, deltas, merge, moves, links)
+        if self._end - self._start == STRIPE_EVENTS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Add the rows of the events since the last stripe."""
+        if self._end > self._start:
+            self._tables.add(stripe_of(self._start, self._end, self._rows))
+            self._start = self._end
+            self._rows.clear()
+
+    def _document(self, table: str, record: Merge | Refusal | ObjectMerge) -> None:
+        text = msgspec.json.encode(record).decode()
+        self._rows[table].append((record.cause.offset, text))
+
+    def _places_merged(
+        self,
+        offset: Offset,
+        deltas: Sequence[Delta],
+        delta: PlacesMerged,
+        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]],
+        links: list[EdgeChange],
+    ) -> None:
+        places = {delta.survivor, *delta.absorbed}
+        self._merges += 1
+        merge = Merge(
+            number=self._merges,
+            cause=cause_of(offset, deltas),
+            bridge=delta.bridge,
+            survivor=delta.survivor,
+            survivor_size=delta.survivor_count,
+            absorbed=delta.absorbed,
+            absorbed_sizes=delta.absorbed_counts,
+            links=delta.links,
+            objects=tuple(found for found, before in moves if before in delta.absorbed),
+            edges=tuple(link for link in links if link.a in places or link.b in places),
+            joined=delta.joined,
+            drives=delta.drives,
+        )
+        self._document("merge", merge)

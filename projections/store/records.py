@@ -1,0 +1,291 @@
+"""Records of a history: causes, merges, and what happened to each place and object.
+
+Keyframes, places and objects are ordinals here, as in the deltas; ids are put in where text or JSON
+is made. No record is removed: an absorbed place keeps its history and the merge that ended it.
+
+Every record has a `Cause`: the event that made it happen, which is a keyframe. An entry of an
+explanation may have a command on ``mapfold/command`` as its cause: the command changes how earlier
+and later keyframes are folded, so its offset is where it was recorded, not where its effect shows.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from operator import attrgetter
+from typing import Any, Literal, Protocol, TypeVar
+
+from eventsrc.envelope.model import Offset, RunId
+from projections.fold.deltas import (
+    Delta,
+    KeyframeAdded,
+    KeyframeOrdinal,
+    KeyframePlaced,
+    MeanDrive,
+    ObjectClassified,
+    ObjectEstimated,
+    ObjectFound,
+    ObjectMissing,
+    ObjectMoved,
+    ObjectOrdinal,
+    ObjectRelocated,
+    ObjectSeen,
+    ObjectsMerged,
+    PlaceChanged,
+    PlaceFormed,
+    PlaceLink,
+    PlaceNamed,
+    PlaceOrdinal,
+)
+
+from .lazy_rows import Items
+
+CauseKind = Literal["keyframe", "command"]
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """The event at ``offset`` and what it was.
+
+    ``time_s`` is the robot's time in seconds, for a command that of its event. ``run_id`` and
+    ``keyframe_id`` name the keyframe; for a command both are None, and ``what`` is its text.
+    """
+
+    offset: Offset
+    kind: CauseKind
+    time_s: float | None = None
+    run_id: RunId | None = None
+    keyframe_id: int | None = None
+    what: str | None = None
+
+    @property
+    def name(self) -> str:
+        """``run:keyframe``, or the text of a command."""
+        if self.kind == "keyframe":
+            return f"{self.run_id}:{self.keyframe_id}"
+        return self.what or f"{self.kind} at offset {self.offset}"
+
+    @property
+    def time(self) -> str | None:
+        """The time as ISO 8601 in UTC."""
+        return None if self.time_s is None else iso_time(self.time_s)
+
+    @property
+    def when(self) -> str:
+        """The time of the event, or its name if it has no time."""
+        return self.time or self.name
+
+    @property
+    def title(self) -> str:
+        """Name and time, ``run:keyframe, 2026-03-24T13:00:00.000Z``."""
+        return self.name if self.time is None else f"{self.name}, {self.time}"
+
+    def document(self) -> dict[str, Any]:
+        """The fields of a cause in every JSON answer."""
+        return {
+            "offset": self.offset,
+            "time": self.time,
+            "cause": self.kind,
+            "run_id": self.run_id,
+            "keyframe_id": self.keyframe_id,
+        }
+
+
+def cause_of(offset: Offset, deltas: Iterable[Delta]) -> Cause:
+    """The cause of the deltas of one event: the keyframe it added, if it added one."""
+    for delta in deltas:
+        if isinstance(delta, KeyframeAdded):
+            return Cause(offset, "keyframe", delta.timestamp, delta.run_id, delta.keyframe_id)
+    return Cause(offset, "command")
+
+
+def iso_time(time_s: float) -> str:
+    """Robot seconds since the epoch as ISO 8601 UTC with milliseconds, ending in Z."""
+    moment = datetime.fromtimestamp(time_s, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeChange:
+    """Shared transitions of two places before and after an event; 0 is no edge."""
+
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    before: int
+    after: int
+
+
+@dataclass(frozen=True, slots=True)
+class Merge:
+    """A merge of places, with the objects and edges it moved.
+
+    ``number`` counts merges from 1. Sizes are members before the merge; ``absorbed`` and
+    ``absorbed_sizes`` are parallel. ``joined`` are the absorbed that came by a ``join`` command,
+    ``drives`` why the others came where places are rooms.
+    ``objects`` are those that the event moved out of an absorbed place. ``edges`` are all adjacency
+    changes of the event that touch the places.
+    """
+
+    number: int
+    cause: Cause
+    bridge: KeyframeOrdinal
+    survivor: PlaceOrdinal
+    survivor_size: int
+    absorbed: tuple[PlaceOrdinal, ...]
+    absorbed_sizes: tuple[int, ...]
+    links: tuple[PlaceLink, ...]
+    objects: tuple[ObjectOrdinal, ...]
+    edges: tuple[EdgeChange, ...]
+    joined: tuple[PlaceOrdinal, ...] = ()
+    drives: tuple[MeanDrive, ...] = ()
+
+    @property
+    def places(self) -> tuple[PlaceOrdinal, ...]:
+        """The survivor first, then the absorbed places."""
+        return (self.survivor, *self.absorbed)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A merge of places ``a`` and ``b`` that a command refused; ``a`` was founded first.
+
+    ``link`` are the core points that would have joined them. ``apart`` are the keyframes that the
+    command names: one in each place.
+    """
+
+    cause: Cause
+    a: PlaceOrdinal
+    b: PlaceOrdinal
+    bridge: KeyframeOrdinal
+    link: PlaceLink
+    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectMerge:
+    """Two objects became one, by a command or by evidence. ``values`` are the survivor's since."""
+
+    cause: Cause
+    values: ObjectsMerged
+
+    @property
+    def offset(self) -> Offset:
+        return self.cause.offset
+
+    @property
+    def survivor(self) -> ObjectOrdinal:
+        return self.values.survivor
+
+    @property
+    def absorbed(self) -> ObjectOrdinal:
+        return self.values.absorbed
+
+
+@dataclass(slots=True)
+class PlaceHistory:
+    """The history of a place, from its founding on. The lists are in order of offset."""
+
+    formed: PlaceFormed
+    cause: Cause
+    joined: list[KeyframePlaced] = field(default_factory=list)
+    """Keyframes that joined it, without those of absorbed places."""
+    changes: list[PlaceChanged] = field(default_factory=list)
+    names: list[PlaceNamed] = field(default_factory=list)
+    merges: list[Merge] = field(default_factory=list)
+    """Merges it survived."""
+    absorbed_by: Merge | None = None
+    """The merge that ended it."""
+
+    @property
+    def place_id(self) -> str:
+        return self.formed.place_id
+
+    def stands(self, end: Offset) -> bool:
+        """Whether it is formed and not absorbed after the events below ``end``."""
+        return self.formed.offset < end and (
+            self.absorbed_by is None or self.absorbed_by.cause.offset >= end
+        )
+
+    def change(self, end: Offset) -> PlaceChanged | None:
+        """The place's size and sums after the events below ``end``."""
+        return last_before(self.changes, end)
+
+    def name(self, end: Offset) -> str | None:
+        """The place's name after the events below ``end``; None without a name."""
+        named = last_before(self.names, end)
+        return None if named is None else named.name
+
+
+@dataclass(slots=True)
+class ObjectHistory:
+    """The history of an object, from its first sighting on. The lists are in order of offset."""
+
+    found: ObjectFound
+    cause: Cause
+    sightings: list[ObjectSeen] = field(default_factory=list)
+    moves: list[ObjectMoved] = field(default_factory=list)
+    merges: list[ObjectMerge] = field(default_factory=list)
+    """Merges it survived."""
+    absorbed_by: ObjectMerge | None = None
+    """The merge that ended it."""
+    estimates: list[ObjectEstimated] = field(default_factory=list)
+    classes: list[ObjectClassified] = field(default_factory=list)
+    misses: list[ObjectMissing] = field(default_factory=list)
+    relocations: list[ObjectRelocated] = field(default_factory=list)
+
+    @property
+    def object_id(self) -> str:
+        return self.found.object_id
+
+    def place(self, end: Offset) -> PlaceOrdinal | None:
+        """The place it is located in after the events below ``end``."""
+        moved = last_before(self.moves, end)
+        return None if moved is None else moved.place
+
+    def stands(self, end: Offset) -> bool:
+        """Whether it is found and not absorbed after the events below ``end``."""
+        return self.found.offset < end and (
+            self.absorbed_by is None or self.absorbed_by.offset >= end
+        )
+
+    def values(self, end: Offset) -> ObjectSeen | ObjectsMerged | None:
+        """The object's count, sums and times after the events below ``end``."""
+        seen, merged = last_before(self.sightings, end), last_before(self.merges, end)
+        if seen is None or merged is None or seen.obs_count > merged.values.obs_count:
+            return seen
+        return merged.values
+
+    def class_name(self, end: Offset) -> str:
+        """The object's class after the events below ``end``."""
+        classified = last_before(self.classes, end)
+        return self.found.class_name if classified is None else classified.class_name
+
+    def looked_for(self, end: Offset) -> ObjectMissing | None:
+        """The count of keyframes that should show it and do not, after the events below ``end``;
+        None if it was relocated since."""
+        looked, moved = last_before(self.misses, end), last_before(self.relocations, end)
+        if looked is None or (moved is not None and moved.offset > looked.offset):
+            return None
+        return looked
+
+
+class _HasOffset(Protocol):
+    @property
+    def offset(self) -> int: ...
+
+
+_T = TypeVar("_T", bound=_HasOffset)
+_offset = attrgetter("offset")
+
+
+def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
+    """The number of items, sorted by offset, that are of events below ``end``."""
+    if isinstance(items, Items):
+        return items.before(end)
+    return bisect_left(items, end, key=_offset)
+
+
+def last_before(items: Sequence[_T], end: Offset) -> _T | None:
+    """The last item, sorted by offset, of the events below ``end``."""
+    count = count_before(items, end)
+    return items[count - 1] if count else None

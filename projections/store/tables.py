@@ -1,0 +1,275 @@
+"""The tables of a history: stripes end to end, looked up by row.
+
+Numbers are read as whole columns, which are put together from the stripes when first used, texts by
+the span of rows. A stripe may lie in a file (`projections.store.part_file`), whose arrays raise
+`DamagedPart` when their checksum does not match; then the stripes are made again from the log and
+the look-up is repeated. The same log gives the same rows, so what was read before still holds.
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
+
+from .columns import NONE, STRIPE_EVENTS, TABLES, Array, Stripe, joined
+
+Rows = NDArray[np.int64]
+_T = TypeVar("_T")
+_MANY: Final = 4_000
+_AT_ONCE: Final = 65_536
+
+
+class DamagedPart(Exception):
+    """Bytes of a stripe are not those that were written; the message says where."""
+
+
+class Tables:
+    """Stripes in order, the first from the first event on.
+
+    ``again`` makes the stripes up to an offset from the log; it is called when one is damaged.
+    """
+
+    def __init__(
+        self,
+        stripes: Sequence[Stripe] = (),
+        again: Callable[[Offset, DamagedPart], Sequence[Stripe]] | None = None,
+    ) -> None:
+        self.stripes = list(stripes)
+        self._again = again
+        self._columns: dict[str, Array] = {}
+        self._groups: dict[str, Groups] = {}
+        self._unreleased = 0  # rows that were read
+
+    @property
+    def end(self) -> Offset:
+        """The number of events."""
+        return self.stripes[-1].end if self.stripes else FIRST_OFFSET
+
+    def add(self, stripe: Stripe) -> None:
+        """Add the rows of the events after `end`."""
+        self.stripes.append(stripe)
+        self._columns.clear()
+        self._groups.clear()
+
+    def shorten(self, first: int) -> None:
+        """Join stripes from the index ``first`` on where neighbours are short."""
+        while len(self.stripes) > first + 1:
+            *_, one, other = self.stripes
+            events = other.end - other.start
+            if other.end - one.start > STRIPE_EVENTS or 2 * events < one.end - one.start:
+                return
+            self.stripes[-2:] = [joined([one, other])]
+
+    def count(self, table: str) -> int:
+        """The number of rows of a table."""
+        return sum(stripe.rows.get(table, 0) for stripe in self.stripes)
+
+    def before(self, table: str, end: Offset) -> int:
+        """The number of rows of events below ``end``."""
+        return self._with_repair(lambda: self._before(table, end))
+
+    def column(self, table: str, column: str, count: int | None = None) -> Array:
+        """The first ``count`` values of a column that holds no texts, all for None."""
+        return self._with_repair(lambda: self._column(table, column, count))
+
+    def integers(self, table: str, column: str, count: int | None = None) -> Rows:
+        """`column` as int64, to compute with."""
+        found = self.column(table, column, count)
+        return found if found.dtype == object else found.astype(np.int64, copy=False)
+
+    def texts(self, table: str, column: str, first: int, last: int) -> list[str | None]:
+        """The texts of the rows from ``first`` to before ``last``."""
+        return self._with_repair(
+            lambda: [
+                text
+                for stripe, a, b in self._spans(table, first, last)
+                for text in stripe.texts(table, column, a, b)
+            ]
+        )
+
+    def text(self, table: str, column: str, row: int) -> str:
+        """The text of a row that has one."""
+        (found,) = self.texts(table, column, row, row + 1)
+        return found or ""
+
+    def codes(self, table: str, column: str, count: int | None = None) -> tuple[Array, list[str]]:
+        """A column of repeated texts as numbers, and the texts that they stand for; -1 is none."""
+        return self._with_repair(lambda: self._codes(table, column, count))
+
+    def group(self, table: str, column: str) -> "Groups":
+        """The rows of a table grouped by the value of a column."""
+        key = f"{table}.{column}"
+        if key not in self._groups:
+            self._groups[key] = Groups(self.column(table, column))
+        return self._groups[key]
+
+    def rows(self, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
+        """The rows from ``first`` to before ``last``, each with all its columns in order."""
+        return list(zip(*self.lists(table, first, last), strict=True))
+
+    def lists(self, table: str, first: int, last: int) -> list[list[Any]]:
+        """The same rows as a list for each column."""
+        found = self._with_repair(lambda: self._lists(table, first, last))
+        self._unreleased += last - first
+        if self._unreleased >= _MANY:  # so that reading all rows does not fill memory
+            self._release()
+        return found
+
+    def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
+        """These rows, each with all its columns in order."""
+        return self._with_repair(lambda: self._rows_at(table, numbers))
+
+    def _before(self, table: str, end: Offset) -> int:
+        count = 0
+        for stripe in self.stripes:
+            if stripe.end > end:
+                if stripe.start < end and table in stripe.rows:
+                    count += bisect_left(stripe.arrays[f"{table}.offset"], end)
+                break
+            count += stripe.rows.get(table, 0)
+        return count
+
+    def _column(self, table: str, column: str, count: int | None) -> Array:
+        name = f"{table}.{column}"
+        wanted = self.count(table) if count is None else count
+        found = self._columns.get(name, _NOTHING)
+        if len(found) < wanted:
+            spans = self._spans(table, 0, wanted)
+            parts = [stripe.arrays[name] for stripe, _, _ in spans]
+            if len(parts) == 1:
+                found = parts[0]
+            else:
+                found = np.concatenate(parts)
+                self._release()
+            self._columns[name] = found
+        return found[:wanted]
+
+    def _release(self) -> None:
+        self._unreleased = 0
+        for release in {stripe.release for stripe in self.stripes}:
+            release()
+
+    def _lists(self, table: str, first: int, last: int) -> list[list[Any]]:
+        found: list[list[Any]] = [[] for _ in TABLES[table]]
+        for stripe, a, b in self._spans(table, first, last):
+            for column, values in zip(found, _stripe_lists(stripe, table, a, b), strict=True):
+                column += values
+        return found
+
+    def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
+        """`rows_at`; of each stripe only the requested rows are read."""
+        bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in self.stripes)])
+        within = np.searchsorted(bounds, numbers, "right") - 1
+        found: list[tuple[Any, ...]] = []
+        places: list[Array] = []
+        for index in np.unique(within).tolist():
+            here = np.flatnonzero(within == index)
+            found += _picked(self.stripes[index], table, numbers[here] - bounds[index])
+            places.append(here)
+            self._release()
+        if len(places) < 2:
+            return found
+        order = np.argsort(np.concatenate(places)).tolist()
+        return [found[place] for place in order]
+
+    def _codes(self, table: str, column: str, count: int | None) -> tuple[Array, list[str]]:
+        strings: list[str] = []
+        parts: list[Array] = [_NOTHING]
+        left = self.count(table) if count is None else count
+        for stripe in self.stripes:
+            if left > 0 and table in stripe.rows:
+                codes = stripe.arrays[f"{table}.{column}"][:left].astype(np.int32)
+                left -= len(codes)
+                parts.append(np.where(codes == NONE, NONE, codes + np.int32(len(strings))))
+                strings += stripe.strings
+        return np.concatenate(parts), strings
+
+    def _spans(self, table: str, first: int, last: int) -> Iterator[tuple[Stripe, int, int]]:
+        """The stripes that have rows of a span, each with the span in its own rows."""
+        counts = [stripe.rows.get(table, 0) for stripe in self.stripes]
+        for stripe, count, before in zip(
+            self.stripes, counts, accumulate(counts, initial=0), strict=False
+        ):
+            a, b = max(first - before, 0), min(last - before, count)
+            if a < b:
+                yield stripe, a, b
+
+    def _with_repair(self, look_up: Callable[[], _T]) -> _T:
+        try:
+            return look_up()
+        except DamagedPart as damage:
+            if self._again is None:
+                raise
+            again, end = self._again, self.end
+            self._again = None
+            try:
+                self.stripes = list(again(end, damage))
+            finally:
+                self._again = again
+            self._columns.clear()
+            return look_up()
+
+
+_NOTHING: Final[Array] = np.zeros(0, np.int8)
+
+
+class Groups:
+    """Indices grouped by ``values`` of 0 or more; with ``items`` these are grouped instead."""
+
+    def __init__(self, values: Array, items: Array | None = None) -> None:
+        order = np.argsort(values, kind="stable").astype(np.int32)
+        self._order = order if items is None else items[order]
+        counts = np.bincount(values) if len(values) else _NOTHING
+        self._ends = np.concatenate([[0], np.cumsum(counts)])
+
+    def __getitem__(self, value: int) -> Array:
+        """The items with this value, in order."""
+        if value + 1 >= len(self._ends):
+            return self._order[:0]
+        return self._order[self._ends[value] : self._ends[value + 1]]
+
+
+def _stripe_lists(stripe: Stripe, table: str, first: int, last: int) -> Iterator[list[Any]]:
+    for column, kind in TABLES[table].items():
+        if kind in ("text", "code"):
+            yield stripe.texts(table, column, first, last)
+        else:
+            yield _values(stripe.arrays[f"{table}.{column}"][first:last], kind)
+
+
+def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
+    """The rows of a stripe with these indices."""
+    columns: list[Any] = []
+    for column, kind in TABLES[table].items():
+        if kind == "text":
+            columns.append([stripe.text(table, column, row) for row in rows.tolist()])
+        elif kind == "code":
+            strings = [*stripe.strings, None]
+            codes = stripe.arrays[f"{table}.{column}"][rows].tolist()
+            columns.append([strings[code] for code in codes])
+        else:
+            columns.append(_values(stripe.arrays[f"{table}.{column}"][rows], kind))
+    return list(zip(*columns, strict=True))
+
+
+def _values(array: Array, kind: str) -> list[Any]:
+    if kind == "flag":
+        array = array.astype(np.bool_)
+    values: list[Any] = array.tolist()
+    if kind == "number?":
+        return [None if value == NONE else value for value in values]
+    return values
+
+
+def last_rows(values: Array, size: int) -> Rows:
+    """For each value 0 … ``size`` - 1 its last index in ``values``, -1 for none."""
+    found = np.full(size, NONE, np.int64)
+    for first in range(0, len(values), _AT_ONCE):  # in spans: numpy makes 64-bit copies of both
+        some = values[first : first + _AT_ONCE]
+        found[some] = np.arange(first, first + len(some))  # of equal indices the last one is kept
+    return found

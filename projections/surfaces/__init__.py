@@ -1,0 +1,1 @@
+"""What people and programs use: commands, Python, HTTP and Zenoh, the web page, the demo."""

@@ -1,0 +1,205 @@
+"""Bags of ROS 2 on the command line: options, the file of labels, and the report of a bag."""
+
+import functools
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.label_files import read_label_file
+from eventsrc.base.text import counted, visible
+from eventsrc.record.importers import BagReport
+from eventsrc.ros.stream import Counts
+
+_PANEL: Final = "Bags of ROS 2"
+_MOST_UNUSED: Final = 10
+_MOST_RUN_ID: Final = 100
+"""Longest run id, so that default detection ids keep within their limit."""
+_NS: Final = 1_000_000_000
+MAX_GAP_S: Final = 3_600.0
+
+
+def ros_option(panel: str, name: str, metavar: str, text: str) -> typer.models.OptionInfo:
+    """An option about messages of ROS, listed under ``panel``; `import` and `record` have them."""
+    option: typer.models.OptionInfo = typer.Option(
+        name, metavar=metavar, help=text, rich_help_panel=panel
+    )
+    return option
+
+
+def labels_option(panel: str) -> typer.models.OptionInfo:
+    """``--labels``."""
+    text = "Names of numbered classes, one a line; the first is that of class 0."
+    return ros_option(panel, "--labels", "FILE", text)
+
+
+def model_option(panel: str) -> typer.models.OptionInfo:
+    """``--embedding-model``."""
+    text = "The model of embeddings that do not name theirs."
+    return ros_option(panel, "--embedding-model", "NAME", text)
+
+
+def heights_option(panel: str) -> typer.models.OptionInfo:
+    """``--heights``."""
+    option: typer.models.OptionInfo = typer.Option(
+        "--heights",
+        help="State the robot's height in envelopes; it separates floors.",
+        rich_help_panel=panel,
+    )
+    return option
+
+
+def max_gap_option(panel: str) -> typer.models.OptionInfo:
+    """``--max-gap``."""
+    text = "Longest time between two poses to interpolate between them."
+    return ros_option(panel, "--max-gap", "SECONDS", text)
+
+
+_named = functools.partial(ros_option, _PANEL)
+
+
+def _topic(name: str, text: str) -> typer.models.OptionInfo:
+    return _named(name, "TOPIC", text)
+
+
+DetectionsOption = Annotated[
+    list[str] | None,
+    _topic("--detections", "Topic of vision_msgs/Detection2DArray; may be repeated. Default: all."),
+]
+PoseOption = Annotated[
+    str | None,
+    _named(
+        "--pose",
+        "tf|TOPIC|none",
+        "Where poses come from: transforms, or a topic of nav_msgs/Odometry or "
+        "geometry_msgs/PoseWithCovarianceStamped. Default: transforms, else such a topic.",
+    ),
+]
+CovarianceOption = Annotated[
+    str | None,
+    _topic(
+        "--covariance",
+        "Topic whose latest covariance is the error of poses by transforms; or none. Default: one "
+        "in the map's frame.",
+    ),
+]
+EmbeddingsOption = Annotated[
+    str | None,
+    _topic(
+        "--embeddings",
+        "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none. "
+        "Default: one with embedding in its name.",
+    ),
+]
+CameraOption = Annotated[
+    str | None,
+    _topic(
+        "--camera",
+        "Topic of sensor_msgs/CameraInfo; or none. Default: that of the detections' frame.",
+    ),
+]
+GridOption = Annotated[
+    str | None,
+    _topic("--grid", "Topic of nav_msgs/OccupancyGrid; or none. Default: topics called map."),
+]
+MapFrameOption = Annotated[
+    str | None, _named("--map-frame", "FRAME", "The frame of the map. Default: map, else the root.")
+]
+BaseFrameOption = Annotated[
+    str | None,
+    _named("--base-frame", "FRAME", "The robot's frame. Default: base_link or base_footprint."),
+]
+RunIdOption = Annotated[
+    str | None,
+    _named("--run-id", "ID", "The run of a bag's keyframes. Default: its name and when it began."),
+]
+LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
+ModelOption = Annotated[str | None, model_option(_PANEL)]
+HeightsOption = Annotated[bool, heights_option(_PANEL)]
+MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
+
+
+def check_run_id(run_id: str | None) -> str | None:
+    """``--run-id``, if a run can have it."""
+    if run_id is not None and not (run_id.isprintable() and 1 <= len(run_id) <= _MOST_RUN_ID):
+        raise MisuseError(
+            f"--run-id {visible(run_id)[:_MOST_RUN_ID]!r}: give 1 to {_MOST_RUN_ID} printable "
+            "characters"
+        )
+    return run_id
+
+
+def max_gap_ns(seconds: float) -> int:
+    """``--max-gap`` as nanoseconds."""
+    if not (math.isfinite(seconds) and 0.0 < seconds <= MAX_GAP_S):
+        raise MisuseError(f"--max-gap {seconds:g}: give seconds above 0, up to {MAX_GAP_S:g}")
+    return round(seconds * _NS)
+
+
+def labels_by_number(path: Path | None) -> dict[str, str]:
+    """Class names by number, of ``--labels``. Empty lines name nothing."""
+    if path is None:
+        return {}
+    names = read_label_file(path)
+    if not all(isinstance(name, str) for name in names):
+        raise MisuseError(f"--labels {path}: not a list of names; write one a line")
+    labels = {str(number): name for number, name in enumerate(names) if name}
+    if not labels:
+        raise MisuseError(f"--labels {path}: names no class; write one a line")
+    return labels
+
+
+def bag_lines(report: BagReport) -> Iterator[str]:
+    """A bag's contents: what was used, and what was not and why."""
+    topics = counted(len(report.topics), "topic")
+    yield (
+        f"{report.name}: {counted(report.messages, 'message')} of {topics}, "
+        f"{report.duration_s:,.1f} s"
+    )
+    used = [topic for topic in report.topics if topic.used_for]
+    unused = [topic for topic in report.topics if not topic.used_for]
+    shown = [*used, *unused[:_MOST_UNUSED]]
+    name_width = max((len(visible(topic.topic)) for topic in shown), default=0)
+    count_width = max((len(f"{topic.messages:,}") for topic in shown), default=0)
+    for topic in shown:
+        yield (
+            f"  {visible(topic.topic):{name_width}}  {topic.messages:>{count_width},}  "
+            f"{visible(topic.type)}: {visible(topic.used_for or 'not used')}"
+        )
+    if len(unused) > _MOST_UNUSED:
+        yield f"  … and {len(unused) - _MOST_UNUSED:,} more topics that are not used"
+    yield from (f"  {line}" for line in stream_lines(report.streams))
+    if report.unchanged_grids:
+        same = counted(report.unchanged_grids, "occupancy grid")
+        yield f"  {same} had the cells of the one before"
+    for note in report.notes:
+        yield f"  note: {visible(note)}"
+
+
+def stream_lines(streams: Mapping[str, Counts]) -> Iterator[str]:
+    """For each topic of detections: its keyframes, what they lack, and unused messages."""
+    for name, counts in streams.items():
+        yield f"{visible(name)}: {_keyframes(counts)}"
+        for topic_name, count in counts.unused.items():
+            reason = visible(counts.reasons[topic_name][:200])
+            yield f"{visible(topic_name)}: {count:,} could not be used; the first: {reason}"
+
+
+def _keyframes(counts: Counts) -> str:
+    """The keyframes of a stream, and what they lack."""
+    lacks = (
+        (counts.without_pose, "without a pose"),
+        (counts.without_camera_frame, "with the pose of the base, not of the camera"),
+        (counts.without_base_frame, "with the heading of the camera, not of the base"),
+        (counts.without_camera, "without the camera's field of view"),
+        (counts.without_covariance, "with a pose, but without its error"),
+    )
+    parts = [f"{number:,} {what}" for number, what in lacks if number]
+    seen = counted(counts.detections, "detection")
+    parts.append(f"{seen}, {counts.with_embedding:,} with an embedding")
+    if counts.unclassified:
+        parts.append(f"{counts.unclassified:,} without a class")
+    return "; ".join([counted(counts.keyframes, "keyframe"), *parts])

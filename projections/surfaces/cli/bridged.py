@@ -1,0 +1,271 @@
+"""`mapfold record --ros2dds`: the options of a bridge from ROS, and the messages at the start."""
+
+import functools
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from eventsrc.base.errors import LogDamaged, MisuseError
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.model import RunId
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.recorder import DEFAULT_KEYS, RecorderReport
+from eventsrc.record.recorder.bridged import Bridge
+from eventsrc.record.recorder.unfinished import append_missing
+from eventsrc.ros.bridge_keys import topic_of
+from eventsrc.ros.derivation import RosRecording
+from eventsrc.ros.library import MessageTypes
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
+
+from .bag_text import (
+    check_run_id,
+    heights_option,
+    labels_by_number,
+    labels_option,
+    max_gap_ns,
+    max_gap_option,
+    model_option,
+    ros_option,
+)
+from .terminal import say
+
+TF_POSE: Final = "tf"
+NONE: Final = "none"
+_DETECTIONS: Final = "/detections"
+_GRID: Final = "/map"
+_QUIET_S: Final = 5.0
+_PANEL: Final = "Messages of ROS 2, with --ros2dds"
+
+
+_option = functools.partial(ros_option, _PANEL)
+
+Ros2ddsOption = Annotated[
+    bool,
+    typer.Option(
+        "--ros2dds",
+        help="Record what a zenoh-bridge-ros2dds sends, and make keyframes of it; needs "
+        "mapfold[ros].",
+        rich_help_panel=_PANEL,
+    ),
+]
+NamespaceOption = Annotated[
+    str, _option("--namespace", "NS", "The namespace in the bridge's configuration, as /bot1.")
+]
+DetectionsOption = Annotated[
+    list[str] | None,
+    _option(
+        "--detections",
+        "TOPIC",
+        f"Topic of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
+    ),
+]
+PoseOption = Annotated[
+    str,
+    _option(
+        "--pose",
+        "tf|TOPIC|none",
+        "Where poses come from: transforms, or a topic of Odometry or PoseWithCovarianceStamped.",
+    ),
+]
+CovarianceOption = Annotated[
+    str | None,
+    _option(
+        "--covariance",
+        "TOPIC",
+        "Topic whose latest covariance is the error of poses by transforms, such as /amcl_pose.",
+    ),
+]
+EmbeddingsOption = Annotated[
+    str | None,
+    _option("--embeddings", "TOPIC", "Topic of the detections' embeddings; see docs/ros.md."),
+]
+CameraOption = Annotated[str | None, _option("--camera", "TOPIC", "Topic of CameraInfo.")]
+GridOption = Annotated[
+    str,
+    _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none."),
+]
+MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of the map.")]
+BaseFrameOption = Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")]
+RunIdOption = Annotated[
+    str | None,
+    _option(
+        "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
+    ),
+]
+LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
+ModelOption = Annotated[str | None, model_option(_PANEL)]
+HeightsOption = Annotated[bool, heights_option(_PANEL)]
+MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
+TopicOption = Annotated[
+    list[str] | None,
+    _option("--topic", "TOPIC", "Another topic to keep, of any type; may be repeated."),
+]
+
+
+class BridgeChoice(NamedTuple):
+    """The values of the ROS options of `mapfold record`."""
+
+    namespace: str
+    detections: list[str] | None
+    pose: str
+    covariance: str | None
+    embeddings: str | None
+    camera: str | None
+    grid: str
+    map_frame: str
+    base_frame: str
+    run_id: str | None
+    labels: Path | None
+    embedding_model: str | None
+    heights: bool
+    max_gap_s: float
+    topics: list[str] | None
+
+
+NOTHING: Final = BridgeChoice(
+    "",
+    None,
+    TF_POSE,
+    None,
+    None,
+    None,
+    _GRID,
+    "map",
+    "base_link",
+    None,
+    None,
+    None,
+    False,
+    DEFAULT_MAX_GAP_NS / 1e9,
+    None,
+)
+"""The values of these options when none is given."""
+
+
+def check_unused(choice: BridgeChoice) -> None:
+    """Raise MisuseError if an option needs --ros2dds, which is not given."""
+    if choice != NOTHING:
+        raise MisuseError(
+            "--namespace, --detections, --pose and the other options for messages of ROS go with "
+            "--ros2dds"
+        )
+
+
+def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId] | None) -> Bridge:
+    """The recorder of the topics of ``choice``. First makes the envelopes that a killed recorder
+    left out. Raises MisuseError for an invalid topic, MapfoldError without rosbags."""
+    types = MessageTypes()
+    recording, topics = recording_of(choice, writer.now_ns(), ledger)
+    try:
+        with LogReader(writer.path) as reader:
+            made = append_missing(reader, writer, types)
+    except LogDamaged as error:
+        say(f"not checked which envelopes the last recording of ROS lacks: {error}")
+    else:
+        if made:
+            say(
+                f"{writer.path}: the last recording of ROS did not finish; made "
+                f"{counted(made, 'event')} from its messages"
+            )
+    return Bridge(recording, topics, types)
+
+
+def recording_of(
+    choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
+) -> tuple[RosRecording, tuple[str, ...]]:
+    """The topics and settings from which envelopes are made, and all topics that are kept."""
+
+    def full(topic: str, option: str) -> str:
+        return topic_of(choice.namespace, topic, option)
+
+    def given(topic: str | None, option: str) -> str | None:
+        return None if topic in (None, NONE) else full(topic, option)
+
+    detections = list(
+        dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
+    )
+    run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
+    by_transforms = choice.pose == TF_POSE
+    labels, gap_ns = labels_by_number(choice.labels), max_gap_ns(choice.max_gap_s)
+    streams = []
+    for topic in detections:
+        run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")
+        highest = None if ledger is None else ledger.highest(run_id)
+        streams.append(
+            Stream(
+                topic,
+                run_id,
+                None if choice.pose == NONE else full("/tf", "--namespace"),
+                None if choice.pose == NONE else full("/tf_static", "--namespace"),
+                None if by_transforms else given(choice.pose, "--pose"),
+                given(choice.covariance, "--covariance"),
+                given(choice.embeddings, "--embeddings"),
+                given(choice.camera, "--camera"),
+                choice.map_frame,
+                choice.base_frame,
+                labels,
+                choice.embedding_model,
+                choice.heights,
+                max_gap_ns=gap_ns,
+                first_keyframe=0 if highest is None else highest + 1,
+            )
+        )
+    grid = given(choice.grid, "--grid")
+    recording = RosRecording(
+        key=DEFAULT_KEYS[0], streams=tuple(streams), grids=() if grid is None else (grid,)
+    )
+    others = (full(topic, "--topic") for topic in choice.topics or ())
+    return recording, tuple(dict.fromkeys([*used_topics(recording), *others]))
+
+
+def used_topics(recording: RosRecording) -> list[str]:
+    """The topics from which envelopes and maps are made."""
+    found: dict[str, None] = {}
+    for stream in recording.streams:
+        pose = [stream.pose, stream.covariance, stream.tf, stream.tf_static]
+        for topic in (stream.detections, *pose, stream.embeddings, stream.camera):
+            if topic is not None:
+                found[topic] = None
+    return [*found, *recording.grids]
+
+
+def _camera(topic: str) -> str:
+    """The part of a run id that distinguishes the runs of several topics of detections."""
+    return topic.strip("/").removesuffix("/detections")
+
+
+def _run_id(namespace: str, now_ns: int) -> str:
+    began = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
+    return f"{namespace.strip('/').replace('/', '-') or 'ros'}-{began:%Y%m%dT%H%M%S}"
+
+
+def say_topics(log: Path, bridge: Bridge) -> None:
+    """Print what is recorded, and the run ids of the keyframes."""
+    runs = ", ".join(visible(stream.run_id) for stream in bridge.recording.streams)
+    keys = ", ".join(bridge.keys)
+    say(f"recording of a zenoh-bridge-ros2dds to {log}: {keys}; keyframes of {runs}")
+
+
+def warn_of_silence(
+    bridge: Bridge, watch: Callable[[RecorderReport], None], every_s: float
+) -> Callable[[RecorderReport], None]:
+    """``watch``, plus one warning if no bridge has announced a topic some seconds after the
+    start."""
+    calls = 0
+
+    def watching(report: RecorderReport) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == round(_QUIET_S / every_s) and not (bridge.types_known or report.messages):
+            say(
+                f"no bridge has announced any of {', '.join(bridge.topics)} yet: check that "
+                "zenoh-bridge-ros2dds runs, is connected to the same router, and has the namespace "
+                "that --namespace says"
+            )
+        watch(report)
+
+    return watching

@@ -1,0 +1,406 @@
+"""`mapfold detect`: pictures to envelopes, with ONNX models."""
+
+import threading
+from collections.abc import Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.adapters.detector.encoder import Encoder, read_preparation
+from eventsrc.adapters.detector.files import open_images
+from eventsrc.adapters.detector.finder import (
+    CONFIDENCE,
+    MOST,
+    OVERLAP,
+    SIZE,
+    Finder,
+    FinderOptions,
+    read_labels,
+)
+from eventsrc.adapters.detector.gate import AFTER_S, MOVED_M, TURNED_DEG, KeyframeGate
+from eventsrc.adapters.detector.heads import HEADS
+from eventsrc.adapters.detector.keyframes import Keyframes
+from eventsrc.adapters.detector.live import QUEUE, LivePictures
+from eventsrc.adapters.detector.onnx_model import OnnxModel
+from eventsrc.adapters.detector.outputs import (
+    CROPS_KEY,
+    CropSender,
+    FileOutput,
+    Output,
+    ZenohOutput,
+)
+from eventsrc.adapters.detector.picture import Picture
+from eventsrc.adapters.detector.poses import NoPoses, Poses, poses_of_file
+from eventsrc.adapters.detector.service import Detection
+from eventsrc.adapters.detector.vision import check_installed
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.config import check_key, parse_address
+from eventsrc.record.transport.session import Session, ZenohOptions, open_session
+
+from .detect_checks import (
+    check_sources,
+    device_of,
+    limits_of,
+    run_id_of,
+    spool_path,
+    stdin_until,
+    timing_of,
+)
+from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
+from .options import (
+    ConfigOption,
+    ConnectBesideListenOption,
+    JsonOption,
+    ListenOption,
+    PublishKeyOption,
+    zenoh_options,
+)
+from .signals import stop_on_signals
+from .terminal import emit, finish, say
+
+_PICTURES: Final = "Pictures and poses"
+_MODELS: Final = "Models"
+_KEYFRAMES: Final = "Keyframes"
+
+
+def detect(
+    images: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR|VIDEO|-",
+            help="Folder of JPEG and PNG pictures, a video, or on stdin a stream of pictures or"
+            " paths.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    zenoh_image: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEY",
+            help="Zenoh key of pictures: JPEG, PNG, or CDR of CompressedImage or Image.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Poses by stamp: TUM, CSV with a header stamp,x,y,yaw, or JSON lines.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    zenoh_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEY",
+            help="Zenoh key of poses: JSON, or CDR of PoseStamped, PoseWithCovarianceStamped or"
+            " Odometry.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N",
+            help="Pictures a second, if neither file names nor the video give times.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = None,
+    start: Annotated[
+        str,
+        typer.Option(
+            metavar="TIME",
+            help="When the first picture was taken, with --fps or for a video: seconds since 1970,"
+            " or ISO.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = "0",
+    queue: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=1000,
+            help="How many pictures from Zenoh may wait; newer ones replace the oldest.",
+            rich_help_panel=_PICTURES,
+        ),
+    ] = QUEUE,
+    detector: Annotated[
+        Path | None,
+        typer.Option(metavar="MODEL.onnx", help="Object detector.", rich_help_panel=_MODELS),
+    ] = None,
+    encoder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL.onnx",
+            help="Encoder of crops; MODEL.json beside it describes its input.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = None,
+    head: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help=f"Format of the detector's output: {', '.join(HEADS)}; yolov8 is for v9, v11 and"
+            " v12 too.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = "yolov8",
+    labels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="The detector's classes, one a line, or coco [default: those in the model].",
+            rich_help_panel=_MODELS,
+        ),
+    ] = None,
+    size: Annotated[
+        int,
+        typer.Option(
+            metavar="PIXELS",
+            min=32,
+            max=4096,
+            help="Side of the detector's input, if the model does not fix it.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = SIZE,
+    device: Annotated[
+        str,
+        typer.Option(metavar="cpu|cuda", help="What the models run on.", rich_help_panel=_MODELS),
+    ] = "cpu",
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=1024,
+            help="Threads of each model [default: the number of cores].",
+            rich_help_panel=_MODELS,
+        ),
+    ] = None,
+    confidence: Annotated[
+        float,
+        typer.Option(
+            metavar="P",
+            min=0.0,
+            max=1.0,
+            help="Least confidence of a detection.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = CONFIDENCE,
+    overlap: Annotated[
+        float,
+        typer.Option(
+            metavar="P",
+            min=0.0,
+            max=1.0,
+            help="Two boxes of a class that overlap by more (intersection over union) are one.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = OVERLAP,
+    max_detections: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=1000,
+            help="Most detections in a picture.",
+            rich_help_panel=_MODELS,
+        ),
+    ] = MOST,
+    moved: Annotated[
+        float,
+        typer.Option(
+            metavar="METRES",
+            min=0.0,
+            help="Distance from the last keyframe from which a picture is a new keyframe.",
+            rich_help_panel=_KEYFRAMES,
+        ),
+    ] = MOVED_M,
+    turned: Annotated[
+        float,
+        typer.Option(
+            metavar="DEGREES",
+            min=0.0,
+            help="Turn since the last keyframe from which a picture is a new keyframe.",
+            rich_help_panel=_KEYFRAMES,
+        ),
+    ] = TURNED_DEG,
+    after: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Time since the last keyframe from which a picture is a new keyframe; 0: every"
+            f" picture is one. [default: {AFTER_S:g}; without poses 0]",
+            rich_help_panel=_KEYFRAMES,
+            show_default=False,
+        ),
+    ] = None,
+    hfov: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEGREES",
+            min=1.0,
+            max=170.0,
+            help="Horizontal field of view of the camera, stated in the envelopes.",
+            rich_help_panel=_KEYFRAMES,
+        ),
+    ] = None,
+    run_id: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID",
+            help="Name of the run, one for each start [default: host and time].",
+            rich_help_panel=_KEYFRAMES,
+        ),
+    ] = None,
+    key: PublishKeyOption = "tb/detections",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write JSON lines for `import` into a new file; publish nothing."
+        ),
+    ] = None,
+    keep_crops: Annotated[
+        bool,
+        typer.Option(
+            "--keep-crops", help=f"Publish each crop as JPEG too, under {CROPS_KEY}/<det_id>."
+        ),
+    ] = False,
+    spool: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File of envelopes that no recorder has acknowledged; the next start sends them"
+            " again [default: detect-spool.sqlite in $MAPFOLD_HOME, else in .mapfold].",
+        ),
+    ] = None,
+    wait: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS", min=0.0, help="How long to wait for acknowledgements at the end."
+        ),
+    ] = 30.0,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+    ] = None,
+    json_: JsonOption = False,
+    connect: ConnectBesideListenOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+) -> None:
+    """Find objects in pictures and publish them as envelopes.
+
+    Pictures come from a folder, a video, stdin or Zenoh; poses from a file or Zenoh. A picture
+    becomes a keyframe when the robot has moved or turned far enough, or after a time. Its objects
+    are found and their crops encoded by ONNX models of your own; without them, this command prints
+    where to get some. Ctrl-C ends it.
+
+    Exit 3 when anything was left out or lost, or waits in the spool.
+    """
+    if detector is None or encoder is None:
+        say(WITHOUT_MODELS)
+        models = (("--detector", detector), ("--encoder", encoder))
+        missing = [name for name, path in models if path is None]
+        raise MisuseError(f"no {' and no '.join(missing)} given")
+    check_sources(images, zenoh_image, poses, zenoh_pose)
+    timing = timing_of(start, fps)
+    if out is not None and keep_crops:
+        raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
+    check_key(key, "--key")
+    address = None if metrics is None else parse_address(metrics, "--metrics")
+    name = run_id_of(run_id)
+    check_installed()
+    wanted = device_of(device)
+    given_poses: Poses = NoPoses() if poses is None else poses_of_file(poses)
+    options = FinderOptions(head, confidence, overlap, max_detections, size)
+    finder = Finder(
+        OnnxModel(detector, wanted, threads),
+        None if labels is None else read_labels(labels),
+        options,
+    )
+    preparation = read_preparation(encoder)
+    opened = Encoder(OnnxModel(encoder, wanted, threads), preparation)
+    limits = limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
+    zenoh = zenoh_options(connect, listen, zenoh_config)
+    with stop_on_signals() as stop, ExitStack() as stack:
+        session = None
+        if zenoh_image or zenoh_pose or keep_crops:
+            session = stack.enter_context(open_session(zenoh, mode=zenoh.mode))
+        live = None
+        if session is not None and (zenoh_image or zenoh_pose):
+            live = LivePictures(session, zenoh_image, zenoh_pose, stop, queue=queue)
+        pictures: Iterable[Picture] = (
+            live
+            if images is None and live
+            else open_images(images or "", stdin_until(stop), timing)
+        )
+        keyframes = Keyframes(
+            finder,
+            opened,
+            KeyframeGate(limits),
+            live.poses if live is not None and live.poses is not None else given_poses,
+            name,
+            hfov_deg=hfov,
+            keep_crops=keep_crops,
+            note=_note,
+        )
+        output = _output(
+            stack,
+            out,
+            zenoh,
+            spool or spool_path(),
+            key,
+            session if keep_crops else None,
+            stop,
+            patient=images is not None,
+        )
+        detection = Detection(keyframes, output, live, stop)
+        if address is not None:
+            stack.enter_context(metrics_of(address, detection))
+        where = str(out) if out is not None else key
+        said = zenoh_image or ("stdin" if images == "-" else images)
+        say(f"detecting in {said}, run {name}, to {where}; Ctrl-C ends it")
+        with show_status() as watch:
+            detection.run(pictures, watch)
+        detection.close(wait)
+    report = detection.report()
+    say(summary(name, report, where))
+    for line in advice(report, live, posed=bool(poses or zenoh_pose), spool=spool or spool_path()):
+        say(line)
+    if json_:
+        emit({"run_id": name, "space": opened.name, **as_document(report)})
+    finish(findings=not report.clean)
+
+
+def _output(
+    stack: ExitStack,
+    out: Path | None,
+    options: ZenohOptions,
+    spool: Path,
+    key: str,
+    crops: Session | None,
+    stop: threading.Event,
+    *,
+    patient: bool,
+) -> Output:
+    if out is not None:
+        return FileOutput(out)
+    publisher = stack.enter_context(EnvelopePublisher(options, spool, key))
+    sender = None if crops is None else CropSender(crops, CROPS_KEY, _note)
+    return ZenohOutput(publisher, sender, stop, patient=patient, note=_note)
+
+
+def _note(line: str) -> None:
+    say(visible(line))
+
+
+def register(app: typer.Typer) -> None:
+    """Add `detect` to the program."""
+    app.command()(detect)

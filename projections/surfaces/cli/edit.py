@@ -1,0 +1,271 @@
+"""`mapfold edit` and `mapfold edits`: corrections as events of the log, and a list of them.
+
+`edit` is a group: each kind of command is a subcommand with arguments of its own, and the options
+that all of them share (`edit_command`).
+"""
+
+import functools
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import Command
+from eventsrc.envelope.model import KeyframeId
+from eventsrc.envelope.trajectory import read_trajectory
+from eventsrc.log import LogReader
+from projections.edit import make
+from projections.edit.correct_poses import Span, by_trajectory, by_transform
+from projections.edit.current import CurrentMap
+from projections.edit.effect import effects_of
+from projections.edit.listing import edits_document, edits_text
+from projections.edit.make import Stamp
+from projections.edit.poses import DEFAULT_SLACK_S
+from projections.edit.record import MakeCommand
+
+from .edit_command import kind_of
+from .options import JsonOption, LogArgument, SetOption, SettingsOption, settings_from
+from .terminal import display, emit, say
+
+PlaceArgument = Annotated[
+    str, typer.Argument(metavar="PLACE", help="A place's id, or RUN:KEYFRAME for its place.")
+]
+OtherPlaceArgument = Annotated[
+    str, typer.Argument(metavar="PLACE", help="Another one, the same way.")
+]
+ObjectArgument = Annotated[
+    str, typer.Argument(metavar="OBJECT", help="An object's id, or the det_id of an observation.")
+]
+OtherObjectArgument = Annotated[
+    str, typer.Argument(metavar="OBJECT", help="Another one, the same way.")
+]
+RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="The run's id.")]
+
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Correct the map by an event in the log: it survives rebuilds, and can be undone.",
+    rich_markup_mode=None,
+)
+
+
+_kind = functools.partial(kind_of, app)
+
+
+@app.callback()
+def _log(context: typer.Context, log: LogArgument) -> None:
+    context.obj = log
+
+
+@_kind("name-place")
+def _name_place(
+    place: PlaceArgument,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
+) -> MakeCommand:
+    """Give a place a name."""
+    return lambda current, stamp: make.name_place(current, stamp, place, name)
+
+
+@_kind("keep-apart")
+def _keep_apart(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
+    """Keep two places apart, whatever joins them later."""
+    return lambda current, stamp: make.keep_apart(current, stamp, first, second)
+
+
+@_kind("undo-merge")
+def _undo_merge(
+    offset: Annotated[
+        int,
+        typer.Argument(
+            metavar="OFFSET", help="The offset of the merge, from `mapfold merges LOG`."
+        ),
+    ],
+) -> MakeCommand:
+    """Undo a merge of places and keep them apart."""
+    return lambda current, stamp: make.undo_merge(current, stamp, offset)
+
+
+@_kind("join")
+def _join(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
+    """Join two places into one.
+
+    Also where no chain of poses connects them.
+    """
+    return lambda current, stamp: make.join(current, stamp, first, second)
+
+
+@_kind("same-object")
+def _same_object(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
+    """Fuse two objects into one."""
+    return lambda current, stamp: make.same_object(current, stamp, first, second)
+
+
+@_kind("different-objects")
+def _different_objects(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
+    """Keep two objects apart.
+
+    Two observations of one object, named by their det_ids, become two objects.
+    """
+    return lambda current, stamp: make.different_objects(current, stamp, first, second)
+
+
+@_kind("drop-object")
+def _drop_object(
+    thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
+) -> MakeCommand:
+    """Drop an object from the map, with the observations that it has now.
+
+    The log keeps them.
+    """
+    return lambda current, stamp: make.drop_object(current, stamp, thing)
+
+
+@_kind("drop-detection")
+def _drop_detection(
+    det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID", help="The det_id of each.")],
+) -> MakeCommand:
+    """Drop detections from the map; the log keeps them."""
+    return lambda current, stamp: make.drop_detection(current, stamp, det_ids)
+
+
+@_kind("forget-run")
+def _forget_run(run: RunArgument) -> MakeCommand:
+    """Drop all keyframes of a run from the map; the log keeps them."""
+    return lambda current, stamp: make.forget_run(current, stamp, run)
+
+
+@_kind("forget-keyframes")
+def _forget_keyframes(
+    run: RunArgument,
+    span: Annotated[
+        str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
+    ],
+) -> MakeCommand:
+    """Drop some keyframes of a run from the map; the log keeps them."""
+    return lambda current, stamp: make.forget_keyframes(current, stamp, run, span)
+
+
+_FromOption = Annotated[
+    int | None, typer.Option("--from", metavar="K", help="From this keyframe of the run.")
+]
+_ToOption = Annotated[
+    int | None, typer.Option("--to", metavar="K", help="To this keyframe, included.")
+]
+
+
+@_kind("correct-poses")
+def _correct_poses(
+    run: RunArgument,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="A trajectory: TUM, CSV with a header, JSON lines."),
+    ] = None,
+    dx: Annotated[float | None, typer.Option("--dx", metavar="METRES", help="Shift in x.")] = None,
+    dy: Annotated[float | None, typer.Option("--dy", metavar="METRES", help="Shift in y.")] = None,
+    dyaw: Annotated[
+        float | None, typer.Option("--dyaw", metavar="RADIANS", help="Turn about the map's origin.")
+    ] = None,
+    first: _FromOption = None,
+    last: _ToOption = None,
+    slack: Annotated[
+        float,
+        typer.Option(
+            "--slack",
+            metavar="SECONDS",
+            min=0.0,
+            help="How far a keyframe may lie outside the stamps of FILE.",
+        ),
+    ] = DEFAULT_SLACK_S,
+    ignore_missing: Annotated[
+        bool,
+        typer.Option(
+            "--ignore-missing", help="Skip poses of keyframes that the run does not have."
+        ),
+    ] = False,
+) -> MakeCommand:
+    """Correct the poses of a run.
+
+    By a trajectory file, or by one rigid transform. Keyframes that the file has no pose for keep
+    theirs.
+    """
+    transform = [value for value in (dx, dy, dyaw) if value is not None]
+    if (file is None) == (not transform):
+        raise MisuseError("give either FILE or some of --dx, --dy and --dyaw")
+    span = Span(_keyframe_id(first), _keyframe_id(last))
+    if file is None:
+        moves = (dx or 0.0, dy or 0.0, dyaw or 0.0)
+        return lambda current, stamp: by_transform(current, stamp, run, span, *moves)
+    trajectory = read_trajectory(file)
+    return lambda current, stamp: by_trajectory(
+        current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
+    )
+
+
+def _keyframe_id(number: int | None) -> KeyframeId | None:
+    return None if number is None else KeyframeId(number)
+
+
+@_kind("use-settings", settings=False)
+def _use_settings(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="JSON object of settings.")
+    ] = None,
+    set_: SetOption = None,
+) -> MakeCommand:
+    """Change the settings of the map.
+
+    To those of FILE, else those in force, changed by --preset and --set.
+    """
+    if file is None and not set_:
+        raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
+
+    def command(current: CurrentMap, stamp: Stamp) -> Command:
+        return make.use_settings(current, stamp, settings_from(file, set_, current.corrections))
+
+    return command
+
+
+@_kind("undo")
+def _undo(
+    undone: Annotated[str, typer.Argument(metavar="COMMAND_ID", help="From `mapfold edits LOG`.")],
+) -> MakeCommand:
+    """Undo a command, as if it had never been given.
+
+    Undoing an undo restores the command.
+    """
+    return lambda current, stamp: make.undo(current, stamp, undone)
+
+
+def edits(
+    log: LogArgument,
+    effects: Annotated[
+        bool,
+        typer.Option(
+            "--effects", help="Compute the effects that are not known yet: two folds for each."
+        ),
+    ] = False,
+    json_: JsonOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """List the commands in a log: who gave which when and why, what it changed, what is undone.
+
+    An effect counts the places, objects and keyframes that were changed in the map of the events
+    before the command. `mapfold edit` keeps the effect of its command beside the log.
+    """
+    settings_of = functools.partial(settings_from, settings_file, set_)
+    with LogReader(log) as reader:
+        current = CurrentMap(reader, settings_of, note=say)
+        found = effects_of(current, known_only=not effects)
+        times = {event.offset: event.logged_ns for event in current.command_events()}
+    if json_:
+        emit(edits_document(found, times))
+    else:
+        display(edits_text(found, times))
+
+
+def register(program: typer.Typer) -> None:
+    """Add `edit` and `edits` to the program."""
+    program.add_typer(app, name="edit")
+    program.command()(edits)

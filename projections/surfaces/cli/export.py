@@ -1,0 +1,282 @@
+"""The map for other programs: `mapfold export` writes files, `mapfold foxglove` serves Foxglove."""
+
+import hashlib
+import math
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted
+from eventsrc.log import LogReader
+from eventsrc.record.transport.config import is_loopback
+from projections.fold.corrections import map_fingerprint
+from projections.map.fold import fold_log_cached
+from projections.map.log_commands import read_corrections
+from projections.map.one_floor import view_of_floor
+from projections.map.scenes import RecordedFold
+
+from .options import (
+    KnownAtOption,
+    LogArgument,
+    SetOption,
+    SettingsOption,
+    W,
+    known_point,
+    point,
+    settings_from,
+    writing,
+)
+from .signals import stop_on_signals
+from .terminal import Bar, say
+
+if TYPE_CHECKING:
+    from projections.adapters.foxglove.playback import Playback
+
+
+def export(
+    log: LogArgument,
+    at: Annotated[str, typer.Option("--at", metavar="W", help=f"Fold to here: {W}.")] = "end",
+    graphml: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Places and Objects as a graph: Gephi, yEd, networkx."),
+    ] = None,
+    dot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The same for Graphviz: neato -Tsvg FILE.")
+    ] = None,
+    geojson: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Places, Objects, ways and paths: QGIS; see --origin."),
+    ] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Four tables: places, objects, keyframes and adjacency .csv."
+        ),
+    ] = None,
+    nav2: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A waypoint for each Place, as Nav2's RViz panel loads."),
+    ] = None,
+    foxglove: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.mcap", help="How the map came about, event by event (extra [foxglove])."
+        ),
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="The same for the Rerun viewer (extra [rerun])."),
+    ] = None,
+    every: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="A scene every N events, for --foxglove and --rerun [default: as many as make at"
+            " most 500 scenes].",
+        ),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON[,YAW]",
+            help="Where the map frame's origin is on Earth (WGS 84), and its x axis in degrees"
+            " counter-clockwise from east, for --geojson [default: coordinates are metres].",
+        ),
+    ] = None,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            "--floor", metavar="NAME", help="This floor only; - is the floor without a name."
+        ),
+    ] = None,
+    known_at: KnownAtOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Write the map folded to a point in the log for other programs.
+
+    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and recordings for Foxglove and Rerun, one or
+    several at once. The same log and settings give the same bytes; for Rerun, the same data.
+    """
+    files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
+    recordings = {"foxglove": foxglove, "rerun": rerun}
+    if not any((files | recordings).values()):
+        names = ", ".join(f"--{name}" for name in files | recordings)
+        raise MisuseError(f"nothing to write; give at least one of {names}")
+    if origin is not None and geojson is None:
+        raise MisuseError("--origin is for --geojson")
+    if every is not None and not any(recordings.values()):
+        raise MisuseError("--every is for --foxglove and --rerun")
+    if floor is not None and foxglove is not None:
+        raise MisuseError("--foxglove shows all floors, one above the other; leave --floor out")
+    if floor is not None and rerun is not None:
+        raise MisuseError("--rerun shows all floors, each in a view; leave --floor out")
+    from projections.adapters import export as formats  # here: with the imports of several formats
+
+    where = None if origin is None else formats.Origin(*_degrees(origin))
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    with LogReader(log) as reader:
+        end = point(reader, at)
+        corrections = read_corrections(reader, known_point(reader, known_at, end))
+        settings = settings_from(settings_file, set_, corrections)
+        for name, file in recordings.items():
+            if file is not None:
+                write = _recorder(
+                    name, f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
+                )
+                with writing(file), Bar() as bar:
+                    fold = RecordedFold(
+                        reader,
+                        settings,
+                        end,
+                        corrections=corrections,
+                        every=every,
+                        progress=bar.show_fold,
+                    )
+                    scenes = write(fold, file)
+                say(f"wrote {file}: {counted(end, 'event')}, {counted(scenes, 'scene')}")
+        if not any(files.values()):
+            return
+        _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
+    if floor is not None:
+        view = view_of_floor(view, floor)
+    texts: dict[Path, str] = {}
+    if graphml is not None:
+        texts[graphml] = formats.graphml(view)
+    if dot is not None:
+        texts[dot] = formats.dot(view)
+    if geojson is not None:
+        texts[geojson] = formats.geojson(view, where)
+    if nav2 is not None:
+        texts[nav2] = formats.nav2_waypoints(view)
+    if csv is not None:
+        texts |= {csv / name: text for name, text in formats.tables(view).items()}
+    for path, text in texts.items():
+        with writing(path):
+            path.write_text(text, "utf-8", newline="")
+    places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
+    say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
+
+
+def _recorder(name: str, identity: str) -> Callable[[RecordedFold, Path], int]:
+    """The function that writes the recordings of an option. Raises MisuseError if its extra is not
+    installed."""
+    try:
+        if name == "foxglove":
+            from projections.adapters.foxglove.recording import write_recording
+
+            return write_recording
+        from projections.adapters.rerun import recording
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"--{name} needs {error.name}, which is not installed; pip install 'mapfold[{name}]'"
+        ) from None
+    recording_id = hashlib.sha256(identity.encode()).hexdigest()[:32]
+    return partial(recording.write_recording, recording_id=recording_id)
+
+
+def _degrees(text: str) -> tuple[float, ...]:
+    """``52.52,13.405`` or ``52.52,13.405,90``. Raises MisuseError."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
+        raise MisuseError(f"--origin {text}: write it as LAT,LON or LAT,LON,YAW, in degrees")
+    if not (-89 <= values[0] <= 89 and -180 <= values[1] <= 180):
+        raise MisuseError(
+            f"--origin {text}: give a latitude of -89 to 89 and a longitude of -180 to 180"
+        )
+    return values
+
+
+def foxglove(
+    log: LogArgument,
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="Listen here.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
+    ] = 8765,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write a layout there first, for Foxglove to import from file."
+        ),
+    ] = None,
+    known_at: KnownAtOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Show a log's map in Foxglove, whose timeline sets the time.
+
+    Seek, play and pause show the map as it was. In Foxglove: Open connection, Foxglove WebSocket.
+    Anybody who can reach the address can read the log. Ctrl-C ends it.
+    """
+    try:
+        from projections.adapters.foxglove.playback import PastMaps, Playback, layout_json
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"mapfold foxglove needs {error.name}, which is not installed;"
+            " pip install 'mapfold[foxglove]'"
+        ) from None
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    if layout is not None:
+        with writing(layout):
+            layout.write_text(layout_json(), "utf-8")
+        say(f"wrote {layout}")
+    with LogReader(log) as reader:
+        end = reader.next_offset
+        corrections = read_corrections(reader, known_point(reader, known_at, end))
+        settings = settings_from(settings_file, set_, corrections)
+        with Bar() as bar:
+            maps = PastMaps(reader, settings, corrections, end, bar.show_fold)
+        if maps.moments.backwards:
+            say(
+                f"{counted(maps.moments.backwards, 'event')} with an earlier stamp than an event"
+                " before; the timeline shows them at that event's time"
+            )
+        try:
+            playback = Playback(maps, log.resolve().name, host, port)
+        except OSError as error:
+            raise MisuseError(
+                f"cannot listen on {host}:{port}: {error}; give another --host or --port"
+            ) from None
+        with stop_on_signals() as stop:
+            if not is_loopback(host):
+                say(f"warning: others can reach {host}, and can read the log; there is no token")
+            shown = f"[{host}]" if ":" in host else host
+            say(f"showing {counted(end, 'event')} of {log} at ws://{shown}:{playback.server.port}")
+            say("in Foxglove: Open connection, Foxglove WebSocket; Ctrl-C ends it")
+            _run(playback, stop)
+    say("closed")
+
+
+def _run(playback: "Playback", stop: threading.Event) -> None:
+    """Play until ``stop``; an error of the player ends it and is raised."""
+    failed: list[BaseException] = []
+
+    def play() -> None:
+        try:
+            playback.run()
+        except BaseException as error:  # noqa: BLE001 - raised below
+            failed.append(error)
+            stop.set()
+
+    player = threading.Thread(target=play, name="playback")
+    player.start()
+    stop.wait()
+    playback.end()
+    player.join()
+    if failed:
+        raise failed[0]
+
+
+def register(app: typer.Typer) -> None:
+    """Add `export` and `foxglove` to the program."""
+    for command in (export, foxglove):
+        app.command()(command)

@@ -1,0 +1,317 @@
+"""``mapfold fleet``: replay, status, verification and questions over many sites at once.
+
+A site that fails does not stop the others. A command ends with exit 3 when a site failed or
+something was found at one.
+"""
+
+from dataclasses import asdict
+from typing import Annotated, Any, Final
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted, visible
+from projections.adapters.fleet.engine import Ended, usable_cores
+from projections.adapters.fleet.site_databases import check_server, site_databases, template_of
+from projections.adapters.fleet.sites import Site
+from projections.fold.settings import Settings
+
+from .databases import LoaderOption, Loaders, loader_of
+from .fleet_options import (
+    EngineOption,
+    JobsOption,
+    QuestionJobsOption,
+    SitesArgument,
+    TemplateOption,
+    VectorTemplateOption,
+    ended_sites,
+    sites_of,
+)
+from .fleet_text import status_table, which_site_text
+from .options import (
+    HfovOption,
+    ImageOption,
+    JsonOption,
+    QuestionArgument,
+    SetOption,
+    SettingsOption,
+    camera_from,
+    question_from,
+    settings_from,
+)
+from .signals import sigterm_unwinds
+from .terminal import display, emit, finish, say
+
+fleet_app = typer.Typer(
+    help="Rebuild, check and ask many sites, each with a log and a database of its own.",
+    no_args_is_help=True,
+)
+
+_NAMED: Final = 10
+
+
+def _chosen(file: Any, assignments: list[str] | None) -> Any:
+    """The values of ``--settings`` and ``--set``, read here: workers may be on other machines."""
+    from projections.adapters.fleet.replaying import ChosenSettings
+
+    settings_from(file, assignments)  # raises for invalid ones
+    base: Settings | None = None if file is None else settings_from(file, None)
+    return ChosenSettings(base, tuple(assignments or ()))
+
+
+def _check_reach(engine: str, db: str | None) -> None:
+    """Raise MisuseError where workers of a cluster would need the embedded server."""
+    if engine.startswith("dask:") and template_of(db, "--db", "MAPFOLD_DB") is None:
+        raise MisuseError(
+            f"--engine {engine}: workers on other machines cannot reach the embedded server; give"
+            " --db postgresql://host/{site}"
+        )
+
+
+@fleet_app.command()
+def replay(
+    place: SitesArgument,
+    engine: EngineOption = "local",
+    jobs: JobsOption = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Rebuild also what is up to date.")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Rebuild also over the map of another log.")
+    ] = False,
+    db: TemplateOption = None,
+    vector_db: VectorTemplateOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    loader: LoaderOption = Loaders.copy,
+    no_hnsw: Annotated[
+        bool, typer.Option("--no-hnsw", help="Do not index large tables for vector search.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Rebuild the databases of all sites that are not up to date.
+
+    It can be interrupted and run again: sites that are up to date are skipped. Databases that do
+    not exist are created. A map made from another log is replaced only with --replace.
+    """
+    from projections.adapters.fleet.replaying import ReplayRequest, SiteReplay, replay_site
+
+    chosen = _chosen(settings_file, assignments)
+    sites = sites_of(place)
+    _check_reach(engine, db)
+    entries: dict[int, dict[str, Any]] = {}
+    with sigterm_unwinds(), site_databases(sites, db, vector_db) as databases:
+        requests = [
+            ReplayRequest(
+                site,
+                databases[site.name],
+                chosen,
+                again,
+                replace,
+                loader_of(loader),
+                not no_hnsw,
+            )
+            for site in sites
+        ]
+        if engine == "local":  # else each site would wait for it
+            for server in databases[sites[0].name].urls:
+                check_server(server)
+        with ended_sites(replay_site, requests, sites, engine, jobs) as results:
+            for ended in results:
+                site = sites[ended.index]
+                done = ended.result or SiteReplay("failed", error=ended.error)
+                entries[ended.index] = _replay_entry(site, ended, done)
+                if not as_json and done.report is not None:
+                    again_text = f", started {ended.attempts} times" if ended.attempts > 1 else ""
+                    say(
+                        f"{visible(site.name)}: {counted(done.report.events, 'event')} in"
+                        f" {done.report.total_s:.2f} s; digest {done.report.digest[:16]}"
+                        f"{again_text}"
+                    )
+    ordered = [entries[index] for index in sorted(entries)]
+    counts = {
+        outcome: sum(entry["outcome"] == outcome for entry in ordered)
+        for outcome in ("rebuilt", "up_to_date", "followed", "failed")
+    }
+    if as_json:
+        emit({"sites": ordered, **counts})
+    _say_replayed(ordered, counts)
+    finish(findings=bool(counts["failed"]))
+
+
+def _replay_entry(site: Site, ended: Ended, done: Any) -> dict[str, Any]:
+    return {
+        "site": site.name,
+        "path": str(site.log),
+        "outcome": done.outcome,
+        "attempts": ended.attempts,
+        "events": done.events,
+        "report": None if done.report is None else asdict(done.report),
+        "error": done.error,
+    }
+
+
+def _say_replayed(entries: list[dict[str, Any]], counts: dict[str, int]) -> None:
+    parts = [f"{counts['rebuilt']:,} rebuilt", f"{counts['up_to_date']:,} up to date"]
+    if counts["followed"]:
+        parts.append(f"{counts['followed']:,} written by a live tail")
+    if counts["failed"]:
+        parts.append(f"{counts['failed']:,} failed")
+    say(f"{counted(len(entries), 'site')}: {', '.join(parts)}")
+    _say_failed([(entry["site"], entry["error"]) for entry in entries if entry["error"]])
+
+
+def _say_failed(failed: list[tuple[str, str]]) -> None:
+    for name, error in failed:
+        say(f"failed: {visible(name)}: {error}")
+
+
+@fleet_app.command()
+def status(
+    place: SitesArgument,
+    jobs: JobsOption = None,
+    db: TemplateOption = None,
+    vector_db: VectorTemplateOption = None,
+    assignments: SetOption = None,
+    settings_file: SettingsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show a table of all sites: log, last keyframe, losses, and how far the databases are.
+
+    Exit 3 when a site is not up to date, has lost something or cannot be read.
+    """
+    from projections.adapters.fleet.looking import SiteStatus, StatusRequest, look_at_site
+
+    from .db import status_document
+    from .log import info_document
+
+    chosen = _chosen(settings_file, assignments)
+    sites = sites_of(place)
+    found: list[SiteStatus] = [SiteStatus()] * len(sites)
+    with sigterm_unwinds(), site_databases(sites, db, vector_db) as databases:
+        requests = [StatusRequest(site, databases[site.name], chosen) for site in sites]
+        with ended_sites(look_at_site, requests, sites, "local", jobs) as results:
+            for ended in results:
+                found[ended.index] = ended.result or SiteStatus(error=ended.error)
+    if as_json:
+        documents = []
+        for site, each in zip(sites, found, strict=True):
+            document = {"site": site.name, "path": str(site.log), "ok": each.healthy}
+            document |= {"error": each.error, "info": None, "log": None, "sinks": None}
+            if each.info is not None and each.databases is not None:
+                document |= {"info": info_document(each.info)}
+                document |= status_document(each.info, each.databases)
+            documents.append(document)
+        emit({"sites": documents, "ok": all(each.healthy for each in found)})
+    else:
+        display(status_table(sites, found))
+    _say_failed([(s.name, each.error) for s, each in zip(sites, found, strict=True) if each.error])
+    finish(findings=not all(each.healthy for each in found))
+
+
+@fleet_app.command()
+def verify(
+    place: SitesArgument,
+    engine: EngineOption = "local",
+    jobs: JobsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Read every byte of all logs, as `log verify` does of one; exit 3 if anything is wrong."""
+    from projections.adapters.fleet.looking import SiteVerification, verify_site
+
+    from .log import finding_text, verification_document
+
+    sites = sites_of(place)
+    found = [SiteVerification()] * len(sites)
+    with ended_sites(verify_site, sites, sites, engine, jobs) as results:
+        for ended in results:
+            found[ended.index] = ended.result or SiteVerification(error=ended.error)
+    pairs = list(zip(sites, found, strict=True))
+    if as_json:
+        documents = [
+            {"site": site.name, "path": str(site.log), "sound": each.sound, "error": each.error}
+            | {"report": None if each.found is None else verification_document(each.found)}
+            for site, each in pairs
+        ]
+        emit({"sites": documents, "sound": all(each.sound for each in found)})
+    else:
+        for site, each in pairs:
+            for finding in () if each.found is None else each.found.findings:
+                display(f"{visible(site.name)}: {finding_text(finding)}")
+    read = [each.found for each in found if each.found is not None]
+    wrong = sum(not each.sound for each in found)
+    say(
+        f"{counted(len(sites), 'site')}: {counted(sum(r.events for r in read), 'event')},"
+        f" {sum(r.size_bytes for r in read):,} bytes:"
+        f" {f'{wrong:,} with findings or not readable' if wrong else 'all good'}"
+    )
+    _say_failed([(site.name, each.error) for site, each in pairs if each.error])
+    finish(findings=bool(wrong))
+
+
+@fleet_app.command()
+def relocalize(
+    place: SitesArgument,
+    query: QuestionArgument,
+    top: Annotated[
+        int, typer.Option("--top", metavar="N", min=1, max=100, help="Places of each site.")
+    ] = 3,
+    hfov: HfovOption = None,
+    image: ImageOption = None,
+    jobs: QuestionJobsOption = None,
+    db: TemplateOption = None,
+    vector_db: VectorTemplateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the site a robot is at, from a few object crops: the probability of each, and of none.
+
+    Each site's map is asked as by `mapfold relocalize`; its answer is in the output. Exit 3 when a
+    site could not be asked.
+    """
+    from projections.adapters.fleet.asking import ask_sites
+
+    question, camera = question_from(query), camera_from(hfov, image)
+    sites = sites_of(place)
+    with sigterm_unwinds(), site_databases(sites, db, vector_db) as databases:
+        answer = ask_sites(
+            sites, databases, question, top=top, camera=camera, jobs=jobs or 2 * usable_cores()
+        )
+    best = answer.which.best
+    if as_json:
+        emit(
+            {
+                "site": None if best is None else best.name,
+                "none": answer.which.none,
+                "sites": [each.document() for each in answer.which.sites],
+                "not_asked": dict(answer.not_asked),
+            }
+        )
+    else:
+        display(which_site_text(answer.which))
+    for name, reason in answer.not_asked.items():
+        say(f"not asked: {visible(name)}: {reason}")
+    finish(findings=bool(answer.not_asked))
+
+
+@fleet_app.command()
+def url(
+    place: SitesArgument,
+    site: Annotated[str, typer.Argument(metavar="SITE", help="The site's name.")],
+    db: TemplateOption = None,
+) -> None:
+    """Print the URL of one site's database, for --db of the commands of one map.
+
+    A URL of the embedded server works while that server runs: see `db start`.
+    """
+    sites = sites_of(place)
+    if site not in {each.name for each in sites}:
+        names = ", ".join(visible(each.name) for each in sites[:_NAMED])
+        more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
+        raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
+    with sigterm_unwinds(), site_databases(sites, db, None) as databases:
+        display(databases[site].graph_url)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the `fleet` group to ``app``."""
+    app.add_typer(fleet_app, name="fleet")

@@ -1,0 +1,278 @@
+"""`mapfold import`: messages from files into a log."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import LogDamaged, MisuseError
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.model import RunId
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.gap_history import fold_and_save_ledger
+from eventsrc.record.importers import (
+    DEFAULT_KEY,
+    IMPORT_FSYNC,
+    BagOptions,
+    ImportInterrupted,
+    ImportReport,
+    TopicChoice,
+    check_sources,
+    import_files,
+)
+from eventsrc.record.importers.map_yaml import read_map_yaml
+from eventsrc.record.importers.source import Source
+from eventsrc.record.importers.topics import NOT_CHOSEN
+from eventsrc.record.transport.config import check_key
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS
+
+from .bag_text import (
+    BaseFrameOption,
+    CameraOption,
+    CovarianceOption,
+    DetectionsOption,
+    EmbeddingsOption,
+    GridOption,
+    HeightsOption,
+    LabelsOption,
+    MapFrameOption,
+    MaxGapOption,
+    ModelOption,
+    PoseOption,
+    RunIdOption,
+    bag_lines,
+    check_run_id,
+    labels_by_number,
+    max_gap_ns,
+)
+from .options import JsonOption
+from .recorder_text import restart_as_json, say_restart
+from .signals import ctrl_c_between_steps
+from .terminal import FileBars, emit, finish, say
+
+_MOST_REJECTS: Final = 5
+_MOST_TOPICS: Final = 10
+
+
+def import_(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
+    ],
+    files: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="FILE",
+            help="JSON lines (plain or gzip), logger records, MCAP files, bags of ROS 2, other "
+            "logs; - is stdin.",
+        ),
+    ] = None,
+    key: Annotated[
+        str, typer.Option(metavar="KEY", help="Key for messages without one.")
+    ] = DEFAULT_KEY,
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="The map.yaml of a map server, appended before the files; its walls apply from"
+            " there on.",
+        ),
+    ] = None,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="The floor of the map of --map, as in the envelopes' `floor`."
+        ),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOB",
+            help="Only topics (keys) that match this, such as 'tb/*'; may be repeated.",
+        ),
+    ] = None,
+    detections: DetectionsOption = None,
+    pose: PoseOption = None,
+    covariance: CovarianceOption = None,
+    embeddings: EmbeddingsOption = None,
+    camera: CameraOption = None,
+    grid: GridOption = None,
+    map_frame: MapFrameOption = None,
+    base_frame: BaseFrameOption = None,
+    run_id: RunIdOption = None,
+    labels: LabelsOption = None,
+    embedding_model: ModelOption = None,
+    heights: HeightsOption = False,
+    max_gap: MaxGapOption = DEFAULT_MAX_GAP_NS / 1e9,
+    json_: JsonOption = False,
+) -> None:
+    """Append recorded envelopes and occupancy maps to a log, in the order of the files.
+
+    From a bag of ROS 2 (a folder, or its .db3 or .mcap file) detections become envelopes with their
+    poses, and occupancy grids become maps; needs the extra mapfold[ros]. Which topics are used
+    follows from their types and names, unless an option names them.
+
+    A message that is neither a valid envelope nor an occupancy grid is kept with its bytes and the
+    reason under mapfold/rejected, and the command exits with 3. Messages of an MCAP file that were
+    meant for something else are passed over and counted; if nothing is left, it exits with 3, too.
+    Ctrl-C keeps the events appended so far and prints how far the import got.
+    """
+    names = files or []
+    if not names and map_ is None:
+        raise MisuseError("nothing to import; give a FILE, or a map by --map")
+    check_sources(names)
+    check_key(key, "--key")
+    if floor is not None and map_ is None:
+        raise MisuseError(f"--floor {visible(floor)} is for a map; give one by --map, too")
+    topics = TopicChoice.of(topic or ())
+    given_map = None if map_ is None else read_map_yaml(map_, floor)
+    bags = BagOptions(
+        tuple(detections or ()),
+        pose,
+        covariance,
+        embeddings,
+        camera,
+        grid,
+        map_frame,
+        base_frame,
+        check_run_id(run_id),
+        embedding_model,
+        labels_by_number(labels),
+        heights,
+        max_gap_ns(max_gap),
+    )
+    rejects = _RejectPrinter()
+    try:
+        with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer:
+            say_restart(log, writer)
+            ledger = _known_keyframes(log)
+            with FileBars() as bars, ctrl_c_between_steps() as step:
+                report = import_files(
+                    writer,
+                    names,
+                    key=key,
+                    progress=lambda source: _show(bars, source),
+                    on_reject=rejects.say,
+                    step=step,
+                    given_map=given_map,
+                    topics=topics,
+                    bags=bags,
+                    ledger=ledger,
+                )
+    except ImportInterrupted as interrupted:
+        rejects.say_rest()
+        say(_kept(log, interrupted))
+        raise
+    rejects.say_rest()
+    if json_:
+        emit({"log": str(log), **_without_bags(report), **restart_as_json(writer)})
+    for bag in report.bags:
+        for line in bag_lines(bag):
+            say(line)
+    if not report.bags and bags != BagOptions():
+        say(
+            "no bag of ROS 2 among the files: --detections and the other options for bags are not"
+            " used"
+        )
+    say(_summary(log, report))
+    for line in _passed_over(report):
+        say(line)
+    useless = any(bag.is_useless for bag in report.bags)
+    finish(findings=report.rejected > 0 or report.imported_nothing or useless)
+
+
+def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
+    """The keyframes that the log has; None if it is damaged, which does not end the import."""
+    try:
+        with LogReader(log) as reader:
+            return fold_and_save_ledger(reader, note=say)
+    except LogDamaged as error:
+        say(f"keyframes that the log has already are not counted: {error}")
+        return None
+
+
+def _without_bags(report: ImportReport) -> dict[str, Any]:
+    """The report as JSON; ``bags`` only where there were some."""
+    document = asdict(report)
+    if not report.bags:
+        del document["bags"]
+    return document
+
+
+class _RejectPrinter:
+    """Prints the first few rejections as they come, and the number of the others."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def say(self, place: str, reason: str) -> None:
+        self._count += 1
+        if self._count <= _MOST_REJECTS:
+            say(visible(f"{place}: rejected: {reason}"))
+
+    def say_rest(self) -> None:
+        if self._count > _MOST_REJECTS:
+            say(f"… and {self._count - _MOST_REJECTS:,} more rejected")
+
+
+def _kept(log: Path, interrupted: ImportInterrupted) -> str:
+    report = interrupted.report
+    if interrupted.place is None:
+        return f"{log}: nothing was imported"
+    kept = counted(report.next_offset - report.first_offset, "event")
+    return (
+        f"{log}: kept {kept}, offsets {report.first_offset} to {report.next_offset - 1}, up to "
+        f"{interrupted.place}; import only what comes after that, or the log holds the rest twice"
+    )
+
+
+def _summary(log: Path, report: ImportReport) -> str:
+    parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
+    if report.repeated:
+        new = report.accepted - report.repeated
+        parts[0] += f" ({new:,} new, {report.repeated:,} of keyframes that it has already)"
+    if report.next_offset > report.first_offset:
+        parts.append(f"offsets {report.first_offset} to {report.next_offset - 1}")
+    if report.maps:
+        parts.insert(1, counted(report.maps, "map"))
+    if report.verbatim:
+        parts.append(f"{counted(report.verbatim, 'verbatim message')} taken over")
+    if report.system:
+        parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
+    if report.skipped:
+        parts.append(f"{counted(report.skipped, 'message')} passed over")
+    parts.append(f"{report.rejected} rejected")
+    hint = (
+        f"; `{advised('log', 'cat', log, '--key', 'mapfold/rejected')}` shows them"
+        if report.rejected
+        else ""
+    )
+    return ", ".join(parts) + hint
+
+
+def _passed_over(report: ImportReport) -> Iterator[str]:
+    for each in report.passed_over[:_MOST_TOPICS]:
+        yield visible(f"passed over: {each.topic}: {counted(each.count, 'message')}, {each.what}")
+    if len(report.passed_over) > _MOST_TOPICS:
+        yield f"… and {counted(len(report.passed_over) - _MOST_TOPICS, 'topic')} more"
+    chosen_away = any(each.what == NOT_CHOSEN for each in report.passed_over)
+    if report.imported_nothing and not report.rejected and chosen_away:
+        yield "nothing was imported: --topic chooses none of these topics"
+    elif report.imported_nothing and not report.rejected:
+        yield (
+            "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
+            "imports a topic of JSON nevertheless and reports what is wrong with each message"
+        )
+
+
+def _show(bars: FileBars, source: Source) -> None:
+    bars.show(id(source), source.name, source.bytes_read(), source.size_bytes)
+
+
+def register(app: typer.Typer) -> None:
+    """Add `import` to ``app``."""
+    app.command("import")(import_)

@@ -1,0 +1,158 @@
+"""`mapfold state` and `mapfold draw`: the map folded to a point in the log, as text, JSON or a
+picture."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.progress import working
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.model import FIRST_OFFSET
+from eventsrc.log import LogReader
+from projections.history.known import map_after
+from projections.map.advice import places_advice, space_advice
+from projections.map.digest import map_digest
+from projections.map.export import state_document, state_text
+from projections.map.fold import fold_events
+from projections.map.log_commands import read_corrections
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+
+from .options import (
+    JsonOption,
+    KnownAtOption,
+    NoCacheOption,
+    SetOption,
+    SettingsOption,
+    W,
+    check_picture,
+    known_point,
+    point,
+    settings_from,
+)
+from .terminal import display, emit, say
+
+
+def state(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
+    at: Annotated[
+        str,
+        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
+    ] = "end",
+    known_at: KnownAtOption = None,
+    json_: JsonOption = False,
+    digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
+    no_digest: Annotated[
+        bool,
+        typer.Option("--no-digest", help="Leave out the digest, which reads the whole map."),
+    ] = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    """Show the map folded to a point in the log.
+
+    Counts, settings, digest, and each place with its size and neighbours; --json prints all.
+    """
+    if json_ and digest:
+        raise MisuseError("--json and --digest together: --json prints the digest too")
+    if digest and no_digest:
+        raise MisuseError("--digest and --no-digest exclude each other")
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    with LogReader(log) as reader:
+        end = point(reader, at)
+        known = known_point(reader, known_at, end)
+        corrections = read_corrections(reader, known)
+        settings = settings_from(settings_file, set_, corrections)
+        view = map_after(
+            reader, settings, end, corrections=corrections, note=say, cache=not no_cache
+        )
+    hexdigits = None
+    if not no_digest:
+        with working("computing the digest"):
+            hexdigits = map_digest(view)
+    if json_:
+        emit(state_document(view, hexdigits, known))
+    elif digest:
+        display(f"{hexdigits}\n")
+    else:
+        display(state_text(view, hexdigits, known))
+    for advice in () if digest else (places_advice(view.counts(), settings), space_advice(view)):
+        if advice is not None:
+            say(advice)
+
+
+def draw(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
+    at: Annotated[
+        str,
+        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
+    ] = "end",
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The picture: .png, .svg or .pdf.")
+    ] = Path("map.png"),
+    house: Annotated[
+        int | None,
+        typer.Option(
+            metavar="SEED", help="Draw the plan of this simulated house under the map.", min=0
+        ),
+    ] = None,
+    min_observations: Annotated[
+        int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
+    ] = 2,
+    floor: Annotated[
+        str | None,
+        typer.Option(
+            "--floor", metavar="NAME", help="Draw this floor only; - is the floor without a name."
+        ),
+    ] = None,
+    merges: Annotated[
+        bool, typer.Option("--merges", help="Mark the keyframes that merged places.")
+    ] = False,
+    known_at: KnownAtOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Draw the map folded to a point in the log.
+
+    The robot's path, places in colours, objects, and edges between adjacent places.
+    """
+    # Imported here: matplotlib takes longer to import than most commands take to run.
+    from eventsrc.adapters.sim import build_house
+    from projections.adapters.drawing import draw_map, floor_of
+    from projections.adapters.drawing.picture import bridges_of, fold_with_merges
+    from projections.map.one_floor import view_of_floor
+
+    check_picture(out)
+    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    with LogReader(log) as reader:
+        end = point(reader, at)
+        corrections = read_corrections(reader, known_point(reader, known_at, end))
+        settings = settings_from(settings_file, set_, corrections)
+        view = MapView(settings, keep_embeddings=False, corrections=corrections)
+        fold = new_map(reader, settings, corrections)
+        merged = fold_with_merges(fold_events(reader.read(FIRST_OFFSET, end), fold), view)
+    title = f"{log.resolve().name} after {counted(view.next_offset, 'event')}"
+    if floor is not None:
+        view, title = view_of_floor(view, floor), f"{title}, floor {visible(floor)}"
+    elif len(floors := {k.floor for k in view.keyframes if k.pose is not None}) > 1:
+        say(f"{out} shows {len(floors)} floors, one above the other; --floor NAME draws one")
+    with working("drawing"):
+        draw_map(
+            view,
+            out,
+            title=title,
+            floor=None if house is None else floor_of(build_house(house)),
+            bridges=bridges_of(view, merged) if merges else (),
+            min_observations=min_observations,
+        )
+    places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
+    say(f"wrote {out}: {places}, {objects}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `state` and `draw` to the program."""
+    for command in (state, draw):
+        app.command()(command)

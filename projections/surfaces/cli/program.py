@@ -1,0 +1,324 @@
+"""The ``mapfold`` program: its start, its standard streams and its exit codes.
+
+Starting. Only the module of the command that was asked for is imported: all of them together take a
+third of a second, longer than most commands work. The cyclic garbage collector is off while modules
+are imported, and OpenBLAS gets one thread: the matrix products here are too small to be split.
+
+Streams. All three are open: where one was closed (``2>&-``), the next file to be opened, a log's
+for example, would get its number and everything that is written to that stream. A failed write to
+stdout is OutputLost, so that a full disk there is not reported as a fault of the log that is read;
+if the reader has closed the pipe it stays a BrokenPipeError. A failed write to stderr is ignored: a
+recorder goes on when the disk of its messages is full or its terminal is gone.
+
+Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted ·
+141 the reader of stdout left before everything was printed · 143 terminated. typer itself would
+answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes both on to
+`run_app` as exceptions of their own.
+"""
+
+import contextlib
+import gc
+import importlib
+import inspect
+import io
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO
+
+import typer
+from typer.core import TyperGroup
+
+from eventsrc.base.errors import MapfoldError
+
+from . import COMMANDS, SECTIONS
+from .in_force import remember_running
+from .presets import add_presets
+from .reading_bar import ReadingBar
+from .terminal import EXIT_FAILED, OutputLost, output_begins, say
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+EXIT_INTERRUPTED: Final = 130
+EXIT_READER_GONE: Final = 141
+"""128 + SIGPIPE, as a shell shows a program that writes to a closed pipe."""
+
+COMPLETION_VARIABLE: Final = "_MAPFOLD_COMPLETE"
+"""The environment variable by which a shell asks for completions."""
+
+# typer's own class or click's, depending on typer's version.
+_UsageError: Any = typer.BadParameter.__base__
+_DATABASE_OPTION: Final = re.compile(r"--(vector-)?db\b")
+_SECRET: Final = re.compile(r"://|password", re.IGNORECASE)
+
+
+def start(
+    command_line: Callable[[Mapping[str, str]], Callable[..., Any]], commands: Mapping[str, str]
+) -> None:
+    """Run the command that ``sys.argv`` names; ends by SystemExit.
+
+    ``commands`` is the table of all commands, ``command_line`` makes the program of some of them.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when numpy is imported
+    gc.disable()
+    if COMPLETION_VARIABLE in os.environ:
+        from typer._completion_classes import completion_init
+
+        completion_init()
+    with _exit_on_ctrl_c():
+        program = command_line(_needed(commands))
+    gc.freeze()
+    gc.enable()
+    try:
+        run_app(program)
+    finally:
+        gc.freeze()  # else the interpreter would search all objects for cycles as it exits
+
+
+def _needed(commands: Mapping[str, str]) -> Mapping[str, str]:
+    """The requested command, or the one that a shell completes; all commands if it is none."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if COMPLETION_VARIABLE in os.environ:
+        typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+        found = re.match(r"\s*\S+\s+(\S+)\s", typed)  # the program, and a command and its end
+        name = found[1] if found else ""
+    if sys.argv[1:] in (["--version"], ["-V"]):
+        return {}
+    return {name: commands[name]} if name in commands else commands
+
+
+@contextlib.contextmanager
+def _exit_on_ctrl_c() -> Iterator[None]:
+    """Ctrl-C during the imports exits at once: an exception could be raised anywhere in them."""
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is not signal.default_int_handler:  # ignored, or set by the caller of `main`
+        yield
+        return
+    signal.signal(signal.SIGINT, _exit_interrupted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
+def _exit_interrupted(_number: int, _frame: FrameType | None) -> None:
+    os.write(2, b"mapfold: interrupted\n")
+    os._exit(EXIT_INTERRUPTED)
+
+
+def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
+    """The program with these commands.
+
+    ``modules`` names the module of each; its ``register`` adds the commands of that module.
+    """
+    app = typer.Typer(
+        name="mapfold",
+        cls=Program,
+        help="A robot's semantic map as a deterministic fold over an append-only log.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["--help", "-h"]},
+    )
+    app.callback()(_main_options)
+    for module in dict.fromkeys(modules[name] for name in names):
+        importlib.import_module(module).register(app)
+    add_presets(app)
+    remember_running(app)
+    _list_whole_sentences(app)
+    return app
+
+
+def _list_whole_sentences(app: typer.Typer) -> None:
+    """Make lists of commands show the first sentence of each one's help, which they would cut."""
+    for command in app.registered_commands:
+        said = inspect.getdoc(command.callback) or ""
+        command.short_help = said.split("\n\n")[0].replace("\n", " ")
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            group.short_help = group.typer_instance.info.help
+            _list_whole_sentences(group.typer_instance)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # it takes as long to import as typer does
+
+        sys.stdout.write(f"mapfold {version('mapfold')}\n")
+        raise typer.Exit
+
+
+def _main_options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            "-V",
+            help="Print the version and exit.",
+            callback=_print_version,
+            is_eager=True,
+        ),
+    ] = False,
+) -> None:  # without a callback typer would drop the name of a single command
+    pass
+
+
+class _Stdout(io.FileIO):
+    def write(self, data: "ReadableBuffer", /) -> int:
+        output_begins()
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise OutputLost(error.strerror or str(error)) from None
+
+
+class _Stderr(io.FileIO):
+    def write(self, data: "ReadableBuffer", /) -> int:
+        with contextlib.suppress(OSError):
+            return super().write(data)
+        return len(memoryview(data))
+
+
+def secure_streams() -> None:
+    """Replace stdin, stdout and stderr as described above, until the program ends."""
+    for number in range(3):
+        _open_if_closed(number)
+    sys.stdout = _secured(sys.stdout, _Stdout)
+    sys.stderr = _secured(sys.stderr, _Stderr)
+
+
+def discard_stdout() -> None:
+    """Redirect stdout to /dev/null, so that the interpreter's flush at exit does not fail too."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _open_if_closed(number: int) -> None:
+    try:
+        os.fstat(number)
+    except OSError:
+        os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest free number
+
+
+def _secured(stream: TextIO | None, kind: type[io.FileIO]) -> io.TextIOWrapper:
+    if stream is None:
+        return open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123 - until the end
+    stream.flush()
+    unbuffered = getattr(stream, "write_through", False)  # python -u
+    raw = kind(stream.fileno(), "w", closefd=False)
+    return io.TextIOWrapper(
+        io.BufferedWriter(raw),
+        encoding=stream.encoding,
+        errors="backslashreplace",  # for letters outside the encoding, and bytes of a path
+        line_buffering=raw.isatty() or kind is _Stderr or unbuffered,
+    )
+
+
+class _Interrupted(Exception):
+    """Ctrl-C."""
+
+
+class _ReaderGone(Exception):
+    """The reader of stdout has closed it: ``mapfold log cat L | head``."""
+
+
+@contextlib.contextmanager
+def _exceptions_passed_on() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise _Interrupted from None
+    except BrokenPipeError:
+        raise _ReaderGone from None
+    except _UsageError as error:
+        message = error.message.removeprefix("Value error, ")
+        error.message = _without_secrets(message, sys.argv)
+        raise
+
+
+def _without_secrets(message: str, arguments: Sequence[str]) -> str:
+    """A usage error's message without words that may be a database's URL or a part of one.
+
+    A URL without quotes is split at its spaces: ``--db host=h password=…`` leaves an argument that
+    no command takes.
+    """
+    split = "extra argument" in message and any(_DATABASE_OPTION.match(a) for a in arguments)
+    if not split and not _SECRET.search(message):
+        return message
+    head = re.split(r"[('\"]", message, maxsplit=1)[0].rstrip()
+    return f"{head} (not shown, it may hold a password)".lstrip()
+
+
+class Program(TyperGroup):
+    """The group of all commands."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """As typer does it; ``--help`` prints from in here."""
+        with _exceptions_passed_on():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """As typer does it."""
+        with _exceptions_passed_on():
+            return super().invoke(ctx)
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 (click calls it so)
+        """The names of the commands, in the order of their sections."""
+        return [name for name in COMMANDS if name in self.commands]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 (as above)
+        """Write the list of commands for ``--help``, by section."""
+        longest = max(map(len, self.commands), default=0)
+        width = formatter.width - 6 - longest
+        for title, modules in SECTIONS.items():
+            commands = [(name, self.commands[name]) for name in modules if name in self.commands]
+            if commands:
+                with formatter.section(title):
+                    formatter.write_dl(
+                        [(f"{k:{longest}}", v.get_short_help_str(width)) for k, v in commands]
+                    )
+
+
+def run_app(app: Callable[..., Any]) -> NoReturn:
+    """Run a typer app made of `Program` and exit; a MapfoldError is one line on stderr."""
+    secure_streams()
+    code = _exit_code(app)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        discard_stdout()
+    except OutputLost as lost:
+        discard_stdout()
+        if code != EXIT_FAILED:
+            code = _report_lost_output(lost)
+    sys.exit(code)
+
+
+def _report_lost_output(lost: OutputLost) -> int:
+    say(f"mapfold: stdout: {lost}; the output is not complete")
+    return EXIT_FAILED
+
+
+def _exit_code(app: Callable[..., Any]) -> int:
+    try:
+        with ReadingBar():
+            app()
+    except SystemExit as ended:  # typer raises it after every command
+        return ended.code if isinstance(ended.code, int) else 0
+    except MapfoldError as error:
+        say(f"mapfold: {error}")
+        return error.exit_code
+    except OutputLost as lost:
+        return _report_lost_output(lost)
+    except _ReaderGone:
+        return EXIT_READER_GONE
+    except (_Interrupted, KeyboardInterrupt):
+        say("mapfold: interrupted")
+        return EXIT_INTERRUPTED
+    return 0

@@ -1,0 +1,278 @@
+"""`mapfold record` and `mapfold router`: from Zenoh to a log, and a router for it."""
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.base.errors import LogDamaged, MisuseError
+from eventsrc.base.text import visible
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES
+from eventsrc.envelope.model import RunId
+from eventsrc.log import LogReader, LogWriter, parse_fsync
+from eventsrc.record.gap_history import fold_and_save_ledger
+from eventsrc.record.recorder import DEFAULT_CROPS, DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
+from eventsrc.record.recorder.edit_requests import Edits, KnownCommands
+from eventsrc.record.recorder.edits import EDIT_PREFIX, edit_key
+from eventsrc.record.transport.config import parse_address
+from eventsrc.record.transport.session import Router, check_keys, open_session
+from eventsrc.ros.library import MessageTypes
+from projections.fold.corrections import check_settings
+
+from .bag_text import stream_lines
+from .bridged import (
+    NOTHING,
+    TF_POSE,
+    BaseFrameOption,
+    BridgeChoice,
+    CameraOption,
+    CovarianceOption,
+    DetectionsOption,
+    EmbeddingsOption,
+    GridOption,
+    HeightsOption,
+    LabelsOption,
+    MapFrameOption,
+    MaxGapOption,
+    ModelOption,
+    NamespaceOption,
+    PoseOption,
+    Ros2ddsOption,
+    RunIdOption,
+    TopicOption,
+    check_unused,
+    open_bridge,
+    recording_of,
+    say_topics,
+    warn_of_silence,
+)
+from .options import (
+    ConfigOption,
+    ConnectBesideListenOption,
+    JsonOption,
+    ListenOption,
+    zenoh_options,
+)
+from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
+from .signals import stop_on_signals
+from .terminal import say, say_metrics
+
+_LARGEST_BYTES: Final = 128 * 1024 * 1024
+"""Lower bound of Zenoh's own size limit, which drops messages silently: most messages that are too
+large should reach the recorder and be counted."""
+
+
+def record(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
+    ],
+    connect: ConnectBesideListenOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+    key: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--key",
+            metavar="KEY",
+            help="Key expression to record; wildcards * and ** work; may be repeated. "
+            f"[default: {DEFAULT_KEYS[0]}]",
+        ),
+    ] = None,
+    crops: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--crops",
+            metavar="KEY",
+            help="Key expression PREFIX/* of the JPEGs of detections, which `mapfold detect"
+            " --keep-crops` publishes; may be repeated; '' keeps none. "
+            f"[default: {DEFAULT_CROPS[0]}]",
+        ),
+    ] = None,
+    fsync: Annotated[
+        str,
+        typer.Option(metavar="POLICY", help="always, <N>ms or never: when events reach the disk."),
+    ] = "50ms",
+    queue: Annotated[
+        int, typer.Option(metavar="N", min=1, help="How many messages may wait for the disk.")
+    ] = DEFAULT_QUEUE_SIZE,
+    max_payload: Annotated[
+        int,
+        typer.Option(
+            min=1, max=MAX_PAYLOAD_BYTES, metavar="BYTES", help="Larger messages are rejected."
+        ),
+    ] = DEFAULT_MAX_PAYLOAD_BYTES,
+    max_events: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Stop after so many messages.")
+    ] = None,
+    gaps: Annotated[
+        bool,
+        typer.Option(
+            "--gaps/--no-gaps",
+            help="Missing keyframe ids are losses; off for robots that do not count by one.",
+        ),
+    ] = True,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+    ] = None,
+    accept_edits: Annotated[
+        bool,
+        typer.Option(
+            "--accept-edits",
+            help="Record the commands of `mapfold edit` from everybody who may query "
+            f"{EDIT_PREFIX}/ on this Zenoh network.",
+        ),
+    ] = False,
+    ros2dds: Ros2ddsOption = False,
+    namespace: NamespaceOption = "",
+    detections: DetectionsOption = None,
+    pose: PoseOption = TF_POSE,
+    covariance: CovarianceOption = None,
+    embeddings: EmbeddingsOption = None,
+    camera: CameraOption = None,
+    grid: GridOption = NOTHING.grid,
+    map_frame: MapFrameOption = NOTHING.map_frame,
+    base_frame: BaseFrameOption = NOTHING.base_frame,
+    run_id: RunIdOption = None,
+    labels: LabelsOption = None,
+    embedding_model: ModelOption = None,
+    heights: HeightsOption = False,
+    max_gap: MaxGapOption = NOTHING.max_gap_s,
+    topic: TopicOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Record what robots publish over Zenoh, until Ctrl-C.
+
+    With --ros2dds also the messages of a zenoh-bridge-ros2dds, and without --key only those.
+
+    Exit 3 when anything was rejected or lost, is missing, or could not be read.
+    """
+    choice = BridgeChoice(
+        namespace, detections, pose, covariance, embeddings, camera, grid, map_frame, base_frame,
+        run_id, labels, embedding_model, heights, max_gap, topic,
+    )  # fmt: skip
+    if not ros2dds:
+        check_unused(choice)
+    policy = parse_fsync(fsync)
+    options = dataclasses.replace(
+        zenoh_options(connect, listen, zenoh_config),
+        max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
+    )
+    keys = tuple(key or (() if ros2dds else DEFAULT_KEYS))
+    check_keys(keys)
+    crop_keys = _crop_keys(crops)
+    if ros2dds:
+        MessageTypes()
+        recording_of(choice, 0, None)
+    address = None if metrics is None else parse_address(metrics, "--metrics")
+    with (
+        RecorderSummary(log, json=json) as summary,
+        stop_on_signals() as stop,
+        open_session(options, mode=options.mode) as session,
+        LogWriter(log, fsync=policy, sealing_process=True) as writer,
+    ):
+        say_restart(log, writer)
+        ledger = _gap_history(log)
+        bridge = open_bridge(choice, writer, ledger) if ros2dds else None
+        recorder = Recorder(
+            session,
+            writer,
+            keys,
+            queue_size=queue,
+            max_events=max_events,
+            ledger=ledger,
+            report_gaps=gaps,
+            max_payload_bytes=max_payload,
+            edits=_edits(log, writer) if accept_edits else None,
+            bridge=bridge,
+            crops=crop_keys,
+        )
+        summary.watch(writer, recorder)
+        with _metrics(address, recorder, log), show_status(log) as watch:
+            if bridge is not None:
+                say_topics(log, bridge)
+                watch = warn_of_silence(bridge, watch, EVERY_S)
+            named = ", ".join(keys or (bridge.keys if bridge is not None else ()))
+            say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
+            if accept_edits:
+                say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
+            recorder.run(stop, every_s=EVERY_S, watch=watch)
+            for line in stream_lines({} if bridge is None else bridge.counts):
+                say(line)
+    summary.finish()
+
+
+def _crop_keys(given: list[str] | None) -> tuple[str, ...]:
+    """The key expressions of ``--crops``. Raises MisuseError."""
+    keys = tuple(filter(None, DEFAULT_CROPS if given is None else given))
+    for key in keys:
+        if not key.endswith("/*") or "*" in key[:-1]:
+            raise MisuseError(f"--crops {visible(key)}: write it as PREFIX/*, such as tb/crops/*")
+    check_keys(keys)
+    return keys
+
+
+def _gap_history(log: Path) -> GapLedger[RunId] | None:
+    """The log's gap history, or None if the log is damaged: recording goes on without it."""
+    try:
+        with LogReader(log) as reader:
+            return fold_and_save_ledger(reader, note=say)
+    except LogDamaged as error:
+        say(f"recording without gap history: {error}")
+        return None
+
+
+def _edits(log: Path, writer: LogWriter) -> Edits:
+    """The receiver of commands; it refuses all of them if those in the log cannot be read."""
+    known: KnownCommands | str
+    try:
+        with LogReader(log) as reader:
+            known = KnownCommands.of(reader)
+    except LogDamaged as error:
+        say(f"recording without edits: {error}")
+        known = str(error)
+    return Edits(writer, known, check_settings)
+
+
+@contextmanager
+def _metrics(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> Iterator[None]:
+    if address is None:
+        yield
+        return
+    from eventsrc.record.metrics import serving_metrics  # not imported unless needed
+
+    with serving_metrics(address, recorder.report, log) as port:
+        say_metrics(address, port)
+        yield
+
+
+def router(
+    listen: ListenOption = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect", metavar="ENDPOINT", help="Router to connect to; may be repeated."
+        ),
+    ] = None,
+    zenoh_config: ConfigOption = None,
+) -> None:
+    """Run a Zenoh router in this process until Ctrl-C.
+
+    It listens on tcp/127.0.0.1:7447 unless --listen or a configuration file says otherwise.
+    --connect links it to other routers.
+    """
+    options = zenoh_options(connect, listen, zenoh_config)
+    with stop_on_signals() as stop, Router(options) as running:
+        say(f"router listening on {', '.join(running.endpoints)}; Ctrl-C ends it")
+        stop.wait()
+    say("router ended")
+
+
+def register(app: typer.Typer) -> None:
+    """Add `record` and `router` to the program."""
+    for command in (record, router):
+        app.command()(command)

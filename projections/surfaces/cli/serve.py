@@ -1,0 +1,252 @@
+"""``mapfold serve``: answer questions over Zenoh and HTTP until a signal.
+
+HTTP on an address that others can reach requires a token. All options are checked before a database
+is opened.
+"""
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Self
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.record.transport.session import open_session
+from projections.postgres.connection import open_targets
+from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
+from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
+
+from .options import (
+    ConfigOption,
+    ConnectBesideListenOption,
+    DbOption,
+    HfovOption,
+    ImageOption,
+    ListenOption,
+    VectorDbOption,
+    camera_from,
+    zenoh_options,
+)
+from .signals import stop_on_signals
+from .terminal import say
+
+if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they are used
+    import socket
+    import ssl
+
+    from projections.surfaces.serve.metrics import ServiceMetrics
+
+
+@dataclass(frozen=True, slots=True)
+class HttpOptions:
+    """The options beside ``--http``."""
+
+    token_file: Path | None
+    tls_cert: Path | None
+    tls_key: Path | None
+    hosts: tuple[str, ...]
+    origins: tuple[str, ...]
+
+    def refuse_without_http(self) -> None:
+        """Raise MisuseError when one of them is given."""
+        for name, value in (
+            ("--token-file", self.token_file),
+            ("--tls-cert", self.tls_cert),
+            ("--tls-key", self.tls_key),
+            ("--allow-host", self.hosts),
+            ("--cors", self.origins),
+        ):
+            if value:
+                raise MisuseError(f"{name} is for HTTP; give --http HOST:PORT too")
+
+
+@dataclass(frozen=True, slots=True)
+class HttpEndpoint:
+    """A bound address and its access control."""
+
+    host: str
+    listener: "socket.socket"
+    token: str | None
+    tls: "ssl.SSLContext | None"
+    hosts: tuple[str, ...]
+    origins: tuple[str, ...]
+
+    @classmethod
+    @contextmanager
+    def bound(cls, http: str, options: HttpOptions) -> Iterator[Self]:
+        """Bind ``http``, a HOST:PORT. Raises MisuseError when the options do not allow it."""
+        host, colon, port = http.rpartition(":")
+        if not colon or not port.isdecimal() or int(port) > 65_535:
+            raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
+        host = host.strip("[]") or "127.0.0.1"
+        try:
+            from projections.surfaces.serve.guard import TOKEN_VARIABLE, read_origin, read_token
+            from projections.surfaces.serve.listening import bind, is_loopback, tls_context
+        except ModuleNotFoundError as error:
+            raise MisuseError(
+                f"--http needs {error.name}, which is not installed; pip install 'mapfold[serve]'"
+            ) from None
+        if (options.tls_cert is None) != (options.tls_key is None):
+            raise MisuseError("--tls-cert and --tls-key need each other; give both")
+        origins = tuple(read_origin(origin) for origin in options.origins)
+        token, tls = read_token(options.token_file, os.environ, say), None
+        if options.tls_cert is not None and options.tls_key is not None:
+            tls = tls_context(options.tls_cert, options.tls_key)
+        with closing(bind(host, int(port))) as listener:
+            local = is_loopback(listener)
+            if token is None and not local:
+                raise MisuseError(
+                    f"--http {http} can be reached by others, so it needs a token: openssl rand"
+                    f" -hex 32 > FILE, then --token-file FILE or {TOKEN_VARIABLE}; or give --http"
+                    f" 127.0.0.1:{port}"
+                )
+            if tls is None and not local:
+                say(
+                    f"warning: --http {http} without TLS: others on the way can read the token and"
+                    " all answers; give --tls-cert and --tls-key"
+                )
+            yield cls(host, listener, token, tls, options.hosts, origins)
+
+    @contextmanager
+    def serving(
+        self, answerer: Answerer, queue: FairQueue, metrics: "ServiceMetrics"
+    ) -> Iterator[str]:
+        """Serve until the end of the block; yields the URL."""
+        from projections.surfaces.serve.guard import Guard, SafeHeaders
+        from projections.surfaces.serve.http import create_app
+        from projections.surfaces.serve.listening import serving
+        from projections.surfaces.serve.metrics import CountedResponses
+
+        app = create_app(answerer, queue, metrics, secured=self.token is not None)
+        guarded = Guard(app, self.token, (self.host, *self.hosts), self.origins)
+        counted = CountedResponses(SafeHeaders(guarded), metrics)
+        with serving(counted, self.listener, self.tls, say) as port:
+            shown = f"[{self.host}]" if ":" in self.host else self.host
+            yield f"{'http' if self.tls is None else 'https'}://{shown}:{port}"
+
+
+_LARGEST_BYTES: Final = 16 * 1024 * 1024
+"""Zenoh drops longer questions without an answer; a shorter one over ``--max-bytes`` is refused."""
+
+
+def serve(
+    http: Annotated[
+        str | None,
+        typer.Option(
+            "--http",
+            metavar="HOST:PORT",
+            help="Answer over HTTP, too, at this address (extra [serve]).",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--token-file",
+            metavar="FILE",
+            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
+            " --http is on loopback.",
+        ),
+    ] = None,
+    tls_cert: Annotated[
+        Path | None,
+        typer.Option("--tls-cert", metavar="FILE", help="PEM certificate: serve HTTPS."),
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM key of --tls-cert.")
+    ] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Name by which HTTP clients call this service, beside its addresses; may be"
+            " repeated.",
+        ),
+    ] = None,
+    cors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--cors",
+            metavar="ORIGIN",
+            help="Site whose pages may ask from a browser, such as https://map.example; may be"
+            " repeated.",
+        ),
+    ] = None,
+    zenoh: Annotated[bool, typer.Option(help="Answer over Zenoh.")] = True,
+    connect: ConnectBesideListenOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+    workers: Annotated[
+        int,
+        typer.Option("--workers", metavar="N", min=1, max=64, help="Questions answered at a time."),
+    ] = 4,
+    rate: Annotated[
+        float,
+        typer.Option(
+            "--rate", metavar="N", min=0.1, help="Questions a second on average; more are refused."
+        ),
+    ] = 500.0,
+    max_bytes: Annotated[
+        int,
+        typer.Option(
+            "--max-bytes", metavar="BYTES", min=1000, help="Longer questions are refused."
+        ),
+    ] = DEFAULT_MAX_BYTES,
+    hfov: HfovOption = None,
+    image: ImageOption = None,
+    db: DbOption = None,
+    vector_db: VectorDbOption = None,
+) -> None:
+    """Answer questions from the live databases until Ctrl-C.
+
+    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as described at its /docs. An
+    invalid question gets an error as its answer. On SIGINT or SIGTERM open questions are answered
+    first.
+    """
+    if http is None and not zenoh:
+        raise MisuseError("nothing to serve on; give --http HOST:PORT, or leave out --no-zenoh")
+    camera = camera_from(hfov, image)
+    options = dataclasses.replace(
+        zenoh_options(connect, listen, zenoh_config),
+        max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
+    )
+    given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()), tuple(cors or ()))
+    with ExitStack() as stack:
+        endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, given))
+        if http is None:
+            given.refuse_without_http()
+        stop = stack.enter_context(stop_on_signals())
+        targets = stack.enter_context(open_targets(db, vector_db))
+        pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
+        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, note=say)
+        session = None
+        if zenoh:
+            session = stack.enter_context(open_session(options, mode=options.mode))
+        # Closed before the session, which sends its last answers.
+        queue = stack.enter_context(FairQueue(workers))
+        metrics = None if endpoint is None else _metrics(answerer, queue)
+        if session is not None:
+            watch = (lambda *_: None) if metrics is None else metrics.watch
+            stack.enter_context(ZenohService(session, answerer, queue, watch))
+            say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
+        if endpoint is not None and metrics is not None:
+            url = stack.enter_context(endpoint.serving(answerer, queue, metrics))
+            say(f"answering {url}, described at /docs")
+        say("Ctrl-C ends it")
+        stop.wait()
+    say("service ended")
+
+
+def _metrics(answerer: Answerer, queue: FairQueue) -> "ServiceMetrics":
+    from projections.surfaces.serve.metrics import ServiceMetrics
+
+    return ServiceMetrics(answerer, queue)
+
+
+def register(app: typer.Typer) -> None:
+    """Add `serve` to the program."""
+    app.command()(serve)

@@ -1,0 +1,178 @@
+"""`mapfold simulate`: a simulated robot, its detector or its camera."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from eventsrc.adapters.sim import DEFAULT_SEED, SimulatedRun, simulate_run
+from eventsrc.adapters.sim.pictures import (
+    PER_S,
+    CameraPicture,
+    camera_pictures,
+    publish_pictures,
+    write_pictures,
+)
+from eventsrc.adapters.sim.run import publish_run, write_run
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted
+from eventsrc.record.transport.config import check_key
+from eventsrc.record.transport.session import ZenohOptions, check_keys, open_session
+
+from .options import (
+    ConfigOption,
+    ConnectBesideListenOption,
+    JsonOption,
+    ListenOption,
+    PublishKeyOption,
+    zenoh_options,
+)
+from .signals import stop_on_signals
+from .terminal import emit, finish, say
+
+_CAMERA: Final = "Camera"
+_MAX_NAME: Final = 100
+
+
+def simulate(
+    seed: Annotated[int, typer.Option(metavar="N", help="Which house.", min=0)] = DEFAULT_SEED,
+    run: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="Which run: a explores, b, c … are other sessions and tours."
+        ),
+    ] = "a",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."
+        ),
+    ] = None,
+    key: PublishKeyOption = "tb/detections",
+    speed: Annotated[
+        float, typer.Option(metavar="X", help="Times real time; 0: without waiting.", min=0.0)
+    ] = 10.0,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Draw what the robot sees: write pictures, poses.csv and truth.jsonl there, for"
+            " `mapfold detect`; publish nothing.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
+    zenoh_image: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEY",
+            help="Publish drawn pictures there, and poses under --zenoh-pose, instead of"
+            " keyframes.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None,
+    zenoh_pose: Annotated[
+        str, typer.Option(metavar="KEY", help="Key of the poses.", rich_help_panel=_CAMERA)
+    ] = "tb/pose",
+    fps: Annotated[
+        float,
+        typer.Option(
+            metavar="N",
+            min=0.0,
+            max=20.0,
+            help="Pictures a second of driving; 0: one for each keyframe.",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = PER_S,
+    wait: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
+    ] = 30.0,
+    json_: JsonOption = False,
+    connect: ConnectBesideListenOption = None,
+    listen: ListenOption = None,
+    zenoh_config: ConfigOption = None,
+) -> None:
+    """Simulate a run through a house, over Zenoh or into files.
+
+    A robot drives through a house generated from a seed; its keyframes are published or written to
+    a file. The ground truth (room and instance) goes to a file beside --out, never into the
+    messages. With --camera or --zenoh-image it has a camera instead of a detector: pictures of
+    coloured boxes, for `mapfold detect`.
+    """
+    if not run.isprintable() or not 1 <= len(run) <= _MAX_NAME:
+        raise MisuseError(f"--run {run!r}: give a name of 1 to {_MAX_NAME} printable characters")
+    check_key(key, "--key")
+    if camera is not None or zenoh_image is not None:
+        if out is not None or (camera is not None and zenoh_image is not None):
+            raise MisuseError("--out, --camera and --zenoh-image: give one of them")
+        pictures = camera_pictures(seed, run, per_s=fps)
+        if camera is not None:
+            taken, where = _write_pictures(pictures, camera), str(camera)
+        else:
+            keys = (zenoh_image or "", zenoh_pose)
+            check_keys(keys)
+            taken = _publish_pictures(
+                pictures, zenoh_options(connect, listen, zenoh_config), keys, speed, wait
+            )
+            where = keys[0]
+        say(f"sim-{seed}-{run}: {counted(taken, 'picture')} to {where}")
+        if json_:
+            emit({"run_id": f"sim-{seed}-{run}", "pictures": taken, "to": where})
+        return
+    simulated = simulate_run(seed, run)
+    document = _numbers(simulated)
+    if out is not None:
+        truth = write_run(simulated, out)
+        say(f"{_summary(document)}: wrote {out}, truth in {truth}")
+        document |= {"out": str(out), "truth": str(truth)}
+    else:
+        options = zenoh_options(connect, listen, zenoh_config)
+        document["published"] = _publish(simulated, options, key, speed, wait)
+        say(f"{_summary(document)}: published {document['published']} on {key}")
+    if json_:
+        emit(document)
+    finish(findings=document.get("published", document["keyframes"]) < document["keyframes"])
+
+
+def _publish(
+    simulated: SimulatedRun, options: ZenohOptions, key: str, speed: float, wait_s: float
+) -> int:
+    with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
+        return publish_run(session, simulated, key, speed=speed, wait_s=wait_s, stop=stop)
+
+
+def _write_pictures(pictures: Iterator[CameraPicture], folder: Path) -> int:
+    with stop_on_signals() as stop:
+        return write_pictures(pictures, folder, stop)
+
+
+def _publish_pictures(
+    pictures: Iterator[CameraPicture],
+    options: ZenohOptions,
+    keys: tuple[str, str],
+    speed: float,
+    wait_s: float,
+) -> int:
+    with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
+        return publish_pictures(session, pictures, *keys, speed=speed, wait_s=wait_s, stop=stop)
+
+
+def _numbers(simulated: SimulatedRun) -> dict[str, Any]:
+    return {
+        "run_id": simulated.run_id,
+        "keyframes": len(simulated.envelopes),
+        "detections": sum(len(envelope["detections"]) for envelope in simulated.envelopes),
+        "seconds": round(simulated.true_poses[-1].time_s, 1),
+    }
+
+
+def _summary(document: dict[str, Any]) -> str:
+    return (
+        f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
+        f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
+    )
+
+
+def register(app: typer.Typer) -> None:
+    """Add `simulate` to the program."""
+    app.command()(simulate)

@@ -1,0 +1,311 @@
+"""`mapfold merges`, `why`, `diff` and `bisect`: why a map is what it is."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import indent
+from typing import Annotated
+
+import typer
+
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import Offset
+from projections.history import Explanation, Expression, ExpressionError, KnownHistory, Timeline
+from projections.history.condition_functions import functions_help
+from projections.history.merges import merge_document, object_merge_document, refusal_document
+from projections.history.rendering import (
+    difference_text,
+    explanation_text,
+    merge_text,
+    merges_text,
+    object_merges_text,
+    refusals_text,
+    search_text,
+)
+from projections.store.records import Merge
+
+from .options import (
+    JsonOption,
+    KnownAtOption,
+    LogArgument,
+    NoCacheOption,
+    SetOption,
+    SettingsOption,
+    W,
+    check_picture,
+    known_point,
+    point,
+    settings_of,
+)
+from .terminal import Bar, display, emit, say
+
+MOST_LINES = 5
+"""Things of a kind that a text answer names without --all."""
+
+AllOption = Annotated[
+    bool, typer.Option("--all", help=f"List all changes, not only {MOST_LINES} of a kind.")
+]
+AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Use the map as of here: {W}.")]
+
+
+@contextlib.contextmanager
+def _timeline(
+    log: Path, settings_file: Path | None, sets: list[str] | None, no_cache: bool
+) -> Iterator[Timeline]:
+    """The log's timeline under the settings of the command line or the log, with a progress
+    bar."""
+    settings, cache = settings_of(settings_file, sets), not no_cache
+    with (
+        Bar() as bar,
+        Timeline(log, settings, progress=bar.show_fold, note=say, cache=cache) as timeline,
+    ):
+        yield timeline
+
+
+def merges(
+    log: LogArgument,
+    at: AtOption = "end",
+    show: Annotated[
+        int | None,
+        typer.Option(
+            "--show", metavar="N", help="Merge number N alone, with links, objects and edges."
+        ),
+    ] = None,
+    draw: Annotated[
+        int | None,
+        typer.Option("--draw", metavar="N", help="Draw merge number N, before and after."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="The picture of --draw: .png, .svg or .pdf [default: merge.png].",
+        ),
+    ] = None,
+    refused: Annotated[
+        bool,
+        typer.Option(
+            "--refused", help="Show instead the merges that a command refused, and the command."
+        ),
+    ] = False,
+    objects: Annotated[
+        bool, typer.Option("--objects", help="Show instead the objects that became one, and why.")
+    ] = False,
+    known_at: KnownAtOption = None,
+    json_: JsonOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    """List every merge of places, and which keyframe made it.
+
+    With its time, the place that survived, the places that were absorbed, and what moved to the
+    survivor.
+    """
+    if refused + objects + (show is not None or draw is not None) > 1:
+        raise MisuseError("--refused and --objects are tables of their own; give one alone")
+    if draw is None and out is not None:
+        raise MisuseError(f"--out {out} is for the picture of --draw N; give --draw too")
+    picture = out or Path("merge.png")
+    if draw is not None:
+        check_picture(picture)
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
+        end = point(timeline.reader, at)
+        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+        if refused:
+            _show_refusals(known, end, json_=json_)
+            return
+        if objects:
+            _show_object_merges(known, end, json_=json_)
+            return
+        found = known.merges(end)
+        if draw is not None:
+            _draw_merge(known, _numbered(found, draw), picture)
+        if show is not None:
+            found = [_numbered(found, show)]
+        if json_:
+            emit([merge_document(known.covering(end), merge) for merge in found])
+        elif show is not None:
+            display(merge_text(known.covering(end), found[0]))
+        else:
+            display(merges_text(known.covering(end), found, end))
+
+
+def _show_refusals(known: KnownHistory, end: Offset, *, json_: bool) -> None:
+    found = known.refusals(end)
+    if json_:
+        emit([refusal_document(known.covering(end), refusal) for refusal in found])
+    else:
+        display(refusals_text(known.covering(end), found))
+
+
+def _show_object_merges(known: KnownHistory, end: Offset, *, json_: bool) -> None:
+    found = known.object_merges(end)
+    if json_:
+        emit([object_merge_document(known.covering(end), merge) for merge in found])
+    else:
+        display(object_merges_text(known.covering(end), found))
+
+
+def _draw_merge(known: KnownHistory, merge: Merge, out: Path) -> None:
+    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    from projections.adapters.drawing.merge_picture import draw_merge
+
+    draw_merge(known, merge, out)
+    say(f"wrote {out}: merge {merge.number}, before and after")
+
+
+def _numbered(found: list[Merge], number: int) -> Merge:
+    """The merge of this number; raises MisuseError naming those there are."""
+    for merge in found:
+        if merge.number == number:
+            return merge
+    there = f"there are 1 to {len(found)}" if found else "there are none"
+    raise MisuseError(f"no merge number {number}; {there} (see `{advised('merges')}`)")
+
+
+def why(
+    log: LogArgument,
+    thing: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PLACE|OBJECT_ID|RUN:KF",
+            help="A place by its id, also an absorbed one, or by its name; an object; the first"
+            " of two keyframes.",
+        ),
+    ] = None,
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="RUN:KF", help="The second keyframe, as with --same."),
+    ] = None,
+    same: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            "--same",
+            metavar="RUN:KF RUN:KF",
+            help="Since when, and by which merges, two keyframes are in one place.",
+        ),
+    ] = None,
+    at: AtOption = "end",
+    known_at: KnownAtOption = None,
+    json_: JsonOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    """Explain why a place or an object is what it is, event by event.
+
+    Commands that named, joined, kept apart or moved a part of it are listed, too.
+    """
+    if (thing is None) == (same is None):
+        raise MisuseError("give a place, an object, or two keyframes as RUN:KEYFRAME RUN:KEYFRAME")
+    pair = (thing, other) if thing is not None and other is not None else same
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
+        end = point(timeline.reader, at)
+        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+        found = _explanation(known, thing, pair, end)
+    if json_:
+        emit(found.document())
+    else:
+        display(explanation_text(found))
+
+
+def _explanation(
+    known: KnownHistory, thing: str | None, pair: tuple[str, str] | None, end: Offset
+) -> Explanation:
+    if pair is not None:
+        return known.why_same(*pair, end)
+    return known.why(thing or "", end)
+
+
+def diff(
+    log: LogArgument,
+    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
+    second: Annotated[str, typer.Argument(metavar="W2", help="To here, given as W1.")] = "end",
+    known_at: Annotated[
+        str | None,
+        typer.Option(
+            "--known-at",
+            metavar="V",
+            help="Apply only the commands recorded before here, to both maps [default: to each map"
+            " those before its end].",
+        ),
+    ] = None,
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    """Show what changed from one moment of the map to another.
+
+    Keyframes, places, objects and adjacency, and the commands recorded in between.
+    """
+    with _timeline(log, settings_file, set_, no_cache) as timeline:
+        reader = timeline.reader
+        span = point(reader, first), point(reader, second)
+        known = None if known_at is None else point(reader, known_at)
+        found = timeline.diff(*span, known_at=known)
+    if json_:
+        emit(found.document())
+    else:
+        display(difference_text(found, most=None if all_ else MOST_LINES))
+
+
+_BISECT_HELP = f"""Find the first event that made a condition over the map true.
+
+EXPR compares numbers and ids, joined by and, or, not and parentheses, for example
+"place_count < 3", "same_place('run:12', 'run:90')", "located_in('obj-…') == 'run_p2'";
+none is no place. It may call:
+
+\b
+{indent(functions_help(), "    ")}
+"""
+
+
+def bisect(
+    log: LogArgument,
+    expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
+    start: Annotated[
+        str, typer.Option("--from", metavar="W", help=f"Search from here: {W}.")
+    ] = "0",
+    end: Annotated[str, typer.Option("--to", metavar="W", help="Search to here.")] = "end",
+    scan: Annotated[
+        bool,
+        typer.Option("--scan", help="List every turn to true and to false, not only the first."),
+    ] = False,
+    known_at: KnownAtOption = None,
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    with _columns_shown(), _timeline(log, settings_file, set_, no_cache) as timeline:
+        asked = Expression(expression)
+        span = point(timeline.reader, start), point(timeline.reader, end)
+        known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
+        found = known.bisect(asked, *span, scan=scan)
+    if json_:
+        emit(found.document())
+    else:
+        display(search_text(found, most=None if all_ else MOST_LINES))
+
+
+@contextlib.contextmanager
+def _columns_shown() -> Iterator[None]:
+    """Print an expression with a mark where it is wrong, above the error message."""
+    try:
+        yield
+    except ExpressionError as error:
+        say(error.pointer)
+        raise
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the program."""
+    app.command()(merges)
+    app.command()(why)
+    app.command()(diff)
+    app.command(help=_BISECT_HELP)(bisect)

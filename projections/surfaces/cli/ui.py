@@ -1,0 +1,214 @@
+"""``mapfold ui``: the web debugger of a log, until a signal."""
+
+import functools
+import secrets
+import webbrowser
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+from urllib.parse import urlencode
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import Offset
+from eventsrc.log import LogReader
+
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    LogArgument,
+    NoCacheOption,
+    SetOption,
+    SettingsOption,
+    W,
+    point,
+    settings_of,
+    zenoh_options,
+)
+from .signals import stop_on_signals
+from .terminal import say
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from projections.surfaces.ui.edits import Editor
+    from projections.surfaces.ui.service import UiService
+
+_EVERY_ADDRESS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  not a bind
+"""The address of this machine for a server that listens on all addresses."""
+_KINDS: Final = ("place", "object", "keyframe", "merge")
+"""Values of ``--select``."""
+
+
+def ui(
+    log: LogArgument,
+    host: Annotated[
+        str,
+        typer.Option(
+            metavar="ADDRESS", help="Address to listen on; other machines need the printed token."
+        ),
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
+    ] = 0,
+    open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="W", help=f"Print the link to this moment, as known then: {W}."),
+    ] = None,
+    select: Annotated[
+        str | None,
+        typer.Option(
+            metavar="THING",
+            help="Print the link to the history of this: place:ID, object:ID, keyframe:RUN/ID or"
+            " merge:OFFSET.",
+        ),
+    ] = None,
+    allow_edits: Annotated[
+        bool, typer.Option("--allow-edits", help="Let the page record corrections in the log.")
+    ] = False,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option("--truth", metavar="FILE", help="Score other settings against this truth."),
+    ] = None,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Name by which browsers call this machine, beside its addresses; may be repeated.",
+        ),
+    ] = None,
+    db: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Show how far behind this database is."),
+    ] = None,
+    vector_db: Annotated[
+        str | None,
+        typer.Option(
+            "--vector-db", metavar="URL", help="The database of the vectors [default: --db]."
+        ),
+    ] = None,
+    connect: ConnectOption = None,
+    zenoh_config: ConfigOption = None,
+    set_: SetOption = None,
+    settings_file: SettingsOption = None,
+    no_cache: NoCacheOption = False,
+) -> None:
+    """Show a log's map in a browser, at any point in time.
+
+    The map at every moment, merges and their causes, changes, and the map under other settings.
+    Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
+    """
+    settings = settings_of(settings_file, set_)
+    if vector_db is not None and db is None:
+        raise MisuseError("--vector-db is for the lag of the tails; give --db URL too")
+    with LogReader(log) as reader:  # errors of log and options come before anything is served
+        shown_first = _moment(None if at is None else point(reader, at), select)
+    try:
+        from projections.surfaces.serve.guard import Guard, SafeHeaders
+        from projections.surfaces.serve.listening import bind, is_loopback, serving
+        from projections.surfaces.ui.app import HEADERS, create_app
+        from projections.surfaces.ui.token_gate import TokenGate
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"mapfold ui needs {error.name}, which is not installed; pip install 'mapfold[ui]'"
+        ) from None
+    from projections.localize.evaluate.truth import read_truth
+    from projections.surfaces.ui.live import LiveWatch
+    from projections.surfaces.ui.opened import Opened
+    from projections.surfaces.ui.service import UiService
+
+    scored = read_truth(truth) if truth else None
+    with ExitStack() as stack:
+        listener = stack.enter_context(closing(bind(host, port, "--host or --port")))
+        local = is_loopback(listener)
+        stop = stack.enter_context(stop_on_signals())
+        tails = None if db is None else _tails(stack, log, db, vector_db)
+        opened = Opened(
+            log,
+            settings,
+            sets=tuple(set_ or ()),
+            settings_file=settings_file,
+            truth_files=tuple(truth or ()),
+            truth=scored,
+            edits=allow_edits,
+            token_needed=not local,
+            cache=not no_cache,
+        )
+        service = stack.enter_context(UiService(opened))
+        watch = stack.enter_context(LiveWatch(service, tails))
+        token = None if local and not allow_edits else secrets.token_urlsafe(24)
+        editor = _editor(service, connect, zenoh_config) if allow_edits else None
+        app = create_app(service, watch, editor)
+        gate = TokenGate(app, token, everything=not local)
+        guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))), HEADERS)
+        bound = stack.enter_context(serving(guarded, listener, note=say))
+        # Before the server, which waits for its streams and answers to end.
+        stack.callback(watch.close)
+        stack.callback(service.end)
+        name = _EVERY_ADDRESS.get(host, host)
+        shown = f"[{name}]" if ":" in name else name
+        url = f"http://{shown}:{bound}/" + ("" if token is None else f"?token={token}")
+        url += shown_first
+        if not local:
+            say(f"warning: others can reach {host}; anybody with the link below can read the log")
+        say(f"showing {log} at {url}")
+        if name != host:
+            say(f"from another machine, put an address of this one in the link instead of {name}")
+        say("Ctrl-C ends it")
+        if open_:
+            webbrowser.open(url)
+        stop.wait()
+    say("page closed")
+
+
+def _moment(at: Offset | None, select: str | None) -> str:
+    """The part of the page's address that leads to a moment and a thing. Raises MisuseError."""
+    parts = {} if at is None else {"at": str(at), "known": "then"}
+    if select is not None:
+        kind, _, name = select.partition(":")
+        if kind not in _KINDS or not name:
+            raise MisuseError(
+                f"--select {select!r} names nothing; write place:ID, object:ID, keyframe:RUN/ID or"
+                " merge:OFFSET"
+            )
+        parts |= {"select": select, "panel": "why"}
+    return "#" + urlencode(parts, safe=":/") if parts else ""
+
+
+def _editor(service: "UiService", connect: list[str] | None, config: Path | None) -> "Editor":
+    """Records commands, through a recorder where one holds the log."""
+    from eventsrc.record.transport.session import open_session
+    from projections.surfaces.ui.edits import Editor
+
+    from .edit_command import user_at_host
+
+    options = zenoh_options(connect, None, config)
+    session = functools.partial(open_session, options, mode=options.mode)
+    return Editor(service.opened, service.log_id, session, user_at_host())
+
+
+def _tails(
+    stack: ExitStack, log: Path, db: str, vector_db: str | None
+) -> "Callable[[], list[dict[str, Any]]]":
+    """The status of the databases' sinks, read at each call."""
+    from projections.postgres.connection import open_targets
+    from projections.postgres.status import projection_status
+
+    targets = stack.enter_context(open_targets(db, vector_db))
+
+    def ask() -> list[dict[str, Any]]:
+        found = projection_status(log, targets, settings_of(None, None))
+        return [
+            {"sink": s.sink, "condition": s.condition, "lag": s.lag, "note": s.note}
+            for s in found.sinks
+        ]
+
+    return ask
+
+
+def register(app: typer.Typer) -> None:
+    """Add `ui` to the program."""
+    app.command()(ui)

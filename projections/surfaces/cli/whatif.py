@@ -1,0 +1,170 @@
+"""`mapfold whatif`: the map under other settings or without a command."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import counted
+from eventsrc.log import LogReader
+from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
+from projections.fold.settings import Settings
+from projections.history.parallel import Rules
+from projections.history.whatif import (
+    Alternative,
+    WhatIf,
+    alternatives,
+    assigned,
+    command_trials,
+    setting_trials,
+    what_if,
+)
+from projections.history.whatif_rendering import whatif_text
+from projections.localize.evaluate.truth import read_truth
+from projections.map.log_commands import read_commands
+
+from .options import (
+    JsonOption,
+    KnownAtOption,
+    LogArgument,
+    SettingsOption,
+    check_picture,
+    known_point,
+    point,
+    settings_of,
+)
+from .terminal import Bar, display, emit, say
+from .time_travel import MOST_LINES, AllOption, AtOption
+
+
+def whatif(
+    log: LogArgument,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a setting; all --set make one alternative, and hold for all of a --grid.",
+        ),
+    ] = None,
+    try_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--try",
+            metavar="'NAME=VALUE …'",
+            help="One alternative; may be repeated.",
+        ),
+    ] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--grid",
+            metavar="NAME=VALUE,…",
+            help="An alternative for every combination of these values and those of other --grid.",
+        ),
+    ] = None,
+    base: Annotated[
+        str,
+        typer.Option(
+            metavar="'NAME=VALUE …'",
+            help="Settings of the base map, on top of --settings or the log's.",
+        ),
+    ] = "",
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without",
+            metavar="COMMAND_ID",
+            help="One alternative: the map without this command; may be repeated.",
+        ),
+    ] = None,
+    at: AtOption = "end",
+    known_at: KnownAtOption = None,
+    truth: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--truth", metavar="FILE", help="Score places and objects against this ground truth."
+        ),
+    ] = None,
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture", metavar="FILE", help="Draw the maps side by side (.png, .svg, .pdf)."
+        ),
+    ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=1, help="Fold in this many processes [default: the number of cores]."
+        ),
+    ] = None,
+    settings_file: SettingsOption = None,
+) -> None:
+    """Show the map under other settings, or without one of its commands.
+
+    Places, noise, merges and objects under each, and how the maps differ. ARI is the adjusted Rand
+    index against the base: 1 is the same partition of keyframes into places or observations into
+    objects, 0 no better than chance, and so is any difference from a base of one single place. With
+    --truth, V is the V-measure against rooms and instances: 1 is perfect.
+    """
+
+    logged = settings_of(settings_file, None)
+
+    def settings(corrections: Corrections) -> Settings:
+        return assigned(logged(corrections), base, "--base")
+
+    def others(settings: Settings) -> list[Settings]:
+        return alternatives(settings, set_ or (), try_ or (), grid or ())
+
+    tried = others(settings(NO_CORRECTIONS))  # a bad value is an error before the log is opened
+    check_picture(picture)
+    if not tried and not without:
+        raise MisuseError(
+            "nothing to try; give --set eps_m=1.0, --try, --grid eps_m=0.5,1.0 or"
+            " --without COMMAND_ID"
+        )
+    scored = read_truth(truth) if truth else None
+    with LogReader(log) as reader:
+        end = point(reader, at)
+        commands = read_commands(reader, known_point(reader, known_at, end))
+    corrections = compile_corrections(commands)
+    common = Rules(settings(corrections), corrections)
+    trials = setting_trials(common, others(common.settings))
+    trials += command_trials(commands, without or (), settings)
+    with Bar() as bar:
+        found = what_if(
+            log, common, trials, end,
+            truth=scored, processes=processes, progress=bar.show_fold,
+            keep_views=picture is not None,
+        )  # fmt: skip
+    from .evaluate import warn_of_no_truth  # here: it imports all of re-localisation
+
+    warn_of_no_truth(log, found.base.result.scores)
+    if picture is not None:
+        _draw_maps(found, picture)
+    if json_:
+        emit(found.document())
+    else:
+        display(whatif_text(found, most=None if all_ else MOST_LINES))
+
+
+def _draw_maps(found: WhatIf, out: Path) -> None:
+    # Here and not above: matplotlib takes longer to import than most commands take to run.
+    from projections.adapters.drawing.merge_picture import draw_maps
+
+    maps = [(_title(each), each.result.view) for each in found.all]
+    draw_maps([(title, view) for title, view in maps if view is not None], out)
+    say(f"wrote {out}: {counted(len(maps), 'map')}")
+
+
+def _title(each: Alternative) -> str:
+    counts = each.result.counts
+    return f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
+
+
+def register(app: typer.Typer) -> None:
+    """Add `whatif` to the program."""
+    app.command()(whatif)

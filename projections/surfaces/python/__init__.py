@@ -1,0 +1,27 @@
+"""The public Python interface, which a script or notebook imports from ``mapfold``.
+
+`open_log`, `fold`, `relocalize` and `Timeline` take paths as text or `Path`. What else is in
+`eventsrc` and `projections` may change between versions.
+"""
+
+from eventsrc.log import Event, LogReader
+from projections.fold.settings import Settings
+from projections.localize.relocalize import Answer, Question
+
+from .folding import fold, open_log
+from .map import Map
+from .questions import relocalize
+from .time_travel import Timeline
+
+__all__ = [
+    "Answer",
+    "Event",
+    "LogReader",
+    "Map",
+    "Question",
+    "Settings",
+    "Timeline",
+    "fold",
+    "open_log",
+    "relocalize",
+]

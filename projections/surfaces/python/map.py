@@ -1,0 +1,101 @@
+"""`Map`: a folded map for scripts and notebooks."""
+
+import html
+from base64 import b64encode
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from eventsrc.base.text import counted, visible
+from eventsrc.envelope.model import Offset
+from projections.map.digest import map_digest
+from projections.map.export import state_document, state_text
+from projections.map.view import MapView
+
+_MOST_ROWS = 50
+
+
+class Map:
+    """The map after some events of a log. In a notebook it is shown as a picture and a table.
+
+    ``view`` is the map as data (`projections.map.view.MapView`), not to be changed.
+
+    Examples:
+        >>> house = fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+        >>> house.places[3]["type"], house.digest[:8]
+        ('living room', '83caf24d')
+    """
+
+    def __init__(self, view: MapView, known_at: Offset | None = None) -> None:
+        self.view = view
+        self._known_at = known_at
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the whole map, in hex; the same log and settings give the same one."""
+        return map_digest(self.view)
+
+    @cached_property
+    def state(self) -> dict[str, Any]:
+        """The document that ``mapfold state --json`` prints."""
+        return state_document(self.view, self.digest, self._known_at)
+
+    @property
+    def places(self) -> list[dict[str, Any]]:
+        """The Places, in the order in which they were founded."""
+        return list(self.state["places"])
+
+    @property
+    def objects(self) -> list[dict[str, Any]]:
+        """The Objects, in the order in which they were found."""
+        return list(self.state["objects"])
+
+    @property
+    def adjacency(self) -> list[dict[str, Any]]:
+        """Pairs of neighbouring Places, each with its number of transitions."""
+        return list(self.state["adjacency"])
+
+    def draw(self, out: str | Path, title: str = "") -> None:
+        """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
+        from projections.adapters.drawing import (
+            draw_map,  # here: matplotlib takes half a second to import
+        )
+
+        draw_map(self.view, Path(out), title=title or self._title)
+
+    @property
+    def _title(self) -> str:
+        return f"map {self.digest[:8]} after {self.view.next_offset:,} events"
+
+    def __str__(self) -> str:
+        return state_text(self.view, self.digest, self._known_at)
+
+    def __repr__(self) -> str:
+        counts = self.view.counts()
+        places, objects = counted(counts["places"], "place"), counted(counts["objects"], "object")
+        events = counted(self.view.next_offset, "event")
+        return f"<Map after {events}: {places}, {objects}, digest {self.digest[:16]}>"
+
+    def _repr_html_(self) -> str:
+        from projections.adapters.drawing import map_png  # see `draw`
+
+        picture = b64encode(map_png(self.view, self._title)).decode("ascii")
+        names = ("place_id", "name", "type", "keyframe_count", "centroid_x", "centroid_y")
+        head = "".join(f"<th>{name}</th>" for name in names)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{_cell(place.get(name))}</td>' for name in names)}</tr>"
+            for place in self.places[:_MOST_ROWS]
+        )
+        more = len(self.places) - _MOST_ROWS
+        rest = f"<p>and {more} more places</p>" if more > 0 else ""
+        return (
+            f'<img alt="{html.escape(repr(self))}" style="max-width:100%"'
+            f' src="data:image/png;base64,{picture}">'
+            f"<table><tr>{head}</tr>{rows}</table>{rest}"
+        )
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.2f}" if isinstance(value, float) else html.escape(visible(str(value)))

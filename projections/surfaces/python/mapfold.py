@@ -1,0 +1,23 @@
+"""mapfold: a robot's semantic map as a deterministic fold over an append-only log.
+
+The wheel installs this file as the module ``mapfold``; ``python -m mapfold`` is the program.
+
+>>> import mapfold
+>>> house = mapfold.fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+>>> len(house.places), len(house.objects)
+(10, 82)
+"""
+
+import sys
+
+if __name__ == "__main__":
+    from projections.surfaces.cli import main
+
+    sys.argv[0] = "mapfold"
+    main()
+
+from projections.surfaces import python as api
+from projections.surfaces.python import *  # noqa: F403
+
+__all__: list[str] = []
+__all__ += api.__all__

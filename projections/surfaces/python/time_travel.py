@@ -1,0 +1,112 @@
+"""`Timeline` for scripts and notebooks: maps of one log at any point, and how they came about."""
+
+from pathlib import Path
+from typing import Any
+
+from eventsrc.envelope.model import Offset
+from eventsrc.log.seek import resolve
+from projections import history
+from projections.fold.corrections import Corrections
+from projections.fold.settings import Settings
+from projections.history.merges import merge_document
+
+from .folding import SettingsLike, settings_from
+from .map import Map
+
+
+class Timeline:
+    """A context manager over a log. A point is a number of events, a time in ISO 8601,
+    ``RUN:KEYFRAME`` or ``end``.
+
+    The log is folded once, at the first question, and its history kept in files beside the log
+    (``LOG.history``, a cache), unless ``cache`` is false. ``settings`` are as in `fold`. Answers
+    are the documents that the commands print with ``--json``. Raises LogNotFound, NotALog,
+    LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
+
+    Examples:
+        >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
+        ...     for merge in timeline.merges()[:2]:
+        ...         print(merge["offset"], merge["survivor"], *merge["absorbed"])
+        240 sim-7-a_p6 sim-7-a_p7
+        294 sim-7-a_p8 sim-7-a_p9
+    """
+
+    def __init__(
+        self, log: str | Path, settings: SettingsLike = None, *, cache: bool = True
+    ) -> None:
+        self._log = Path(log)
+        self._chosen = settings_from(settings)
+        self._timeline = history.Timeline(self._log, self._settings, cache=cache)
+
+    def __enter__(self) -> "Timeline":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the log."""
+        self._timeline.reader.close()
+
+    @property
+    def end(self) -> int:
+        """The number of events."""
+        return self._timeline.end
+
+    def at(self, point: int | str = "end") -> Map:
+        """The map at a point. It has no embeddings: ask a map of `fold` by `relocalize`."""
+        end = self._offset(point)
+        return Map(self._timeline.at(end), end)
+
+    def merges(self, point: int | str = "end") -> list[dict[str, Any]]:
+        """Every merge of places up to a point, as ``mapfold merges --json``."""
+        end = self._offset(point)
+        known = self._timeline.knowing(end)
+        return [merge_document(known.covering(end), each) for each in known.merges(end)]
+
+    def why(self, thing: str, point: int | str = "end") -> dict[str, Any]:
+        """The history of a place or an object, as ``mapfold why --json``.
+
+        Raises NoSuchThing with the nearest names.
+        """
+        return self._timeline.why(thing, self._offset(point)).document()
+
+    def why_same(self, first: str, second: str, point: int | str = "end") -> dict[str, Any]:
+        """Since when, and by which merges, two keyframes (``RUN:KEYFRAME``) are in one place."""
+        return self._timeline.why_same(first, second, self._offset(point)).document()
+
+    def diff(self, start: int | str, end: int | str = "end") -> dict[str, Any]:
+        """The difference between the maps at two points, as ``mapfold diff --json``."""
+        return self._timeline.diff(self._offset(start), self._offset(end)).document()
+
+    def bisect(
+        self, condition: str, start: int | str = 0, end: int | str = "end"
+    ) -> dict[str, Any]:
+        """The first event that made a condition true, as ``mapfold bisect --json``.
+
+        Raises ExpressionError for a condition that cannot be read.
+
+        Examples:
+            >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
+            ...     timeline.bisect("object_count >= 40")["found"]["offset"]
+            131
+        """
+        found = self._timeline.bisect(condition, self._offset(start), self._offset(end))
+        return found.document()
+
+    def whatif(self, *alternatives: SettingsLike, point: int | str = "end") -> dict[str, Any]:
+        """The map under other settings beside this one, as ``mapfold whatif --json``.
+
+        Each alternative is a whole set of settings, as in `fold`.
+        """
+        end = self._offset(point)
+        corrections = self._timeline.corrections(end)
+        others = [settings_from(each)(corrections) for each in alternatives]
+        base = self._chosen(corrections)
+        return history.what_if(self._log, base, others, end, processes=1).document()
+
+    def _offset(self, point: int | str) -> Offset:
+        return resolve(self._timeline.reader, str(point))
+
+    def _settings(self, corrections: Corrections) -> Settings:
+        return self._chosen(corrections)

@@ -1,0 +1,148 @@
+"""Answers that compare: two moments, the map under other settings or without a command and the
+log's own, and the event that made a condition true.
+"""
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, Final
+
+from starlette.datastructures import QueryParams
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible_lines
+from eventsrc.envelope.model import Offset
+from eventsrc.log.seek import resolve
+from projections.fold.corrections import compile_corrections
+from projections.history import Expression, ExpressionError
+from projections.history.condition_functions import FUNCTIONS
+from projections.history.merges import merge_document
+from projections.history.parallel import Rules
+from projections.history.rendering import difference_text, search_text
+from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
+from projections.history.whatif_rendering import whatif_text
+from projections.map.log_commands import read_commands
+
+from .log_map import LogMap
+from .log_prefix import PrefixReader
+from .moment import Moment, command_line
+from .opened import Opened
+from .requests import assignments_of, text_of
+
+MOST_LINES: Final = 200
+_FLAGS: Final = ("1", "true", "yes")
+_WORDS: Final = ("and", "or", "not", "none")
+
+
+def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The difference between the maps at ``from`` and ``to``, each map under the commands before
+    it, or both under those before ``known_at``."""
+    start, end = (shown.point(text_of(query, name)) for name in ("from", "to"))
+    known_at = shown.point(query["known_at"]) if query.get("known_at") else None
+    found = shown.timeline.diff(start, end, known_at=known_at)
+    words = [str(start), str(end)]
+    if known_at is not None:
+        words += ["--known-at", str(known_at)]
+    settings = shown.opened.words(*assignments_of(query))
+    return {
+        **found.document(),
+        "known_at": known_at,
+        "lines": visible_lines(difference_text(found, most=MOST_LINES)).splitlines(),
+        "command": command_line(shown.opened, "diff", *words, *settings),
+    }
+
+
+def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """When ``condition`` became true between ``from`` (default: the start) and ``to`` (default: the
+    end); with ``scan=1`` every turn."""
+    expression = Expression(text_of(query, "condition"))
+    moment = Moment.of(shown, query, "to")
+    start = shown.point(text_of(query, "from", "0"))
+    scan = query.get("scan", "") in _FLAGS
+    found = moment.known.bisect(expression, start, moment.end, scan=scan)
+    words = [expression.source, *(["--from", str(start)] if start else [])]
+    words += ["--to", str(moment.end), *(["--scan"] if scan else [])]
+    return {
+        **found.document(),
+        "known_at": moment.known_at,
+        "lines": visible_lines(search_text(found, most=MOST_LINES)).splitlines(),
+        "command": moment.command("bisect", *words, asked_at=False),
+    }
+
+
+def conditions_answer(_: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The functions of conditions, for completion, and the error in ``text`` with its column."""
+    return {
+        "functions": [
+            {
+                "name": function.name,
+                "signature": function.signature,
+                "parameters": [parameter.value for parameter in function.parameters],
+                "optional": function.optional,
+                "result": function.result.value,
+                "says": function.says,
+            }
+            for function in FUNCTIONS.values()
+        ],
+        "words": list(_WORDS),
+        "error": _error(query["text"]) if query.get("text") else None,
+    }
+
+
+def _error(text: str) -> dict[str, Any] | None:
+    try:
+        Expression(text)
+    except ExpressionError as error:
+        return {"column": error.column, "message": error.reason}
+    return None
+
+
+def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """Every merge of places up to W."""
+    moment = Moment.of(shown, query)
+    known = moment.known
+    return {
+        **moment.document(),
+        "merges": [merge_document(known.history, merge) for merge in known.merges(moment.end)],
+        "command": moment.command("merges"),
+    }
+
+
+WHATIF_OPTIONS: Final = ("try", "grid", "without")
+
+
+def whatif_answer(
+    opened: Opened, through: Offset, query: QueryParams, go_on: Callable[[], None]
+) -> dict[str, Any]:
+    """``set`` together make one alternative; each ``try``, ``grid`` and ``without`` as the options
+    of ``mapfold whatif``. ``seconds`` is the time of all folds; each alternative has its own."""
+    started = perf_counter()
+    sets = assignments_of(query)
+    tries, grids, without = (query.getlist(name) for name in WHATIF_OPTIONS)
+    with PrefixReader(opened.log, through, go_on) as reader:
+        end = resolve(reader, text_of(query, "at", "end"))
+        known_at = resolve(reader, text_of(query, "known_at", str(end)))
+        commands = read_commands(reader, known_at)
+    corrections = compile_corrections(commands)
+    base = Rules(opened.settings(corrections), corrections)
+    trials = setting_trials(base, alternatives(base.settings, sets, tries, grids))
+    trials += command_trials(commands, without, opened.settings)
+    if not trials:
+        raise MisuseError("nothing to try; give set, try, grid or without")
+    found = what_if(opened.log, base, trials, end, truth=opened.truth, progress=lambda *_: go_on())
+    words = [
+        w for name in WHATIF_OPTIONS for text in query.getlist(name) for w in (f"--{name}", text)
+    ]
+    words += [word for text in sets for word in ("--set", text)]
+    words += [*opened.base_words(), "--at", str(end)]
+    if known_at != end:
+        words += ["--known-at", str(known_at)]
+    return {
+        "through": through,
+        "at": end,
+        "known_at": known_at,
+        **found.document(),
+        "names": [each.name for each in found.all],
+        "lines": visible_lines(whatif_text(found, most=MOST_LINES)).splitlines(),
+        "seconds": round(perf_counter() - started, 3),
+        "command": command_line(opened, "whatif", *words),
+    }

@@ -1,0 +1,197 @@
+"""Re-localisation in the map at W: the pose from which some crops are seen; and the crops of a
+mapped keyframe as such a question.
+
+The search needs the map with its embeddings, which histories do not have, so a question about
+another W folds the log again. The last such map is kept if it is small.
+"""
+
+import sys
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+import pybase64
+from starlette.datastructures import QueryParams
+
+from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.ingest import Rejected
+from eventsrc.envelope.model import Offset
+from eventsrc.envelope.upcast import read_envelopes
+from eventsrc.log import Event
+from eventsrc.log.seek import resolve
+from projections.fold.corrections import map_fingerprint
+from projections.fold.errors import QuestionError
+from projections.localize.relocalize import (
+    Candidates,
+    Crop,
+    ExactIndex,
+    Match,
+    parse_question,
+    rank,
+)
+from projections.localize.relocalize.floors import Hypotheses
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+
+from .log_map import LogMap
+from .log_prefix import PrefixReader
+from .moment import Moment, command_line, shell_line
+from .opened import Opened
+from .requests import assignments_of, text_of
+from .search import keyframe_of
+
+MOST_BYTES: Final = 1_000_000
+_KEPT_OBSERVATIONS: Final = 20_000
+"""Most observations of a map whose search matrix is kept: at 512 dimensions it takes 80 MB."""
+_MOST_TOP: Final = 20
+_MATCHES: Final = 8
+
+
+class Localizer:
+    """Answers questions; keeps the last map that it searched. Not for several threads at once."""
+
+    def __init__(self, opened: Opened) -> None:
+        self._opened = opened
+        self._kept: tuple[object, ExactIndex] | None = None
+
+    def answer(
+        self, through: Offset, query: QueryParams, payload: bytes, go_on: Callable[[], None]
+    ) -> dict[str, Any]:
+        """Ranked places, a pose, all weighed poses (x, y, yaw, weight), and the matches of each
+        crop."""
+        started = perf_counter()
+        question = parse_question(payload)
+        crops = question.crops
+        top = text_of(query, "top", "3")
+        if not (top.isascii() and top.isdecimal() and 1 <= int(top[:9]) <= _MOST_TOP):
+            raise QuestionError(f"top is {top[:40]!r}; give a number from 1 to {_MOST_TOP}")
+        end, index = self._index(through, query, go_on)
+        candidates = index.search(crops)
+        found = rank(question, candidates, top=int(top))
+        words = ["question.json", "--log", str(self._opened.log), "--as-of", str(end)]
+        settings = self._opened.words(*assignments_of(query))
+        return {
+            "through": through,
+            "at": end,
+            "known_at": end,
+            **found.document(),
+            "poses": _poses(found.hypotheses),
+            **_floors(found.hypotheses),
+            "crops": [
+                _crop(crop, matches, candidates)
+                for crop, matches in zip(crops, candidates.matches, strict=True)
+            ],
+            "seconds": round(perf_counter() - started, 3),
+            "command": shell_line("mapfold", "relocalize", *words, *settings),
+        }
+
+    def _index(
+        self, through: Offset, query: QueryParams, go_on: Callable[[], None]
+    ) -> tuple[Offset, ExactIndex]:
+        """The map at W under the commands before it, to be searched."""
+        with PrefixReader(self._opened.log, through, go_on) as reader:
+            end = resolve(reader, text_of(query, "at", "end"))
+            corrections = read_corrections(reader, end)
+            settings = self._opened.settings(corrections)
+            settings = settings.with_assignments(assignments_of(query), "set")
+            key = reader.log_id, end, map_fingerprint(settings, corrections)
+            if self._kept is not None and self._kept[0] == key:
+                return end, self._kept[1]
+            self._kept = None
+            view = fold_log(reader, settings, end, corrections=corrections)[1]
+        index = ExactIndex(view)
+        if len(view.observations) <= _KEPT_OBSERVATIONS:
+            self._kept = key, index
+        return end, index
+
+
+def _poses(found: Hypotheses | None) -> list[list[float]]:
+    """x, y, yaw and weight of each, likeliest first."""
+    if found is None:
+        return []
+    rows: list[list[float]] = np.column_stack((found.poses, found.weights)).tolist()
+    return rows
+
+
+def _floors(found: Hypotheses | None) -> dict[str, Any]:
+    """The floor of each of the poses, where any has a name."""
+    named = found is not None and any(name is not None for name in found.floors)
+    return {"pose_floors": list(found.floors)} if found is not None and named else {}
+
+
+def _crop(crop: Crop, matches: tuple[Match, ...], candidates: Candidates) -> dict[str, Any]:
+    return {
+        "det_id": crop.det_id,
+        "class_name": crop.class_name,
+        "bbox": None if crop.bbox is None else list(crop.bbox),
+        "matches": [_match(each, candidates) for each in matches[:_MATCHES]],
+    }
+
+
+def _match(match: Match, candidates: Candidates) -> dict[str, Any]:
+    place = match.keyframe_place if match.object_place is None else match.object_place
+    return {
+        "det_id": match.det_id,
+        "run_id": match.run_id,
+        "similarity": match.similarity,
+        "pose": None if match.pose is None else list(match.pose),
+        "class_name": match.class_name,
+        "object_id": match.object_id,
+        "place_id": None if place is None else candidates.places[place].place_id,
+    }
+
+
+def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The crops of a mapped keyframe as a question, and its pose in the map, the ``truth``.
+
+    ``ask_at`` is a W at which the map lacks the keyframe's run, or the keyframe.
+    """
+    moment = Moment.of(shown, query)
+    history = moment.known.history
+    ordinal = keyframe_of(history, query)
+    keyframe = history.keyframes[ordinal]
+    pose = keyframe.pose
+    first = next(k.offset for k in history.keyframes if k.run == keyframe.run)
+    event = next(shown.reader.read(keyframe.offset, Offset(keyframe.offset + 1)), None)
+    if event is None:
+        raise MapfoldError(f"the event at offset {keyframe.offset} cannot be read any more")
+    asked = _crops_of(event)
+    if not asked:
+        raise QuestionError(
+            f"keyframe {keyframe.run_id}:{keyframe.keyframe_id} has no detection with an embedding,"
+            " so nothing can be asked with it; pick another"
+        )
+    return {
+        **moment.document(),
+        "keyframe": f"{keyframe.run_id}/{keyframe.keyframe_id}",
+        "number": ordinal,
+        "offset": keyframe.offset,
+        "ask_at": first or keyframe.offset,
+        "question": {"crops": asked},
+        "truth": None if pose is None else [pose.x_m, pose.y_m, pose.yaw_rad],
+        "command": command_line(
+            shown.opened, "log", "cat", "--from", str(keyframe.offset), "--to",
+            str(keyframe.offset + 1),
+        ),
+    }  # fmt: skip
+
+
+def _crops_of(event: Event) -> list[dict[str, Any]]:
+    """The detections of an envelope that have an embedding, in the form of a question."""
+    accepted = read_envelopes([event], max_bytes=sys.maxsize)[0]
+    if isinstance(accepted, Rejected):
+        return []
+    rows = zip(accepted.det_ids, accepted.envelope.detections, accepted.vectors, strict=True)
+    return [
+        {
+            "det_id": det_id,
+            "class": seen.class_name,
+            "bbox": list(seen.bbox),
+            "embedding": pybase64.b64encode(vector.astype("<f4").tobytes()).decode(),
+            "embedding_dim": len(vector),
+            **({} if seen.embedding_model is None else {"embedding_model": seen.embedding_model}),
+        }
+        for det_id, seen, vector in rows
+        if vector is not None
+    ]

@@ -1,0 +1,192 @@
+"""The map of one log under one choice of settings, up to where the log can be read and folded.
+
+Where the log cannot be read or folded, the map ends, with a sentence in ``problems``. The history
+is folded once, later questions are look-ups; new events are folded when `refresh` finds them. Not
+for several threads at once.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, MapfoldError
+from eventsrc.base.text import counted
+from eventsrc.envelope.model import Offset
+from eventsrc.log import LogReader
+from eventsrc.log.format import list_growing
+from eventsrc.log.seek import resolve
+from projections.fold.corrections import Corrections, map_fingerprint
+from projections.fold.errors import FoldError
+from projections.fold.settings import Settings
+from projections.history import Progress, Timeline
+
+from .log_events import MOST_REPORTS, LogEvents
+from .log_prefix import PrefixReader
+from .opened import Opened
+
+MOST_HISTORIES: Final = 4
+"""Histories of the log's own settings that are kept: one for each set of commands asked about."""
+MOST_ALTERNATIVES: Final = 2
+"""Maps under other settings that are kept, each with one history."""
+
+
+class LogMap:
+    """A context manager over an existing log. Raises LogError when there is none.
+
+    ``sets`` (``name=value``) change the settings that it was opened with. ``progress`` is called
+    while events are folded.
+    """
+
+    def __init__(
+        self,
+        opened: Opened,
+        sets: Sequence[str] = (),
+        *,
+        progress: Progress | None = None,
+        histories: int = MOST_HISTORIES,
+    ) -> None:
+        self.opened = opened
+
+        def settings(corrections: Corrections) -> Settings:
+            return opened.settings(corrections).with_assignments(sets, "set")
+
+        self.reader = PrefixReader(opened.log)
+        self.timeline = Timeline(
+            opened.log,
+            settings,
+            progress=progress,
+            reader=self.reader,
+            histories=histories,
+            cache=opened.cache and not sets,  # a trial of settings is not kept
+        )
+        self.log_events = LogEvents()
+        self.log_id = self.reader.log_id
+        self.packed: tuple[object, bytes] | None = None
+        """The last whole history as an answer, and what it is of."""
+        self._files = _files(opened.log)
+        self._stopped: str | None = None
+        self._lost: str | None = None
+
+    def __enter__(self) -> "LogMap":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    @property
+    def through(self) -> Offset:
+        """The number of events that every answer covers."""
+        return self.timeline.end
+
+    @property
+    def lost(self) -> str | None:
+        """Why the part of the log that was read cannot be read any more; None if it can."""
+        return self._lost
+
+    @property
+    def problems(self) -> list[str]:
+        """Warnings about the map, as sentences."""
+        found = [problem for problem in (self._lost, self._stopped) if problem is not None]
+        if left_out := self.log_events.left_out:
+            found.append(
+                f"the timeline marks the first {MOST_REPORTS:,} rejected payloads and losses,"
+                f" not the {left_out:,} after them"
+            )
+        if self.through == 0 and not found:
+            return ["the log has no events yet; this page shows them as they are recorded"]
+        history = self.timeline.history
+        if self.through and not history.keyframes:
+            found.append(
+                f"none of the {counted(self.through, 'event')} is a keyframe, so there is no map"
+            )
+        elif history.keyframes and all(k.pose is None for k in history.keyframes):
+            found.append(
+                f"none of the {counted(len(history.keyframes), 'keyframe')} has a pose, so there"
+                " are no places and there is nothing to draw"
+            )
+        return found
+
+    @property
+    def key(self) -> str:
+        """A key that stays equal while the map only grows, and changes when maps of the past
+        change."""
+        known = self.timeline.corrections()
+        offsets = ",".join(str(command.offset) for command in known.in_force)
+        map_ = map_fingerprint(self.timeline.settings, known)
+        made = f"{self.log_id} {map_} {offsets} {self._stopped}"
+        return hashlib.sha256(made.encode()).hexdigest()[:16]
+
+    def refresh(self, end: Offset | None = None) -> bool:
+        """Fold the events recorded since, at most to ``end``; whether anything is new.
+
+        Errors of a log that is damaged, deleted or cannot be folded are in `problems`, not raised.
+        """
+        before = self.through, self._lost, self._stopped
+        if end is not None:
+            self.reader.limit = end
+        self._lost = None
+        try:
+            if end is None:
+                self._check_same()
+                self.reader.check_end()
+            self.timeline.refresh()
+        except LogError as error:
+            self._lost = str(error)
+        self._fold()
+        return before != (self.through, self._lost, self._stopped)
+
+    def point(self, text: str, note: Callable[[str], None] | None = None) -> Offset:
+        """The number of events of a W, written as for ``--at``."""
+        return resolve(self.reader, text, note=note)
+
+    def _check_same(self) -> None:
+        """Raises LogError if there is no log any more where it was, or another one."""
+        path, files = self.reader.path, _files(self.reader.path)
+        if files == self._files:
+            return
+        if not path.exists():
+            raise LogNotFound(f"the log at {path} is gone; this page shows what was read before")
+        with LogReader(path) as reader:
+            if reader.log_id != self.log_id:
+                raise LogError(
+                    f"there is another log at {path} now; this page shows the one that was there."
+                    " Start mapfold ui again"
+                )
+            if reader.next_offset < self.through:
+                raise LogError(
+                    f"the log at {path} has {counted(reader.next_offset, 'event')} now, fewer than"
+                    f" the {self.through} that this page shows. Start mapfold ui again"
+                )
+        self._files = files
+
+    def _fold(self) -> None:
+        """Fold to the end, or to where that is not possible."""
+        while True:
+            try:
+                _ = self.timeline.history
+                self.log_events.read_on(self.reader, self.through)
+            except LogDamaged as error:
+                stop = self.reader.first_unreadable()
+                self._stop_at(stop, error)
+            except FoldError as error:
+                self._stop_at(error.offset, error)
+            else:
+                return
+
+    def _stop_at(self, offset: Offset | None, error: MapfoldError) -> None:
+        """End the map before the event at ``offset``."""
+        if offset is None or offset >= self.reader.next_offset:
+            raise error
+        self.reader.limit = offset
+        self._stopped = f"{error}. The map shown ends before it, after {counted(offset, 'event')}"
+        self.timeline.refresh()
+
+
+def _files(path: Path) -> tuple[int, ...]:
+    """Identifies the folder and its last segment, to detect replaced ones."""
+    try:
+        status = [path.stat(), *(entry.path.stat() for entry in list_growing(path)[-1:])]
+    except OSError:
+        return ()
+    return tuple(number for each in status for number in (each.st_dev, each.st_ino))
