@@ -73,8 +73,10 @@ def _open_no_follow(path: str, flags: int) -> int:
 
 @contextlib.contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM, so that no half-started server is left running."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    """Block the signals that end a command, so that no server is left half started or half
+    stopped."""
+    ending = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ending)
     try:
         yield
     finally:
@@ -144,7 +146,7 @@ class EmbeddedServer:
         """End the use; stop the server if it has no other user and is not kept. True if it runs."""
         if not self.home.exists():
             return False
-        with self._exclusive():
+        with self._exclusive(), _signals_blocked():
             if discard_keep:
                 (self.home / "pg.keep").unlink(missing_ok=True)
             if self._users_lock is not None:

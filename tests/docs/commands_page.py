@@ -21,7 +21,8 @@ HEAD = """\
 Data goes to stdout (`--json` gives one JSON document or JSON lines), what is for people to stderr.
 Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted (Ctrl-C)
 · 141 the reader of stdout left before everything was printed (`… | head`) · 143 terminated
-(SIGTERM). What runs until it is stopped, such as `record`, exits with 0 or 3 when it is stopped.
+(SIGTERM), 129 hung up (SIGHUP). What runs until it is stopped, such as `record`, exits with 0 or 3
+when it is stopped.
 What takes longer than a second shows a progress bar where stderr is a terminal.
 
 `W` is a point in a log: a number of events, an ISO time, `RUN:KEYFRAME`, or `end`. `--at N` means

@@ -117,11 +117,12 @@ def test_db_stop_does_not_stop_a_server_in_use(home: Path) -> None:
         assert other.poll() is None
 
 
-@pytest.mark.parametrize("signum", mostly_slow([signal.SIGTERM, signal.SIGINT]))
+@pytest.mark.parametrize("signum", mostly_slow([signal.SIGHUP, signal.SIGTERM, signal.SIGINT]))
 def test_a_signal_leaves_no_server_behind(home: Path, signum: signal.Signals) -> None:
     with holder(home) as (other, _):
         assert EmbeddedServer(home).running
-        other.send_signal(signum)
+        for _ in range(1 if signum is signal.SIGINT else 2):
+            other.send_signal(signum)
         assert other.wait(WAIT_S) != 0
     assert not EmbeddedServer(home).running
 

@@ -5,13 +5,10 @@ A replay prints how many events were left out, and why.
 """
 
 import contextlib
-import signal
-import threading
 from collections.abc import Iterator
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -49,6 +46,7 @@ from .options import (
     settings_from,
     settings_of,
 )
+from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say, say_metrics
 
 
@@ -252,7 +250,7 @@ def tail_command(
     with LogReader(log) as reader:
         end = reader.next_offset
     with (
-        _stopped_by_signals() as stop,
+        stop_on_signals() as stop,
         databases(db, vector_db) as targets,
         _metrics(address, progress, log),
         Bar() as bar,
@@ -349,23 +347,6 @@ def _print_followed(report: TailReport) -> None:
     say(f"{'; '.join(done)}; the databases are at offset {report.next_offset:,}")
     for letter in report.parked:
         say(f"parked: offset {letter.offset:,}: {letter.reason}")
-
-
-@contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """SIGTERM and Ctrl-C end the tail after the current batch; a second Ctrl-C at once."""
-    stop = threading.Event()
-
-    def drain(_signum: int, _frame: FrameType | None) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = {s: signal.signal(s, drain) for s in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield stop
-    finally:
-        for signum, handler in before.items():
-            signal.signal(signum, handler)
 
 
 def register(app: typer.Typer) -> None:

@@ -24,7 +24,7 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.errors import QuestionError, SettingsError
 from projections.fold.settings import Settings, read_settings
 
-from .signals import sigterm_unwinds
+from .signals import unwind_on_signals
 from .terminal import say
 
 if TYPE_CHECKING:
@@ -160,10 +160,10 @@ VectorDbOption = Annotated[
 
 @contextlib.contextmanager
 def databases(db: str | None, vector_db: str | None) -> "Iterator[Targets]":
-    """The databases a command uses; an embedded server it started is stopped, after SIGTERM too."""
+    """The databases a command uses; an embedded server it started is stopped, also by a signal."""
     from projections.postgres.connection import open_targets
 
-    with sigterm_unwinds(), open_targets(db, vector_db) as targets:
+    with unwind_on_signals(), open_targets(db, vector_db) as targets:
         yield targets
 
 

@@ -10,10 +10,10 @@ stdout is OutputLost, so that a full disk there is not reported as a fault of th
 if the reader has closed the pipe it stays a BrokenPipeError. A failed write to stderr is ignored: a
 recorder goes on when the disk of its messages is full or its terminal is gone.
 
-Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 130 interrupted ·
-141 the reader of stdout left before everything was printed · 143 terminated. typer itself would
-answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes both on to
-`run_app` as exceptions of their own.
+Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 129 hung up ·
+130 interrupted · 141 the reader of stdout left before everything was printed · 143 terminated.
+typer itself would answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes
+both on to `run_app` as exceptions of their own.
 """
 
 import contextlib

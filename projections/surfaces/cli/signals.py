@@ -33,20 +33,18 @@ def stop_on_signals() -> Iterator[threading.Event]:
     """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work.
 
     SIGHUP comes when the terminal is closed; where it is ignored (``nohup``) it stays ignored.
-    After the first signal all have their usual effect again: a second Ctrl-C ends a command that
-    hangs. For the main thread only, as Python's signals are.
+    After the first signal a Ctrl-C has its usual effect again and ends a command that hangs. The
+    others are ignored then: shells send a second SIGHUP, ``timeout`` a second SIGTERM at once. For
+    the main thread only, as Python's signals are.
     """
     stop = _PollingEvent()
     usual = {number: signal.getsignal(number) for number in _STOPPING}
     if usual[signal.SIGHUP] == signal.SIG_IGN:
         del usual[signal.SIGHUP]
 
-    def restore() -> None:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
-
     def set_stop(_number: int, _frame: FrameType | None) -> None:
-        restore()
+        for number, handler in usual.items():
+            signal.signal(number, handler if number == signal.SIGINT else signal.SIG_IGN)
         # In another thread: the handler may have interrupted this one inside `stop.wait`, while it
         # holds the lock that `stop.set` takes.
         threading.Thread(target=stop.set, name="stop").start()
@@ -56,24 +54,35 @@ def stop_on_signals() -> Iterator[threading.Event]:
     try:
         yield stop
     finally:
-        restore()
+        for number, handler in usual.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
-def sigterm_unwinds() -> Iterator[None]:
-    """SIGTERM ends the command through its ``finally`` blocks, as Ctrl-C does."""
+def unwind_on_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the command through its ``finally`` blocks, as Ctrl-C does.
+
+    Further ones are ignored, so that they do not interrupt these blocks. Where one of them is
+    handled or ignored already, that stays so.
+    """
+    ours = [
+        number
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is signal.SIG_DFL
+    ]
 
     def leave(signum: int, _frame: FrameType | None) -> None:
+        for number in ours:
+            signal.signal(number, signal.SIG_IGN)
         sys.exit(128 + signum)
 
-    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # the command handles it itself
-        yield
-        return
-    signal.signal(signal.SIGTERM, leave)
+    for number in ours:
+        signal.signal(number, leave)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 class Steps:

@@ -1,0 +1,102 @@
+"""Signals: Ctrl-C takes effect between two steps; what a second signal does to a command that ends
+after the first."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from projections.surfaces.cli.signals import (
+    ctrl_c_between_steps,
+    stop_on_signals,
+    unwind_on_signals,
+)
+
+_HANDLER = signal.getsignal(signal.SIGINT)
+
+
+def _ctrl_c() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_in_a_step_takes_effect_after_it() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps() as step:  # noqa: PT012
+        for number in range(9):
+            with step:
+                if number == 2:
+                    _ctrl_c()
+                done.append(number)
+    assert done == [0, 1, 2]
+    assert signal.getsignal(signal.SIGINT) is _HANDLER
+
+
+def test_ctrl_c_outside_of_steps_takes_effect_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps():
+        _ctrl_c()
+
+
+def test_a_second_ctrl_c_takes_effect_at_once() -> None:
+    reached = []
+    with pytest.raises(KeyboardInterrupt), ctrl_c_between_steps() as step, step:  # noqa: PT012
+        _ctrl_c()
+        reached.append("after the first")
+        _ctrl_c()
+        reached.append("after the second")
+    assert reached == ["after the first"]
+
+
+@pytest.fixture
+def unhandled() -> Iterator[None]:
+    """SIGTERM and SIGHUP have no handler, and the tests' process survives those of a test."""
+    usual = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
+    yield
+    for number, handler in usual.items():
+        signal.signal(number, handler)
+
+
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.mark.usefixtures("unhandled")
+@pytest.mark.parametrize("first", [signal.SIGINT, *ENDING])
+@pytest.mark.parametrize("second", ENDING)
+def test_a_second_signal_does_not_cut_the_end_of_a_command_short(
+    first: signal.Signals, second: signal.Signals
+) -> None:
+    with stop_on_signals() as stop:
+        signal.raise_signal(first)
+        stop.wait()
+        signal.raise_signal(second)
+        if first is signal.SIGINT:
+            with pytest.raises(KeyboardInterrupt):
+                _ctrl_c()
+    assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_DFL] * 2
+    assert signal.getsignal(signal.SIGINT) is _HANDLER
+
+
+@pytest.mark.usefixtures("unhandled")
+@pytest.mark.parametrize("number", ENDING)
+def test_signals_unwind_a_command_once(number: signal.Signals) -> None:
+    closed = []
+    with pytest.raises(SystemExit) as ended, unwind_on_signals():  # noqa: PT012
+        try:
+            signal.raise_signal(number)
+        finally:
+            for again in ENDING:
+                signal.raise_signal(again)
+            closed.append("all")
+    assert ended.value.code == 128 + number
+    assert closed == ["all"]
+    assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_DFL] * 2
+
+
+@pytest.mark.usefixtures("unhandled")
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+    with stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGHUP)
+        assert not stop.is_set()
+    with unwind_on_signals():
+        signal.raise_signal(signal.SIGHUP)
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
