@@ -40,6 +40,20 @@ _UNSAFE: Final = re.compile(
 )
 
 
+MOST_DIGITS: Final = 19
+"""No offset, id or time in nanoseconds has more."""
+
+
+def whole_number(digits: str) -> int:
+    """The whole number that ``digits`` says; one of more than `MOST_DIGITS` is 10**19, with its
+    sign, which is larger than all that is counted. Python raises ValueError from 4,300 digits on.
+    """
+    negative = digits.startswith("-")
+    significant = digits.removeprefix("-").lstrip("0") or "0"
+    size = 10**MOST_DIGITS if len(significant) > MOST_DIGITS else int(significant)
+    return -size if negative else size
+
+
 def visible(text: str) -> str:
     """``text`` (a key, a name, a path) on one line, with control characters as escapes."""
     return text if text.isprintable() else _UNSAFE.sub(_escaped, text)

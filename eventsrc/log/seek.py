@@ -26,16 +26,17 @@ from pydantic import BaseModel, ValidationError
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import counted, whole_number
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 
 from .event import Event
 from .reader import LogReader, OnGap
 from .segment import Unreadable
 
-_KEYFRAME_OF_RUN = re.compile(r"(.+):(-?\d+)", re.DOTALL)
-_KEYFRAME = re.compile(rb'"keyframe_id"\s*:\s*(-?\d+)')
+_KEYFRAME_OF_RUN = re.compile(r"(.+):(-?[0-9]+)", re.DOTALL)
+_KEYFRAME = re.compile(rb'"keyframe_id"\s*:\s*(-?[0-9]{1,19})(?![0-9])')
 _LIKE_A_TIME = re.compile(r"[\dT:.,+Z -]+")
+_MAX_SHOWN = 200
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -60,7 +61,7 @@ def resolve(
     if text == "end":
         return _at_end(reader, on_gap)
     if text.isascii() and text.isdecimal():
-        return _checked_offset(reader, Offset(int(text)))
+        return _checked_offset(reader, text)
     time_ns = time_of(text)
     if time_ns is not None:
         included, later = _at_time(reader, time_ns, on_gap)
@@ -73,7 +74,7 @@ def resolve(
         return included
     keyframe = _KEYFRAME_OF_RUN.fullmatch(text)
     found = keyframe and _at_keyframe(
-        reader, RunId(keyframe[1]), KeyframeId(int(keyframe[2])), on_gap
+        reader, RunId(keyframe[1]), KeyframeId(whole_number(keyframe[2])), on_gap
     )
     if found:
         return found
@@ -83,8 +84,8 @@ def resolve(
 def _no_point_message(reader: LogReader, text: str, *, named: bool) -> str:
     if not named:
         return (
-            f"{text!r} is no point in a log; give an offset, a time such as 2026-03-24T13:00:00Z, "
-            "RUN:KEYFRAME or end"
+            f"{_shown(text)!r} is no point in a log; give an offset, a time such as"
+            " 2026-03-24T13:00:00Z, RUN:KEYFRAME or end"
         )
     no_time = (
         ", nor is this a time, which is written with its date, such as 2026-03-24T13:00:00Z"
@@ -92,9 +93,13 @@ def _no_point_message(reader: LogReader, text: str, *, named: bool) -> str:
         else ""
     )
     return (
-        f"{text}: {reader.path} has no such keyframe{no_time}; "
+        f"{_shown(text)}: {reader.path} has no such keyframe{no_time}; "
         f"`{advised('log', 'cat', reader.path)}` lists what it has"
     )
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 1]}…"
 
 
 def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) -> Offset:
@@ -112,10 +117,11 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
     return count if text == "end" or text.isdecimal() else Offset(count - 1)
 
 
-def _checked_offset(reader: LogReader, offset: Offset) -> Offset:
+def _checked_offset(reader: LogReader, text: str) -> Offset:
+    offset = Offset(whole_number(text))
     if offset > reader.next_offset:
         raise MisuseError(
-            f"{offset} is beyond the end of {reader.path}, which holds "
+            f"{_shown(text)} is beyond the end of {reader.path}, which holds "
             f"{counted(reader.next_offset, 'event')}; use end"
         )
     return offset

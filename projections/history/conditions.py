@@ -24,6 +24,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Literal
 
 from eventsrc.base.errors import MisuseError
@@ -34,6 +35,9 @@ MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
 MAX_DIGITS = 4300
 """Most digits of a number: as many as Python converts by default."""
+
+MAX_TOKENS = 2_000
+"""Names, numbers, texts and signs of a condition: it is evaluated for each event of a scan."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>-?\d+)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),])"
@@ -175,7 +179,9 @@ class _Parser:
 
     def __init__(self, source: str) -> None:
         self._source = source
-        self._tokens = list(self._split())
+        self._tokens = list(islice(self._split(), MAX_TOKENS + 2))
+        if len(self._tokens) > MAX_TOKENS + 1:
+            raise self._error(self._tokens[MAX_TOKENS], f"more than {MAX_TOKENS:,} words and signs")
         self._check_order()
         words = [token.python() for token in self._tokens]
         self._starts = [0]
@@ -363,7 +369,8 @@ class _Parser:
     def _after(self, node: ast.expr, text: str) -> _Token:
         """The first sign ``text`` after ``node``."""
         start = self._index((node.end_col_offset or 1) - 1) + 1
-        return next(t for t in self._tokens[start:] if t.kind == "sign" and t.text == text)
+        following = islice(self._tokens, start, None)
+        return next(t for t in following if t.kind == "sign" and t.text == text)
 
     def _error(self, where: _Token, reason: str) -> ExpressionError:
         return ExpressionError(self._source, where.column, reason)

@@ -21,6 +21,10 @@ WIDE = ("eps_m=1.0", "min_samples=8")
 SETS = [word for text in WIDE for word in ("--set", text)]
 
 
+NINES = "9" * 5_000
+"""More digits than Python reads as a number."""
+
+
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy: snapshots and effects are kept beside a log."""
@@ -213,6 +217,14 @@ def test_search(server: UiServer) -> None:
     ("path", "status", "kind", "said"),
     [
         ("digest?at=446", 400, "bad_question", "446"),
+        (f"digest?at={NINES}", 400, "bad_question", "9999… is beyond the end"),
+        (f"digest?at=sim-7-a:{NINES}", 400, "bad_question", "no such keyframe"),
+        (f"digest?known_at={NINES}", 400, "bad_question", "is beyond the end"),
+        (f"history?from={NINES}", 400, "bad_question", "from is '9999"),
+        (f"why?what=keyframe:sim-7-a/{NINES}", 404, "not_found", "no keyframe"),
+        (f"why?what=merge:{NINES}", 400, "bad_question", "names no offset"),
+        (f"keyframe?number={NINES}", 400, "bad_question", "number is '9999"),
+        (f"diff?from=1&to={NINES}", 400, "bad_question", "is beyond the end"),
         ("digest?at=tomorrow", 400, "bad_question", "tomorrow"),
         ("digest?at=-1", 400, "bad_question", "-1"),
         ("digest?set=eps=1", 400, "bad_settings", "no setting 'eps'"),

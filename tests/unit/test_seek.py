@@ -35,7 +35,9 @@ def reader(log_path: Path) -> Iterator[LogReader]:
         ("4", 4, 4),
         ("6", 6, 6),
         ("end", 6, 6),
+        ("0" * 5_000 + "4", 4, 4),
         ("a:1", 1, 0),
+        ("a:" + "0" * 5_000 + "2", 2, 1),
         ("a:2", 2, 1),
         ("a:b:2", 5, 4),
         ("1970-01-01T00:00:09Z", 0, 0),
@@ -65,6 +67,10 @@ def test_a_point_that_is_not_in_the_log_is_an_error(reader: LogReader, text: str
 @pytest.mark.parametrize(
     ("text", "says"),
     [
+        ("9" * 5_000, "9999… is beyond the end of "),
+        ("9" * 20, "99999999999999999999 is beyond the end of "),
+        ("a:" + "9" * 5_000, "9999…: {} has no such keyframe"),
+        ("-" + "9" * 5_000, "9999…' is no point in a log; give an offset"),
         (
             "09:02:06",
             "09:02:06: {} has no such keyframe, nor is this a time, which is written with",

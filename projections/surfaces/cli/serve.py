@@ -6,6 +6,7 @@ is opened.
 
 import dataclasses
 import os
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -80,7 +81,7 @@ class HttpEndpoint:
     def bound(cls, http: str, options: HttpOptions) -> Iterator[Self]:
         """Bind ``http``, a HOST:PORT. Raises MisuseError when the options do not allow it."""
         host, colon, port = http.rpartition(":")
-        if not colon or not port.isdecimal() or int(port) > 65_535:
+        if not colon or not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65_535:
             raise MisuseError(f"--http {http}: write it as HOST:PORT, such as 127.0.0.1:8080")
         host = host.strip("[]") or "127.0.0.1"
         try:

@@ -5,6 +5,7 @@ The search needs the map with its embeddings, which histories do not have, so a 
 another W folds the log again. The last such map is kept if it is small.
 """
 
+import re
 import sys
 from collections.abc import Callable
 from time import perf_counter
@@ -64,7 +65,7 @@ class Localizer:
         question = parse_question(payload)
         crops = question.crops
         top = text_of(query, "top", "3")
-        if not (top.isascii() and top.isdecimal() and 1 <= int(top[:9]) <= _MOST_TOP):
+        if not re.fullmatch("[0-9]{1,9}", top) or not 1 <= int(top) <= _MOST_TOP:
             raise QuestionError(f"top is {top[:40]!r}; give a number from 1 to {_MOST_TOP}")
         end, index = self._index(through, query, go_on)
         candidates = index.search(crops)
