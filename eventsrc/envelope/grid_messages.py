@@ -9,7 +9,8 @@ as in envelopes.
 """
 
 import math
-from typing import Annotated
+import re
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -62,9 +63,28 @@ _HEAD = msgspec.json.Decoder(_Head)
 _CELLS = msgspec.json.Decoder(list[Annotated[int, msgspec.Meta(ge=-1, le=100)]])
 
 
+_NAMES_A_GRID = re.compile(r"(?:map|grid)(?:/|$)", re.IGNORECASE)
+_TYPE_IN_KEY = re.compile(r"/(\w+)::\w+::dds_::(\w+)_(?:/|$)")
+"""As rmw_zenoh has it: ``0/map/nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_…``."""
+NO_GRID: Final = (
+    "CDR, the encoding of ROS, under a key that does not name an occupancy grid: grids are read "
+    "under keys such as tb/map, of which a part ends in map or grid; record other messages of ROS "
+    "with --ros2dds"
+)
+
+
+def names_grid(key: str) -> bool:
+    """Whether a key says that its messages in CDR, which do not say their type, are grids: by the
+    type in it, else by a part that ends in ``map`` or ``grid``."""
+    type_ = _TYPE_IN_KEY.search(key)
+    if type_ is not None:
+        return type_.groups() == ("nav_msgs", "OccupancyGrid")
+    return _NAMES_A_GRID.search(key) is not None
+
+
 def is_grid_message(payload: bytes) -> bool:
-    """Whether to read a payload that is no envelope as an occupancy grid: JSON with the fields of
-    one, or any CDR, because no other message in CDR is read."""
+    """Whether a payload that is no envelope may be an occupancy grid: JSON with the fields of one,
+    or CDR."""
     if is_cdr(payload):
         return True
     return payload.lstrip()[:1] == b"{" and all(mark in payload for mark in _MARKS)

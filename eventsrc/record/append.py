@@ -14,7 +14,13 @@ from typing import NamedTuple
 
 import msgspec
 
-from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.cdr import is_cdr
+from eventsrc.envelope.grid_messages import (
+    NO_GRID,
+    is_grid_message,
+    names_grid,
+    read_grid_message,
+)
 from eventsrc.envelope.ingest import (
     DEFAULT_MAX_PAYLOAD_BYTES,
     CheckedEnvelope,
@@ -94,6 +100,7 @@ def check_payloads(
     logged_ns: int,
     max_bytes: int,
     version: int | None = None,
+    are_grids: bool = False,
 ) -> list[Checked]:
     """Validate key and payload of each message (key, payload).
 
@@ -103,7 +110,8 @@ def check_payloads(
     ``first`` and ``logged_ns`` stand in for the keyframe id and the time of a bare list
     (`eventsrc.envelope.upcast`), which has neither. For validation any offset and any time will do,
     so both may be earlier than those that the events get. ``version`` is the envelope version that
-    another log has recorded them in; by default it is detected.
+    another log has recorded them in; by default it is detected. With ``are_grids`` messages in
+    CDR are occupancy grids whatever their keys.
     """
     pending = [
         PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))
@@ -119,15 +127,17 @@ def check_payloads(
             results[index] = Rejected(f"key {abbreviate(event.key)} {faults[event.key]}")
     for index, result in enumerate(results):
         if isinstance(result, Rejected) and pending[index].key not in faults:
-            results[index] = _as_map(pending[index], max_bytes) or result
+            results[index] = _as_map(pending[index], max_bytes, are_grids) or result
     return [Checked(event.version, result) for event, result in zip(pending, results, strict=True)]
 
 
-def _as_map(event: PendingEvent, max_bytes: int) -> NewMap | Rejected | None:
+def _as_map(event: PendingEvent, max_bytes: int, is_grid: bool) -> NewMap | Rejected | None:
     """The occupancy map in a payload that is no envelope, or the reason why its grid is refused;
     None if the payload does not look like a grid."""
     if len(event.payload) > max_bytes or not is_grid_message(event.payload):
         return None
+    if is_cdr(event.payload) and not is_grid and not names_grid(event.key):
+        return Rejected(NO_GRID)
     try:
         return NewMap(read_grid_message(event.payload, event.key).encode())
     except InvalidMap as error:

@@ -12,8 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
+from eventsrc.envelope.grid_messages import is_grid_message, names_grid, read_grid_message
+from eventsrc.envelope.ingest import Rejected
+from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
+from eventsrc.record.append import NewMap, check_payloads
 from tests.envelopes import payload
 from tests.maps import cdr_message, drawn_map, grid_message
 from tests.thorough import examples, rounds
@@ -180,3 +183,43 @@ def test_the_largest_map_is_read() -> None:
     cells = np.random.default_rng(0).choice(np.array([0, 100, 255], np.uint8), (4000, 4000))
     large = OccupancyMap(None, 0.05, (0.0, 0.0, 0.0), "k", cells)
     assert read_grid_message(cdr_message(large), "k").digest() == large.digest()
+
+
+@pytest.mark.parametrize(
+    ("key", "named"),
+    [
+        ("tb/map", True),
+        ("map", True),
+        ("robot1/local_costmap/costmap", True),
+        ("occupancy_grid", True),
+        ("Map/5", True),
+        ("0/walls/nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf2", True),
+        ("tb/scan", False),
+        ("maps/scan", False),
+        ("map_updates", False),
+        ("0/map/sensor_msgs::msg::dds_::LaserScan_/RIHS01_8d348150c12913a31ee0ec170fbf2", False),
+        ("0/map/map_msgs::msg::dds_::OccupancyGridUpdate_/RIHS01_8d348150c12913a31ee", False),
+        ("rt/odom", False),
+        ("", False),
+    ],
+)
+def test_a_key_names_a_grid_or_the_message_is_none(key: str, named: bool) -> None:
+    assert names_grid(key) == named
+    asked = [(key or "k", LITTLE)]
+    (checked,) = check_payloads(asked, first=Offset(0), logged_ns=1, max_bytes=10_000)
+    assert isinstance(checked.result, NewMap if named else Rejected)
+    if isinstance(checked.result, Rejected):
+        assert "does not name an occupancy grid" in checked.result.reason
+    (checked,) = check_payloads(
+        asked, first=Offset(0), logged_ns=1, max_bytes=10_000, are_grids=True
+    )
+    assert isinstance(checked.result, NewMap), "its type says so"
+
+
+def test_no_other_message_of_ros_is_refused_as_a_grid() -> None:
+    """Text in a message was read as "1,702,060,386 × 1,852,402,783 cells"."""
+    said = b"\0\1\0\0" + b"rosgraph message of any other type, such as a log entry" * 4
+    (checked,) = check_payloads([("rosout", said)], first=Offset(0), logged_ns=1, max_bytes=10_000)
+    assert isinstance(checked.result, Rejected)
+    assert "cells" not in checked.result.reason
+    assert "--ros2dds" in checked.result.reason

@@ -70,6 +70,7 @@ class McapFile:
                         message.published_ns,
                         message.version,
                         is_foreign=message.version is None,
+                        is_grid=is_grid,
                     )
                 else:
                     what = f"{message.encoding} {message.schema}".strip()

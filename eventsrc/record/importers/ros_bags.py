@@ -145,7 +145,7 @@ class RosBag:
             report.unchanged_grids += 1
             return None
         self._known[topic] = digest
-        return ImportedMessage(payload, _key(topic), received_ns)
+        return ImportedMessage(payload, _key(topic), received_ns, is_grid=True)
 
     def _define(self, contents: BagContents) -> list[str]:
         """Define the types that may be used as the bag does; return notes on those that fail."""

@@ -282,6 +282,7 @@ class _Import:
             logged_ns=self._writer.now_ns() if message.logged_ns is None else message.logged_ns,
             max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
             version=message.version if message.version in UPCASTERS else None,
+            are_grids=message.is_grid,
         )
         is_rejected = isinstance(checked.result, Rejected)
         if is_rejected and self._is_for_others(message):

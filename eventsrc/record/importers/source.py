@@ -22,7 +22,8 @@ class ImportedMessage:
     is the format of a message that no importer reads; it is passed over, and its payload may be
     left out. ``refused`` is the reason if the source could not read the message: it is kept as
     rejected; of a payload that is too large ``excerpt`` is kept. ``begins`` marks the begin of an
-    import in another mapfold log, from which log times may be older than before.
+    import in another mapfold log, from which log times may be older than before. ``is_grid``
+    marks an occupancy grid in CDR, by its type.
     """
 
     payload: bytes
@@ -36,6 +37,7 @@ class ImportedMessage:
     refused: str | None = None
     begins: bool = False
     excerpt: Excerpt | None = None
+    is_grid: bool = False
 
 
 class Source(Protocol):
