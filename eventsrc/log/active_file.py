@@ -1,7 +1,8 @@
 """Read an active segment, growing or left over from a crash.
 
 It has no index: its chunk heads and commit marks (80 bytes a commit) are read once, and later only
-those that have been added.
+those that have been added. How far it was read follows from the chunks, which are added one by one,
+so that an exception at any moment, such as that of Ctrl-C, leaves it right.
 """
 
 import os
@@ -22,13 +23,20 @@ class ActiveFile(SegmentFile):
 
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
-        self.position = self.head_bytes
         self._seed = mark_seed(self.head)
         try:
             self.refresh()
         except BaseException:
             self.close()
             raise
+
+    @property
+    def position(self) -> int:
+        """The byte after the last commit mark that was read."""
+        if not self.chunks:
+            return self.head_bytes
+        last = self.chunks[-1]
+        return last.position + last.length + _mcap.MARK_BYTES
 
     def refresh(self) -> Offset:
         """Read the commit marks added since the last call; return the next offset."""
@@ -41,19 +49,16 @@ class ActiveFile(SegmentFile):
         return self.next_offset
 
     def _read_commit(self) -> bool:
-        head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD, self.position)
+        position = self.position
+        head_bytes = os.pread(self._fd, _mcap.PLAIN_CHUNK_HEAD, position)
         if len(head_bytes) < _mcap.PLAIN_CHUNK_HEAD:
             return False
         head = _mcap.decode_chunk_head(head_bytes)
-        mark_at = self.position + head.length
-        mark = os.pread(self._fd, _mcap.MARK_BYTES, mark_at)
+        mark = os.pread(self._fd, _mcap.MARK_BYTES, position + head.length)
         first, following = _mcap.decode_mark(mark, self._seed)
         if first != self.next_offset:
             raise BadRecord("a commit mark contradicts the one before it")
-        chunk = ChunkRef(self.position, head.length, first, following)
-        self.chunks.append(chunk)
-        self.next_offset = following
-        self.position = mark_at + _mcap.MARK_BYTES
+        self.chunks.append(ChunkRef(position, head.length, first, following))
         return True
 
     def was_replaced(self) -> bool:

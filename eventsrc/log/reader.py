@@ -7,10 +7,12 @@ before it and raises LogDamaged; with ``on_gap`` it reports what is missing and 
 
 import contextlib
 import sys
+import threading
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
@@ -33,19 +35,34 @@ OpenSegment = SealedFile | ActiveFile
 OnGap = Callable[[Unreadable], None]
 
 
+class _Found(NamedTuple):
+    """The segments of a log, and the last of them, open."""
+
+    segments: tuple[SegmentPath, ...]
+    last: OpenSegment
+
+
 class LogReader:
-    """A context manager over an existing log. Raises LogNotFound, NotALog or LogDamaged."""
+    """A context manager over an existing log. Raises LogNotFound, NotALog or LogDamaged.
+
+    Several threads may use it at once, each with iterators of its own.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._lock = threading.RLock()
         self._open: OrderedDict[int, OpenSegment] = OrderedDict()
         end = sealed_end(path)  # before the folder is listed: a writer may be active
-        self._segments = segments_of(path)
-        self._last = _open_segment(path, self._segments[-1])
+        segments = tuple(segments_of(path))
+        self._found = _Found(segments, _open_segment(path, segments[-1]))
         self.log_id = self._last.log_id
         """From its last segment; reading stops at a segment with another id."""
         if end is not None and end.log_id == self.log_id:
             end.require(path, self.next_offset)
+
+    @property
+    def _last(self) -> OpenSegment:
+        return self._found.last
 
     @property
     def next_offset(self) -> Offset:
@@ -55,19 +72,22 @@ class LogReader:
     @property
     def segments(self) -> tuple[SegmentPath, ...]:
         """The segments as of opening or the last `refresh`, in offset order."""
-        return tuple(self._segments)
+        return self._found.segments
 
     def refresh(self) -> Offset:
         """Find the commits since the last call; return the new `next_offset`."""
+        with self._lock:
+            return self._refresh()
+
+    def _refresh(self) -> Offset:
         while True:
             if isinstance(self._last, ActiveFile):
                 self._last.refresh()
             following = self._following()
             if following is not None:
                 last = self._open_checked(following)
-                self._segments.append(following)
                 self._keep_open(self._last)
-                self._last = last
+                self._found = _Found((*self.segments, following), last)
             elif isinstance(self._last, ActiveFile) and self._last.was_replaced():
                 self._reopen_last()
             else:
@@ -94,7 +114,7 @@ class LogReader:
     def _reopen_last(self) -> None:
         """Open the last segment again: a restarted writer has sealed it, perhaps with events that
         had no commit mark yet, or has replaced an empty one."""
-        self._last = self._open_checked(self._segments[-1])
+        self._found = self._found._replace(last=self._open_checked(self.segments[-1]))
 
     def _following(self) -> SegmentPath | None:
         """The segment that starts where the last one ends, once its writer has begun it."""
@@ -146,16 +166,18 @@ class LogReader:
 
     def _report_damaged_end(self, start: Offset, report: OnGap) -> None:
         """Report recorded events at the end of the growing segment that cannot be read any more."""
-        gap = self._last.damaged_end() if isinstance(self._last, ActiveFile) else None
+        with self._lock:  # it reads commits that were added meanwhile
+            gap = self._last.damaged_end() if isinstance(self._last, ActiveFile) else None
         if gap is not None and gap.last >= start:
             report(gap)
 
     def _entries_from(self, start: Offset) -> Iterator[tuple[SegmentPath, Offset]]:
         """Each segment from the one that holds ``start``, with the base of the next one."""
-        first = bisect_right(self._segments, start, key=lambda entry: entry.base) - 1
-        for index in range(max(first, 0), len(self._segments)):
-            is_last = index + 1 == len(self._segments)
-            yield self._segments[index], _NO_END if is_last else self._segments[index + 1].base
+        segments = self.segments
+        first = bisect_right(segments, start, key=lambda entry: entry.base) - 1
+        for index in range(max(first, 0), len(segments)):
+            is_last = index + 1 == len(segments)
+            yield segments[index], _NO_END if is_last else segments[index + 1].base
 
     def stretches(self, start: Offset, end: Offset, size: int) -> Iterator[tuple[Offset, Offset]]:
         """Ranges that make up ``start`` to ``end``, in order, for several readers to share: each is
@@ -220,11 +242,12 @@ class LogReader:
 
     def open_segment(self, entry: SegmentPath) -> OpenSegment:
         """One of `segments`, open. The last one is the object that `refresh` updates."""
-        if entry.base == self._last.base:
-            return self._last
-        segment = self._open.get(entry.base) or self._open_checked(entry)
-        self._keep_open(segment)
-        return segment
+        with self._lock:
+            if entry.base == self._last.base:
+                return self._last
+            segment = self._open.get(entry.base) or self._open_checked(entry)
+            self._keep_open(segment)
+            return segment
 
     def _open_checked(self, entry: SegmentPath) -> OpenSegment:
         segment = _open_segment(self.path, entry)
@@ -242,7 +265,8 @@ class LogReader:
 
     def close(self) -> None:
         """Close the files; iterators still running keep theirs open."""
-        self._open.clear()
+        with self._lock:
+            self._open.clear()
 
     def __enter__(self) -> "LogReader":
         return self

@@ -138,8 +138,7 @@ class SealedFile(SegmentFile):
         edges = sealed_edges(self.seal["chunk_edges"], self.base)
         if len(edges) != len(indexes) + 1:
             raise BadRecord("the seal does not fit the index")
-        self.next_offset = edges[-1]
-        if end_in(self.head, self.next_offset) != self.next_offset:
+        if end_in(self.head, edges[-1]) != edges[-1]:
             raise BadRecord("the seal does not fit the head")
         self.chunks = [
             ChunkRef(position, length, first, following, channels)

@@ -81,7 +81,6 @@ class SegmentFile:
         self.path = path
         self.base = base
         self.chunks: list[ChunkRef] = []
-        self.next_offset = base
         self._fd = os.open(path, os.O_RDONLY)
         try:
             self.head, self.head_bytes = read_head(path, os.pread(self._fd, HEAD_BYTES, 0), base)
@@ -89,6 +88,11 @@ class SegmentFile:
             self.close()
             raise
         self.log_id = self.head["log_id"]
+
+    @property
+    def next_offset(self) -> Offset:
+        """The offset after the last event."""
+        return self.chunks[-1].following if self.chunks else self.base
 
     def read_chunk(self, chunk: ChunkRef) -> bytes:
         """The chunk's body, CRC checked; LogDamaged otherwise."""
