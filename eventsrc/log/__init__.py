@@ -1,6 +1,12 @@
 """The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
 
-from .cache_folders import cache_folder, cache_sizes, make_cache_folder
+from .cache_folders import (
+    cache_folder,
+    cache_sizes,
+    delete_left_over_files,
+    make_cache_folder,
+    write_cache_file,
+)
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
 from .file_fault import FileFault
@@ -33,6 +39,7 @@ __all__ = [
     "Verification",
     "cache_folder",
     "cache_sizes",
+    "delete_left_over_files",
     "event_hash",
     "follow",
     "make_cache_folder",
@@ -41,4 +48,5 @@ __all__ = [
     "same_but_sealed",
     "segment_signatures",
     "verify_log",
+    "write_cache_file",
 ]

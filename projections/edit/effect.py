@@ -1,8 +1,6 @@
 """The effect of a command on the map of the events before it: counts, and the whole difference."""
 
-import contextlib
 import json
-import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +8,7 @@ from eventsrc.base.progress import working
 from eventsrc.base.text import counted
 from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
-from eventsrc.log import cache_folder, make_cache_folder
+from eventsrc.log import cache_folder, make_cache_folder, write_cache_file
 from projections.fold.corrections import (
     Corrections,
     RecordedCommand,
@@ -150,15 +148,12 @@ class EffectCache:
         """Keep an effect. A cache that cannot be written is left as it is, with a note."""
         self._effects = {**self._read(), change.identity: effect}
         document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
-        beside = self._path.with_suffix(f".{os.getpid()}.part")
+        data = json.dumps(document).encode()
         try:
             make_cache_folder(self._log, "snapshots")
-            beside.write_text(json.dumps(document), "utf-8")
-            beside.replace(self._path)
+            write_cache_file(self._path, lambda file: file.write(data))
         except OSError as error:
             self._note(f"{self._path}: no effect was kept: {error.strerror}")
-            with contextlib.suppress(OSError):  # the same disk; the note has said what is wrong
-                beside.unlink(missing_ok=True)
 
     def _read(self) -> dict[str, Effect]:
         """The cached effects; none if the file is of another log or was not written by this

@@ -6,7 +6,6 @@ has lost since, by recovery or deletion, is not used. For each set of settings a
 snapshots are kept: the newest, and others spread out below it.
 """
 
-import os
 import re
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +13,13 @@ from pathlib import Path
 
 from eventsrc.base.progress import working
 from eventsrc.envelope.model import Offset
-from eventsrc.log import cache_folder, make_cache_folder, segment_signatures
+from eventsrc.log import (
+    cache_folder,
+    delete_left_over_files,
+    make_cache_folder,
+    segment_signatures,
+    write_cache_file,
+)
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
@@ -85,14 +90,13 @@ class SnapshotCache:
     def keep(self, semantic_map: SemanticMap, view: MapView) -> None:
         """Write a snapshot for the map's offset, unless there is one that may be usable."""
         path = self._path(semantic_map.next_offset)
-        beside = path.with_suffix(f".{os.getpid()}.part")
         try:
             make_cache_folder(self._log, "snapshots")
             if not path.exists() or path in self._unusable:
                 segments = self._signatures(semantic_map.next_offset)
                 with working("keeping a snapshot of the map"):
-                    beside.write_bytes(snapshot(semantic_map, view, self._log_id, segments))
-                beside.replace(path)
+                    data = snapshot(semantic_map, view, self._log_id, segments)
+                    write_cache_file(path, lambda file: file.write(data))
                 self._thin_out()
         except OSError as error:
             self._note(f"{path}: no snapshot was kept: {error.strerror}")
@@ -101,7 +105,9 @@ class SnapshotCache:
         return self.folder / f"{self._fingerprint}-{offset:020d}.map"
 
     def _thin_out(self) -> None:
-        """While there are too many, delete the one whose neighbours are closest together."""
+        """While there are too many, delete the one whose neighbours are closest together; delete
+        what killed processes left."""
+        delete_left_over_files(self.folder)
         offsets = self.offsets()
         while len(offsets) > _MAX_KEPT:
             gaps = [(offsets[i + 1] - offsets[i - 1], i) for i in range(1, len(offsets) - 1)]

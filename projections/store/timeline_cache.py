@@ -31,10 +31,12 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import (
     LogReader,
     cache_folder,
+    delete_left_over_files,
     event_hash,
     make_cache_folder,
     same_but_sealed,
     segment_signatures,
+    write_cache_file,
 )
 from projections.fold import State, part, prefixed
 from projections.fold.corrections import Corrections, map_fingerprint
@@ -60,7 +62,6 @@ _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
 _DIGEST: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.\d+\.digest")
 _OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|fold|digest)")
-_LEFT_OVER_S: Final = 3_600.0
 _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
 """Errors of opening something other than a regular file."""
 _TRIES: Final = 3
@@ -209,7 +210,7 @@ class TimelineCache:
         if not new or new[0].start != start:  # a stripe is in two parts: it was joined in memory
             start, new = FIRST_OFFSET, list(stripes)
         new = joined_short(new)
-        self._write(
+        write_cache_file(
             self.folder / f"{self._key}-{start:020d}-{end:020d}.npz",
             lambda file: write_part(file, self._about(start, end), new),
         )
@@ -220,20 +221,7 @@ class TimelineCache:
 
     def _write_state(self, path: Path, end: Offset, state: State) -> None:
         data = pack(prefixed("about", self._about(FIRST_OFFSET, end)) | state)
-        self._write(path, lambda file: file.write(data))
-
-    def _write(self, path: Path, write: Callable[[Any], object]) -> None:
-        beside = path.with_name(f"{path.name}.{os.getpid()}.new")
-        try:
-            beside.unlink(missing_ok=True)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-            with os.fdopen(os.open(beside, flags, 0o644), "wb") as file:
-                write(file)
-            beside.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                beside.unlink(missing_ok=True)
-            raise
+        write_cache_file(path, lambda file: file.write(data))
 
     def _about(self, start: Offset, end: Offset) -> dict[str, Any]:
         return {
@@ -328,9 +316,9 @@ class TimelineCache:
                 file.path.unlink(missing_ok=True)
         for path in self._paths():
             fold = _FOLD.fullmatch(path.name)
-            is_old = fold is not None and fold[1] == self._key and int(fold[2]) < end
-            if is_old or (path.name.endswith(".new") and _age_s(path) > _LEFT_OVER_S):
+            if fold is not None and fold[1] == self._key and int(fold[2]) < end:
                 path.unlink(missing_ok=True)
+        delete_left_over_files(self.folder)
         self._limit()
 
     def _limit(self) -> None:
