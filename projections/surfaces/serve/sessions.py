@@ -40,10 +40,11 @@ class Sessions:
             _, track = self._kept.pop(name, (0.0, None))
             if track is None:
                 track = Track(name)
-            self._kept[name] = (self._now(), track)
+            found = track.step(moved, answer.hypotheses, answer.confidence, answer.known)
+            self._kept[name] = (self._now(), track)  # not before: a step that failed is discarded
             if len(self._kept) > self._most:
                 del self._kept[next(iter(self._kept))]
-            return track.step(moved, answer.hypotheses, answer.confidence, answer.known).document()
+            return found.document()
 
     def _forget(self) -> None:
         ended = self._now() - SILENT_S
