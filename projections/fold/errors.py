@@ -6,6 +6,7 @@ MapfoldError
 ├── QuestionError               2  a question about the map cannot be asked as it is
 ├── FoldError                   1  an event cannot be folded; names its offset
 │   └── ImpossibleCommand       1  a command makes it one that cannot be folded
+├── FoldInterrupted             1  a fold ended in the midst of an event and is of no use
 └── DatabaseError               1  a database cannot be used as asked
     ├── DatabaseUnavailable     1  no server answers, or it refused the connection
     ├── ExtensionMissing        1  the server lacks AGE or pgvector
@@ -49,6 +50,16 @@ class FoldError(MapfoldError):
     def __reduce__(self) -> tuple[type["FoldError"], tuple[int, str]]:
         """Pickle the arguments, not the message, so that it passes between processes."""
         return FoldError, (self.offset, self.reason)
+
+
+class FoldInterrupted(MapfoldError):
+    """A fold ended in the midst of the event before ``next_offset``: it is of no use any more."""
+
+    def __init__(self, next_offset: Offset) -> None:
+        super().__init__(
+            f"this fold was interrupted at the event at offset {next_offset - 1}; fold the log"
+            " again from its start or from a snapshot"
+        )
 
 
 class ImpossibleCommand(FoldError):

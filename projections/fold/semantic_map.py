@@ -83,7 +83,8 @@ Reducer: TypeAlias = (
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
 
-    ``next_offset`` is one past the last event folded or skipped.
+    ``next_offset`` is one past the last event folded or skipped. It is set before an event changes
+    anything else, so that what follows the fold can tell an interrupted one by it.
     """
 
     def __init__(self, settings: Settings, corrections: Corrections = NO_CORRECTIONS) -> None:
@@ -208,8 +209,8 @@ class SemanticMap:
         """
         if not corrections.differs_in_names_only(self.corrections):
             raise ValueError("these corrections differ in more than names; fold the log again")
+        self.corrections = corrections  # first: see `LiveFold`
         older, self.names = self.names, PlaceNames(corrections.names)
-        self.corrections = corrections
         self._anchors = self._all_anchors()
         self._is_corrected = self._edits_events or bool(self._anchors)
         for anchor in self.names.newest:

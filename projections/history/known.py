@@ -120,7 +120,7 @@ class KnownHistory:
     def _history_of(self, end: Offset) -> StoredHistory:
         """The history of ``end`` events or more."""
         tables = self._recorder.up_to(end)
-        if self._history is None or self._history.next_offset != tables.end:
+        if self._history is None or self._history.tables is not tables:
             self._index = None
             self._history = StoredHistory(
                 self.settings, self.corrections, tables, partial(map_at, self.reader)

@@ -244,8 +244,7 @@ class _Fold:
         self.map = new_map(reader, settings, corrections)
         self.view = MapView(settings, keep_embeddings=False, corrections=corrections)
         self._map_at = partial(map_at, reader)
-        self._tables = Tables()
-        self._writer = TableWriter(self._tables)
+        self._writer = TableWriter(Tables())
         self.seconds = 0.0
         objects_merge = bool(corrections.same) or settings.fusion == "evidence"
         self._needed = _PLACE_DELTAS | _OBJECT_DELTAS if objects_merge else _PLACE_DELTAS
@@ -256,9 +255,8 @@ class _Fold:
         self._writer.add(offset, [delta for delta in deltas if type(delta) in self._needed])
 
     def result(self, truth: "Truth | None", *, keep_view: bool) -> FoldResult:
-        self._writer.flush()
-        view = self.view
-        history = StoredHistory(view.settings, view.corrections, self._tables, self._map_at)
+        view, tables = self.view, Tables(self._writer.finish())
+        history = StoredHistory(view.settings, view.corrections, tables, self._map_at)
         result = fold_result(view, history, truth, self.seconds)
         return replace(result, view=self.view) if keep_view else result
 

@@ -62,8 +62,8 @@ class Timeline:
         self._progress = progress
         self._note = note
         self._cache = cache
-        self._commands: list[RecordedCommand] = []
-        self._commands_end = FIRST_OFFSET
+        self._commands: tuple[list[RecordedCommand], Offset] = [], FIRST_OFFSET
+        """Those of the first events, and how many events these are."""
         self._compiled: dict[int, Corrections] = {}
         self._histories: dict[tuple[str, tuple[Offset, ...]], KnownHistory] = {}
 
@@ -86,11 +86,12 @@ class Timeline:
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> list[RecordedCommand]:
         """The commands recorded from ``start`` to before ``end``, undone ones too."""
+        commands, known = self._commands
         last = self.end if end is None else end
-        if self._commands_end < last:
-            self._commands += read_commands(self.reader, last, self._commands_end)
-            self._commands_end = last
-        return [recorded for recorded in self._commands if start <= recorded.offset < last]
+        if known < last:
+            commands = commands + read_commands(self.reader, last, known)
+            self._commands = commands, last
+        return [recorded for recorded in commands if start <= recorded.offset < last]
 
     def corrections(self, known_at: Offset | None = None) -> Corrections:
         """The corrections compiled from the commands before ``known_at``, from all for None."""

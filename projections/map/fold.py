@@ -128,8 +128,8 @@ def gc_paused() -> Iterator[None]:
     Afterwards all objects are in the oldest generation, so that the next search skips them.
     """
     was_on = gc.isenabled()
-    gc.disable()
     try:
+        gc.disable()
         yield
     finally:
         if was_on:

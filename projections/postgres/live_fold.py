@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from eventsrc.envelope.model import Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.errors import FoldError
+from projections.fold.errors import FoldError, FoldInterrupted
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker
@@ -16,7 +16,11 @@ from projections.map.view import MapView
 
 
 class LiveFold:
-    """The fold's state, its view without embeddings, and the tracker of the view's changes."""
+    """The fold's state, its view without embeddings, and the tracker of the view's changes.
+
+    The fold sets ``next_offset`` and ``corrections`` before it changes, the view after it has. So
+    they differ once an exception has come in between, and every later call raises FoldInterrupted.
+    """
 
     def __init__(
         self,
@@ -43,6 +47,7 @@ class LiveFold:
         After a failed event the map is as it was before it; the next step passes over the event.
         Events are read a stretch ahead, which is faster than one by one.
         """
+        self._check_whole()
         start = 0
         while start < len(events):
             waiting = iter(events[start:])
@@ -59,20 +64,27 @@ class LiveFold:
 
     def fold_parsed(self, events: Sequence[ParsedEvent]) -> None:
         """Fold events that are parsed. Raises FoldError at the first one that fails."""
+        self._check_whole()
         for event in events:
             self.tracker.apply_event(event.offset, fold_parsed(event, self.map), event.logged_ns)
 
     def use_names(self, offset: Offset, corrections: Corrections) -> None:
         """Apply the names of ``corrections``; the event at ``offset`` changed nothing else in them.
         The event must have been fed or skipped. Raises ValueError."""
-        deltas = self.map.use_names(offset, corrections)
+        self._check_whole()
+        self.tracker.apply_names(self.map.use_names(offset, corrections))
         self.view.corrections = corrections
-        self.tracker.apply_names(deltas)
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that is left out."""
+        self._check_whole()
         self.map.skip(offset)
         self.view.advance(Offset(offset + 1))
+
+    def _check_whole(self) -> None:
+        fold, view = self.map, self.view
+        if fold.next_offset != view.next_offset or fold.corrections is not view.corrections:
+            raise FoldInterrupted(fold.next_offset)
 
 
 def batches(

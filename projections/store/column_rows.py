@@ -34,7 +34,7 @@ from projections.fold.deltas import (
     RunSeen,
 )
 
-from .columns import STRIPE_EVENTS, stripe_of
+from .columns import STRIPE_EVENTS, Stripe, stripe_of
 from .records import EdgeChange, Merge, ObjectMerge, Refusal, cause_of
 from .tables import Tables, last_rows
 
@@ -90,11 +90,15 @@ _ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
 
 
 class TableWriter:
-    """Adds the rows of further events to ``tables``, in stripes of `STRIPE_EVENTS`."""
+    """Makes the rows of the events after those of ``tables``, in stripes of `STRIPE_EVENTS`.
+
+    ``end`` is the number of events whose rows are complete; an exception in the midst of an event
+    leaves it before that event.
+    """
 
     def __init__(self, tables: Tables) -> None:
-        self._tables = tables
-        self._start = self._end = tables.end
+        self.end = self._start = tables.end
+        self._stripes: list[Stripe] = []
         moved = tables.column("moved", "object")
         last = last_rows(moved, tables.count("found"))
         places = tables.rows_at("moved", last[last >= 0])
@@ -106,7 +110,6 @@ class TableWriter:
 
     def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
-        self._end = Offset(offset + 1)
         merges: list[PlacesMerged] = []
         moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]] = []
         links: list[EdgeChange] = []
@@ -131,15 +134,21 @@ class TableWriter:
                 self._document("refusal", refusal)
         for merge in merges:
             self._places_merged(offset, deltas, merge, moves, links)
-        if self._end - self._start == STRIPE_EVENTS:
-            self.flush()
+        end = Offset(offset + 1)
+        if end - self._start == STRIPE_EVENTS:
+            self._end_stripe(end)
+        self.end = end
 
-    def flush(self) -> None:
-        """Add the rows of the events since the last stripe."""
-        if self._end > self._start:
-            self._tables.add(stripe_of(self._start, self._end, self._rows))
-            self._start = self._end
-            self._rows.clear()
+    def finish(self) -> list[Stripe]:
+        """The stripes of all events that were added; called once, after the last of them."""
+        if self.end > self._start:
+            self._end_stripe(self.end)
+        return self._stripes
+
+    def _end_stripe(self, end: Offset) -> None:
+        self._stripes.append(stripe_of(self._start, end, self._rows))
+        self._start = end
+        self._rows.clear()
 
     def _document(self, table: str, record: Merge | Refusal | ObjectMerge) -> None:
         text = msgspec.json.encode(record).decode()

@@ -1,11 +1,17 @@
 """Folds a log into the tables of a history, from the end of the cached history on.
 
 Long folds are cached beside the log, so that the next process folds only later events.
+
+**An interrupted fold is continued or discarded.** An exception, such as that of Ctrl-C, can come at
+any moment. A fold raises its ``next_offset`` before an event changes it, and a `TableWriter` its
+``end`` when the rows of the event are complete. So the two agree exactly between events, and only
+then are fold and tables kept, both by one assignment. Until then there are the tables from before.
 """
 
-from collections.abc import Callable
-from typing import Final, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, TypeAlias
 
+from eventsrc.base.errors import LogError
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
@@ -17,7 +23,7 @@ from projections.map.fold import READ_AHEAD, fold_events, gc_paused, parse_event
 from projections.map.space_vectors import new_map
 
 from .column_rows import TableWriter
-from .columns import Stripe
+from .columns import STRIPE_EVENTS, Stripe, joined
 from .tables import DamagedPart, Tables
 from .timeline_cache import TimelineCache
 
@@ -25,6 +31,16 @@ Progress: TypeAlias = Callable[[int, int], None]
 """Called with (events folded, events in all) from time to time."""
 
 _PROGRESS_EVERY: Final = 500
+
+
+class _Folded(NamedTuple):
+    """``map`` is the fold at the end of ``tables``, if it is in memory. The first ``read`` stripes
+    are from the cache, which has the first ``kept`` events."""
+
+    tables: Tables
+    map: SemanticMap | None = None
+    read: int = 0
+    kept: Offset = FIRST_OFFSET
 
 
 class HistoryRecorder:
@@ -41,84 +57,99 @@ class HistoryRecorder:
     ) -> None:
         self._reader, self._settings, self._corrections = reader, settings, corrections
         self._cache, self._progress = cache, progress
-        self._map: SemanticMap | None = None
-        self._tables: Tables | None = None
-        self._read = 0  # stripes that were read from the cache
-        self._kept = FIRST_OFFSET
+        self._folded: _Folded | None = None
 
     def has(self, end: Offset) -> bool:
         """Whether ``end`` events are folded, or in the cache."""
-        return end <= self._opened().end
+        return end <= self._opened().tables.end
 
     def up_to(self, end: Offset) -> Tables:
         """The tables of at least the first ``end`` events; folds those that are missing. Raises
         FoldError at a bad event; what was folded before it stays."""
-        tables = self._opened()
-        if tables.end < end:
+        if self._opened().tables.end < end:
             self._fold_on(end)
             self._keep()
-        return self._opened()
+        return self._opened().tables
 
-    def _opened(self) -> Tables:
-        if self._tables is None:
+    def _opened(self) -> _Folded:
+        if self._folded is None:
             found = self._cache.stripes(self._reader.next_offset) if self._cache else []
-            return self._start(found)
-        return self._tables
+            self._folded = self._of(found)
+        return self._folded
 
-    def _start(self, stripes: list[Stripe]) -> Tables:
-        self._tables, self._map = Tables(stripes, self._folded_again), None
-        self._read, self._kept = len(stripes), self._tables.end
-        return self._tables
+    def _of(self, stripes: list[Stripe]) -> _Folded:
+        tables = Tables(stripes, self._folded_again)
+        return _Folded(tables, None, len(stripes), tables.end)
 
     def _fold_on(self, end: Offset) -> None:
-        tables = self._opened()
-        if self._map is None and tables.end > FIRST_OFFSET:
-            self._map = self._cache.fold_at(tables.end) if self._cache else None
-            if self._map is None:
-                self._start([])
-        if self._map is None:
-            self._map = new_map(self._reader, self._settings, self._corrections)
-        self._fold(self._map, end)
-
-    def _fold(self, semantic_map: SemanticMap, end: Offset) -> None:
-        """Fold up to ``end`` and add the rows to the tables."""
-        tables = self._opened()
-        writer = TableWriter(tables)
-        events = self._reader.read(tables.end, end)
+        before = self._opened()
+        semantic_map = before.map
+        if semantic_map is None and self._cache is not None and before.tables.end > FIRST_OFFSET:
+            semantic_map = self._cache.fold_at(before.tables.end)
+        if semantic_map is None:
+            before = self._of([])
+            semantic_map = new_map(self._reader, self._settings, self._corrections)
+        self._folded = before._replace(map=None)  # as the fold is changed now
+        writer = TableWriter(before.tables)
         try:
-            with gc_paused():
-                for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
-                    writer.add(folded.offset, folded.deltas)
-                    if self._progress and folded.offset % _PROGRESS_EVERY == 0:
-                        self._progress(folded.offset, end)
+            self._fold(semantic_map, writer, end)
         finally:
-            writer.flush()
-            tables.shorten(self._read)
+            if semantic_map.next_offset == writer.end:  # else it ended in the midst of an event
+                found = [*before.tables.stripes, *writer.finish()]
+                tables = Tables(_with_short_joined(found, before.read), self._folded_again)
+                self._folded = before._replace(tables=tables, map=semantic_map)
+
+    def _fold(self, semantic_map: SemanticMap, writer: TableWriter, end: Offset) -> None:
+        """Fold up to ``end`` and add the rows."""
+        events = self._reader.read(semantic_map.next_offset, end)
+        with gc_paused():
+            for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
+                writer.add(folded.offset, folded.deltas)
+                if self._progress and folded.offset % _PROGRESS_EVERY == 0:
+                    self._progress(folded.offset, end)
         if self._progress:
             self._progress(end, end)
 
     def _keep(self) -> None:
-        tables = self._opened()
-        if self._cache is None or self._map is None or self._map.next_offset != tables.end:
+        folded = self._opened()
+        end = folded.tables.end
+        if self._cache is None or folded.map is None or folded.map.next_offset != end:
             return
-        if self._cache.is_worth(tables.end - self._kept):
-            self._cache.keep(tables.stripes, self._map)
-            self._kept = tables.end
+        if self._cache.is_worth(end - folded.kept):
+            self._cache.keep(folded.tables.stripes, folded.map)
+            self._folded = folded._replace(kept=end)
 
     def _folded_again(self, end: Offset, damage: DamagedPart) -> list[Stripe]:
         """The stripes of ``end`` events folded from the log again, after a cached part was
-        damaged."""
+        damaged. Raises LogError if the log has them no more."""
         if self._cache is not None:
             self._cache.forget(damage)
         # With a reader of its own: a map may be looked at after its timeline was closed.
         with LogReader(self._reader.path) as reader:
             again = HistoryRecorder(reader, self._settings, self._corrections, None, self._progress)
-            stripes = again.up_to(end).stripes
-            self._read, self._kept, self._map = 0, FIRST_OFFSET, None
-            if self._cache is not None and again._map is not None:
-                self._cache.keep(stripes, again._map)
-                self._kept = end
-        return stripes
+            if reader.log_id != self._reader.log_id or reader.next_offset < end:
+                raise LogError(
+                    f"{damage}, and the log at {reader.path} is another one now or has lost events;"
+                    " open it again"
+                )
+            tables = again.up_to(end)
+            folded = again._opened()
+            if self._cache is not None and folded.map is not None:
+                self._cache.keep(tables.stripes, folded.map)
+        return tables.stripes
+
+
+def _with_short_joined(stripes: Sequence[Stripe], first: int) -> list[Stripe]:
+    """The same rows, with the last stripes joined while they are short; those before the index
+    ``first`` stay."""
+    found = list(stripes)
+    while len(found) > first + 1:
+        *_, one, other = found
+        events = other.end - other.start
+        if other.end - one.start > STRIPE_EVENTS or 2 * events < one.end - one.start:
+            break
+        found[-2:] = [joined([one, other])]
+    return found
 
 
 def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:

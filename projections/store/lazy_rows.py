@@ -17,7 +17,7 @@ class Chunks(Sequence[_T]):
     """A sequence of ``count`` items; ``make(first, last)`` returns those from ``first`` to before
     ``last``.
 
-    Indexing keeps the chunks made last; iterating keeps none.
+    Indexing keeps some of the chunks made last; iterating keeps none. For many threads.
     """
 
     __slots__ = ("_count", "_kept", "_make")
@@ -43,12 +43,14 @@ class Chunks(Sequence[_T]):
         if not 0 <= at < self._count:
             raise IndexError(f"{index} of {self._count}")
         chunk, within = divmod(at, _KEPT)
-        if chunk not in self._kept:
+        made = self._kept.get(chunk)
+        if made is None:
             first = chunk * _KEPT
-            if len(self._kept) == _MOST_CHUNKS:
-                del self._kept[next(iter(self._kept))]
-            self._kept[chunk] = self._make(first, min(first + _KEPT, self._count))
-        return self._kept[chunk][within]
+            made = self._make(first, min(first + _KEPT, self._count))
+            if len(self._kept) >= _MOST_CHUNKS:
+                self._kept = {}  # all at once, as another thread may be reading it
+            self._kept[chunk] = made
+        return made[within]
 
     def __iter__(self) -> Iterator[_T]:
         for first in range(0, self._count, _AT_ONCE):

@@ -79,9 +79,10 @@ class StoredObject(ObjectRecord):
     def observations(self) -> list[ObservationOrdinal]:
         if self._made is None:
             moment, absorbed = self._moment, self.ordinal in self._moment.absorbed_objects
-            self._made = [] if absorbed else moment.sightings[self.ordinal].tolist()
+            made = [] if absorbed else moment.sightings[self.ordinal].tolist()
             if self.ordinal in moment.survivors_of_objects:
-                self._made.sort()
+                made.sort()
+            self._made = made  # when it is sorted: another thread may read it
         return self._made
 
     @observations.setter

@@ -4,8 +4,12 @@ Numbers are read as whole columns, which are put together from the stripes when 
 the span of rows. A stripe may lie in a file (`projections.store.part_file`), whose arrays raise
 `DamagedPart` when their checksum does not match; then the stripes are made again from the log and
 the look-up is repeated. The same log gives the same rows, so what was read before still holds.
+
+Rows are never added to tables: those of a log that has grown are others. So maps that were made
+from tables stay as they are, also while another thread folds on.
 """
 
+import threading
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
@@ -16,7 +20,7 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
-from .columns import NONE, STRIPE_EVENTS, TABLES, Array, Stripe, joined
+from .columns import NONE, TABLES, Array, Stripe
 
 Rows = NDArray[np.int64]
 _T = TypeVar("_T")
@@ -29,7 +33,7 @@ class DamagedPart(Exception):
 
 
 class Tables:
-    """Stripes in order, the first from the first event on.
+    """Stripes in order, the first from the first event on; for many threads.
 
     ``again`` makes the stripes up to an offset from the log; it is called when one is damaged.
     """
@@ -41,6 +45,7 @@ class Tables:
     ) -> None:
         self.stripes = list(stripes)
         self._again = again
+        self._repair = threading.Lock()
         self._columns: dict[str, Array] = {}
         self._groups: dict[str, Groups] = {}
         self._unreleased = 0  # rows that were read
@@ -49,21 +54,6 @@ class Tables:
     def end(self) -> Offset:
         """The number of events."""
         return self.stripes[-1].end if self.stripes else FIRST_OFFSET
-
-    def add(self, stripe: Stripe) -> None:
-        """Add the rows of the events after `end`."""
-        self.stripes.append(stripe)
-        self._columns.clear()
-        self._groups.clear()
-
-    def shorten(self, first: int) -> None:
-        """Join stripes from the index ``first`` on where neighbours are short."""
-        while len(self.stripes) > first + 1:
-            *_, one, other = self.stripes
-            events = other.end - other.start
-            if other.end - one.start > STRIPE_EVENTS or 2 * events < one.end - one.start:
-                return
-            self.stripes[-2:] = [joined([one, other])]
 
     def count(self, table: str) -> int:
         """The number of rows of a table."""
@@ -163,13 +153,14 @@ class Tables:
 
     def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
         """`rows_at`; of each stripe only the requested rows are read."""
-        bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in self.stripes)])
+        stripes = self.stripes
+        bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in stripes)])
         within = np.searchsorted(bounds, numbers, "right") - 1
         found: list[tuple[Any, ...]] = []
         places: list[Array] = []
         for index in np.unique(within).tolist():
             here = np.flatnonzero(within == index)
-            found += _picked(self.stripes[index], table, numbers[here] - bounds[index])
+            found += _picked(stripes[index], table, numbers[here] - bounds[index])
             places.append(here)
             self._release()
         if len(places) < 2:
@@ -191,9 +182,10 @@ class Tables:
 
     def _spans(self, table: str, first: int, last: int) -> Iterator[tuple[Stripe, int, int]]:
         """The stripes that have rows of a span, each with the span in its own rows."""
-        counts = [stripe.rows.get(table, 0) for stripe in self.stripes]
+        stripes = self.stripes
+        counts = [stripe.rows.get(table, 0) for stripe in stripes]
         for stripe, count, before in zip(
-            self.stripes, counts, accumulate(counts, initial=0), strict=False
+            stripes, counts, accumulate(counts, initial=0), strict=False
         ):
             a, b = max(first - before, 0), min(last - before, count)
             if a < b:
@@ -203,15 +195,10 @@ class Tables:
         try:
             return look_up()
         except DamagedPart as damage:
-            if self._again is None:
-                raise
-            again, end = self._again, self.end
-            self._again = None
-            try:
-                self.stripes = list(again(end, damage))
-            finally:
-                self._again = again
-            self._columns.clear()
+            with self._repair:
+                if self._again is not None:  # else another thread did, or there is no way to
+                    self.stripes = list(self._again(self.end, damage))
+                    self._again, self._columns = None, {}
             return look_up()
 
 

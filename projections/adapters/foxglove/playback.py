@@ -116,8 +116,7 @@ class PastMaps:
         self.moments = Moments(reader.read(FIRST_OFFSET, end))
         self._lines: list[tuple[Offset, str]] = []
         self._merges: list[PlacesMerged] = []
-        tables = Tables()
-        writer = TableWriter(tables)
+        writer = TableWriter(Tables())
         view = MapView(settings, keep_embeddings=False, corrections=corrections)
         semantic_map = new_map(reader, settings, corrections)
         events = reader.read(FIRST_OFFSET, end)
@@ -128,8 +127,8 @@ class PastMaps:
                 self._lines += ((offset, line) for line in change_lines(view, deltas))
                 self._merges += (delta for delta in deltas if isinstance(delta, PlacesMerged))
                 progress(offset, end)
-        writer.flush()
         self.floors = list(view.maps)
+        tables = Tables(writer.finish())
         self._history = StoredHistory(settings, corrections, tables, partial(map_at, reader))
 
     def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:

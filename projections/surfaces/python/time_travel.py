@@ -1,7 +1,10 @@
 """`Timeline` for scripts and notebooks: maps of one log at any point, and how they came about."""
 
+import functools
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log.seek import resolve
@@ -13,6 +16,19 @@ from projections.history.merges import merge_document
 from .folding import SettingsLike, settings_from
 from .map import Map
 
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def _one_at_a_time(ask: _Method) -> _Method:
+    """A method of `Timeline` for which other threads wait."""
+
+    @functools.wraps(ask)
+    def waiting(self: "Timeline", *args: Any, **kwargs: Any) -> Any:
+        with self._lock:
+            return ask(self, *args, **kwargs)
+
+    return cast("_Method", waiting)
+
 
 class Timeline:
     """A context manager over a log. A point is a number of events, a time in ISO 8601,
@@ -22,6 +38,9 @@ class Timeline:
     (``LOG.history``, a cache), unless ``cache`` is false. ``settings`` are as in `fold`. Answers
     are the documents that the commands print with ``--json``. Raises LogNotFound, NotALog,
     LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
+
+    Several threads may ask one timeline; they are answered one after another. A question that is
+    interrupted, by Ctrl-C or the stop button of a notebook, can be asked again.
 
     Examples:
         >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
@@ -34,6 +53,7 @@ class Timeline:
     def __init__(
         self, log: str | Path, settings: SettingsLike = None, *, cache: bool = True
     ) -> None:
+        self._lock = threading.RLock()
         self._log = Path(log)
         self._chosen = settings_from(settings)
         self._timeline = history.Timeline(self._log, self._settings, cache=cache)
@@ -44,26 +64,35 @@ class Timeline:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @_one_at_a_time
     def close(self) -> None:
         """Close the log."""
         self._timeline.reader.close()
 
     @property
     def end(self) -> int:
-        """The number of events."""
+        """The number of events as of opening or the last `refresh`."""
         return self._timeline.end
 
+    @_one_at_a_time
+    def refresh(self) -> int:
+        """Include the events recorded since; returns the new `end`."""
+        return self._timeline.refresh()
+
+    @_one_at_a_time
     def at(self, point: int | str = "end") -> Map:
         """The map at a point. It has no embeddings: ask a map of `fold` by `relocalize`."""
         end = self._offset(point)
         return Map(self._timeline.at(end), end)
 
+    @_one_at_a_time
     def merges(self, point: int | str = "end") -> list[dict[str, Any]]:
         """Every merge of places up to a point, as ``mapfold merges --json``."""
         end = self._offset(point)
         known = self._timeline.knowing(end)
         return [merge_document(known.covering(end), each) for each in known.merges(end)]
 
+    @_one_at_a_time
     def why(self, thing: str, point: int | str = "end") -> dict[str, Any]:
         """The history of a place or an object, as ``mapfold why --json``.
 
@@ -71,14 +100,17 @@ class Timeline:
         """
         return self._timeline.why(thing, self._offset(point)).document()
 
+    @_one_at_a_time
     def why_same(self, first: str, second: str, point: int | str = "end") -> dict[str, Any]:
         """Since when, and by which merges, two keyframes (``RUN:KEYFRAME``) are in one place."""
         return self._timeline.why_same(first, second, self._offset(point)).document()
 
+    @_one_at_a_time
     def diff(self, start: int | str, end: int | str = "end") -> dict[str, Any]:
         """The difference between the maps at two points, as ``mapfold diff --json``."""
         return self._timeline.diff(self._offset(start), self._offset(end)).document()
 
+    @_one_at_a_time
     def bisect(
         self, condition: str, start: int | str = 0, end: int | str = "end"
     ) -> dict[str, Any]:
@@ -99,8 +131,9 @@ class Timeline:
 
         Each alternative is a whole set of settings, as in `fold`.
         """
-        end = self._offset(point)
-        corrections = self._timeline.corrections(end)
+        with self._lock:
+            end = self._offset(point)
+            corrections = self._timeline.corrections(end)
         others = [settings_from(each)(corrections) for each in alternatives]
         base = self._chosen(corrections)
         return history.what_if(self._log, base, others, end, processes=1).document()
