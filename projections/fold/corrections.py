@@ -15,10 +15,10 @@ had always been known, but only from the offset where it was recorded.
 """
 
 import hashlib
-import heapq
-import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeAlias
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from functools import cached_property
+from typing import NamedTuple
 
 import msgspec
 
@@ -35,7 +35,6 @@ from eventsrc.envelope.commands import (
     KeepApart,
     NamePlace,
     Reembed,
-    RigidTransform,
     SameObject,
     Undo,
     UndoMerge,
@@ -45,10 +44,8 @@ from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import DetId, Envelope, KeyframeId, Offset, RunId
 
 from .pair_groups import without_contradictions
+from .pose_corrections import Pose, PoseCorrection, PoseCorrections
 from .settings import Settings
-
-Pose: TypeAlias = tuple[float, float, float]
-"""Metres, metres, radians."""
 
 
 class Keyframe(NamedTuple):
@@ -73,32 +70,7 @@ class RecordedCommand(NamedTuple):
     command: Command
 
 
-class PoseCorrection(NamedTuple):
-    """One command's correction of a run's poses: ``poses`` by keyframe, or ``transform`` of the
-    keyframes from ``first`` to ``last``, None for no bound."""
-
-    poses: dict[KeyframeId, Pose]
-    transform: RigidTransform | None
-    first: KeyframeId | None
-    last: KeyframeId | None
-
-    def corrected(self, keyframe_id: KeyframeId, pose: Pose | None) -> Pose | None:
-        """A keyframe's pose after this; a transform gives none to one that has none."""
-        return self.poses.get(keyframe_id) if pose is None else self.apply(keyframe_id, pose)
-
-    def apply(self, keyframe_id: KeyframeId, pose: Pose) -> Pose:
-        """A keyframe's corrected pose: metres, metres, radians."""
-        if self.transform is None:
-            return self.poses.get(keyframe_id, pose)
-        if self.first is not None and keyframe_id < self.first:
-            return pose
-        if self.last is not None and keyframe_id > self.last:
-            return pose
-        t, (x, y, yaw) = self.transform, pose
-        return (t.cos * x - t.sin * y + t.dx, t.sin * x + t.cos * y + t.dy, yaw + t.dyaw)
-
-
-class Corrections(msgspec.Struct, frozen=True, eq=False):
+class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     """The compiled corrections of a fold; `compile_corrections` makes them. Pairs are in ascending
     order.
 
@@ -110,7 +82,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
     forgotten_runs: frozenset[RunId] = frozenset()
     forgotten_ranges: dict[RunId, tuple[tuple[KeyframeId, KeyframeId], ...]] = {}
     dropped: frozenset[DetId] = frozenset()
-    poses: dict[RunId, tuple[PoseCorrection, ...]] = {}
+    poses: dict[RunId, PoseCorrections] = {}
     apart: tuple[tuple[Keyframe, Keyframe], ...] = ()
     joined: tuple[tuple[Keyframe, Keyframe], ...] = ()
     different: tuple[tuple[DetId, DetId], ...] = ()
@@ -123,6 +95,10 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
         """16 hex digits that are equal for equal corrections; empty if there are none that change
         the fold. The log's settings are not part of it: they have a fingerprint of their own. Nor
         are vectors, which only a map of their space has (`map_fingerprint`)."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> str:
         rows = self._canonical()
         if not any(rows):
             return ""
@@ -139,6 +115,10 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
 
     def without_names(self) -> "Corrections":
         """These corrections without names of places, which change nothing else."""
+        return self._nameless if self.names else self
+
+    @cached_property
+    def _nameless(self) -> "Corrections":
         return msgspec.structs.replace(self, names=())
 
     def differs_in_names_only(self, other: "Corrections") -> bool:
@@ -156,24 +136,41 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
 
     def is_forgotten(self, run_id: RunId, keyframe_id: KeyframeId) -> bool:
         """Whether a keyframe is left out of the fold."""
-        ranges = self.forgotten_ranges.get(run_id, ())
-        return run_id in self.forgotten_runs or any(a <= keyframe_id <= b for a, b in ranges)
+        if run_id in self.forgotten_runs:
+            return True
+        starts, ends = self._forgotten.get(run_id, ((), ()))
+        at = bisect_right(starts, keyframe_id) - 1
+        return at >= 0 and keyframe_id <= ends[at]
+
+    @cached_property
+    def _forgotten(self) -> dict[RunId, tuple[list[KeyframeId], list[KeyframeId]]]:
+        """The first and the last keyframes of the forgotten ranges of each run, which are ascending
+        and have no keyframe in common."""
+        found = {}
+        for run_id, ranges in self.forgotten_ranges.items():
+            starts, ends = list[KeyframeId](), list[KeyframeId]()
+            for first, last in sorted(ranges):
+                if ends and first <= ends[-1]:
+                    ends[-1] = max(last, ends[-1])
+                else:
+                    starts.append(first)
+                    ends.append(last)
+            found[run_id] = starts, ends
+        return found
 
     def pose(self, envelope: Envelope) -> Pose | None:
         """The envelope's corrected pose, metres and radians; None if it has none."""
-        pose = _logged_pose(envelope)
-        for correction in self.poses.get(envelope.run_id, ()):
-            pose = correction.corrected(envelope.keyframe_id, pose)
-        return pose
+        pose, own = logged_pose(envelope), self.poses.get(envelope.run_id)
+        return pose if own is None else own.corrected(envelope.keyframe_id, pose)
 
     def pose_command(self, envelope: Envelope, is_good: Callable[[Pose], bool]) -> RecordedCommand:
         """The command that invalidates the envelope's pose: the last one that turns a good pose
         into one that is not. Raises ValueError if the corrected pose is good."""
-        pose, good, found = _logged_pose(envelope), True, None
+        pose, good, found = logged_pose(envelope), True, None
         for recorded in self.in_force:
             command = recorded.command
             if isinstance(command, CorrectPoses) and command.run_id == envelope.run_id:
-                pose = _pose_correction(command).corrected(envelope.keyframe_id, pose)
+                pose = PoseCorrection.of(command).corrected(envelope.keyframe_id, pose)
                 was_good, good = good, pose is None or is_good(pose)
                 found = None if good else recorded if was_good else found
         if found is None:
@@ -192,7 +189,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False):
             sorted(self.forgotten_runs),
             sorted(self.forgotten_ranges.items()),
             sorted(self.dropped),
-            [(run, _normal_order(cs)) for run, cs in sorted(self.poses.items())],
+            [(run, each.normal_order) for run, each in sorted(self.poses.items())],
             sorted(self.apart),
             sorted(self.joined),
             sorted(self.different),
@@ -241,8 +238,8 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     ranges: dict[RunId, list[tuple[KeyframeId, KeyframeId]]] = {}
     dropped: set[DetId] = set()
     poses: dict[RunId, list[PoseCorrection]] = {}
-    places: list[tuple[tuple[Keyframe, Keyframe], bool]] = []
-    objects: list[tuple[tuple[DetId, DetId], bool]] = []
+    places: list[tuple[tuple[Keyframe, ...], bool]] = []
+    objects: list[tuple[tuple[DetId, ...], bool]] = []
     names: list[PlaceName] = []
     settings: Settings | None = None
     reembedded: list[Reembed] = []
@@ -251,9 +248,9 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
             case NamePlace():
                 names.append(PlaceName(_keyframe(command.place), command.name, offset))
             case KeepApart() | UndoMerge():
-                places += [(pair, False) for pair in _pairs(command.places)]
-            case Join():
-                places += [(pair, True) for pair in _pairs(command.places)]
+                places.append((_keyframes(command.places), False))
+            case Join() if len(joined_places := _keyframes(command.places)) > 1:
+                places.append((joined_places, True))
             case SameObject() | DifferentObjects():
                 first, second = sorted(command.det_ids)
                 objects.append(((first, second), isinstance(command, SameObject)))
@@ -264,12 +261,12 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
             case ForgetKeyframes():
                 ranges.setdefault(command.run_id, []).append((command.first, command.last))
             case CorrectPoses():
-                poses.setdefault(command.run_id, []).append(_pose_correction(command))
+                poses.setdefault(command.run_id, []).append(PoseCorrection.of(command))
             case UseSettings():
                 settings = Settings.from_document(command.settings)
             case Reembed():
                 reembedded.append(command)
-            case Undo():
+            case Join() | Undo():
                 pass
     joined, apart = without_contradictions(places)
     same, different = without_contradictions(objects)
@@ -278,7 +275,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         forgotten_runs=frozenset(runs),
         forgotten_ranges={run: tuple(sorted(set(rs))) for run, rs in ranges.items()},
         dropped=frozenset(dropped),
-        poses={run: tuple(cs) for run, cs in poses.items()},
+        poses={run: PoseCorrections(each) for run, each in poses.items()},
         apart=tuple(apart),
         joined=tuple(joined),
         different=tuple(different),
@@ -302,76 +299,12 @@ def _keyframe(anchor: Anchor) -> Keyframe:
     return Keyframe(anchor.run_id, anchor.keyframe_id)
 
 
-def _logged_pose(envelope: Envelope) -> Pose | None:
+def logged_pose(envelope: Envelope) -> Pose | None:
+    """The envelope's pose as it was recorded, metres and radians; None if it has none."""
     x, y, yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
     return None if x is None or y is None or yaw is None else (x, y, yaw)
 
 
-def _pose_correction(command: CorrectPoses) -> PoseCorrection:
-    poses = {p.keyframe_id: (p.x, p.y, p.yaw) for p in command.poses}
-    return PoseCorrection(poses, command.transform, command.first, command.last)
-
-
-def _normal_order(corrections: Sequence[PoseCorrection]) -> list[object]:
-    """One run's corrections, in an order that is the same for all orders with equal results.
-
-    Two that have no keyframe in common can change places. So of those that need not come after one
-    that is left, the one with the smallest row is next.
-    """
-    reaches = [_reach(correction) for correction in corrections]
-    heads = {n: (_row(correction), n) for n, correction in enumerate(corrections)}
-    after: dict[int, list[int]] = {n: [] for n in heads}
-    waits = dict.fromkeys(heads, 0)
-    for n, (low, high) in enumerate(reaches):
-        for earlier, (first, last) in enumerate(reaches[:n]):
-            if first <= high and low <= last:
-                bounds = max(low, first), min(high, last)
-                if _overlap(corrections[earlier], corrections[n], *bounds):
-                    after[earlier].append(n)
-                    waits[n] += 1
-    ready = [heads[n] for n in heads if not waits[n]]
-    heapq.heapify(ready)
-    ordered = list[object]()
-    while ready:
-        row, n = heapq.heappop(ready)
-        ordered.append(row)
-        for later in after[n]:
-            waits[later] -= 1
-            if not waits[later]:
-                heapq.heappush(ready, heads[later])
-    return ordered
-
-
-def _row(correction: PoseCorrection) -> tuple[object, ...]:
-    """All of a correction, in values that have an order. An empty tuple stands for none."""
-    bounds = [() if bound is None else (bound,) for bound in (correction.first, correction.last)]
-    return sorted(correction.poses.items()), _numbers(correction.transform), *bounds
-
-
-def _reach(correction: PoseCorrection) -> tuple[float, float]:
-    """The smallest and the greatest keyframe that a correction can change."""
-    if correction.transform is None:
-        return min(correction.poses), max(correction.poses)
-    first, last = correction.first, correction.last
-    return -math.inf if first is None else first, math.inf if last is None else last
-
-
-def _overlap(one: PoseCorrection, other: PoseCorrection, low: float, high: float) -> bool:
-    """Whether two corrections have a keyframe in common, of those from ``low`` to ``high``, which
-    both reach."""
-    if low > high:
-        return False
-    sets = sorted((c.poses for c in (one, other) if c.transform is None), key=len)
-    if len(sets) == 2:
-        return not sets[0].keys().isdisjoint(sets[1])
-    return not sets or any(low <= keyframe <= high for keyframe in sets[0])
-
-
-def _pairs(anchors: tuple[Anchor, ...]) -> list[tuple[Keyframe, Keyframe]]:
-    """Every two different anchors, the smaller one first."""
-    keyframes = sorted({_keyframe(anchor) for anchor in anchors})
-    return [(a, b) for i, a in enumerate(keyframes) for b in keyframes[i + 1 :]]
-
-
-def _numbers(transform: RigidTransform | None) -> tuple[float, ...]:
-    return () if transform is None else tuple(transform.model_dump().values())
+def _keyframes(anchors: tuple[Anchor, ...]) -> tuple[Keyframe, ...]:
+    """The different keyframes among anchors, ascending."""
+    return tuple(sorted({_keyframe(anchor) for anchor in anchors}))

@@ -7,19 +7,20 @@ keyframe without a pose it is left out.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from eventsrc.base.advised import command_line
 from eventsrc.base.text import visible
 from eventsrc.envelope.ingest import Accepted
-from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, Offset
+from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, Offset, RunId
 
-from .corrections import Corrections
+from .corrections import Corrections, logged_pose
 from .envelope_evidence import small_angle
 from .errors import ImpossibleCommand
 from .exact import Units
 from .exact_functions import cos_sin
+from .pose_corrections import Pose
 
 
 class EditedEvent(NamedTuple):
@@ -30,43 +31,63 @@ class EditedEvent(NamedTuple):
     dropped: tuple[DetId, ...]
 
 
-def edits_events(corrections: Corrections) -> bool:
-    """Whether `edit_event` can change any event."""
-    c = corrections
-    return bool(c.forgotten_runs or c.forgotten_ranges or c.dropped or c.poses)
+class EventEdits:
+    """The corrections of single events."""
+
+    def __init__(self, corrections: Corrections) -> None:
+        c = self._corrections = corrections
+        self.any = bool(c.forgotten_runs or c.forgotten_ranges or c.dropped or c.poses)
+        """Whether any event can be changed."""
+        self.expects = any(poses.are_many for poses in c.poses.values())
+        """Whether `expect` saves time."""
+        self._expected: dict[Offset, Pose | None] = {}
+
+    def expect(self, coming: Iterable[tuple[Offset, Envelope]]) -> None:
+        """Correct the poses of the envelopes that come next: many at once, which is quicker."""
+        by_run: dict[RunId, list[tuple[Offset, Envelope]]] = {}
+        for offset, envelope in coming:
+            by_run.setdefault(envelope.run_id, []).append((offset, envelope))
+        self._expected = {}
+        for run_id, events in by_run.items():
+            own = self._corrections.poses.get(run_id)
+            if own is not None and own.are_many:
+                poses = own.corrected_poses([(e.keyframe_id, logged_pose(e)) for _, e in events])
+                offsets = (offset for offset, _ in events)
+                self._expected.update(zip(offsets, poses, strict=True))
+
+    def edited(
+        self, offset: Offset, accepted: Accepted, units: Sequence[Units | None] | None
+    ) -> EditedEvent | None:
+        """The corrected event; None if it is left out. ``units`` runs parallel to the detections.
+
+        Raises ImpossibleCommand for a pose that a correction moves out of the map.
+        """
+        corrections = self._corrections
+        envelope, dropped = accepted.envelope, corrections.dropped
+        if corrections.is_forgotten(envelope.run_id, envelope.keyframe_id):
+            return None
+        gone: tuple[DetId, ...] = ()
+        if dropped and not dropped.isdisjoint(accepted.det_ids):
+            gone = tuple(det_id for det_id in accepted.det_ids if det_id in dropped)
+            kept = corrections.kept(accepted)
+            units = None if units is None else [units[i] for i in kept]
+            detections = tuple(envelope.detections[i] for i in kept)
+            accepted = Accepted(
+                envelope.model_copy(update={"detections": detections}),
+                tuple(accepted.det_ids[i] for i in kept),
+                tuple(accepted.vectors[i] for i in kept),
+            )
+        if envelope.run_id in corrections.poses:
+            expected = self._expected
+            pose = expected[offset] if offset in expected else corrections.pose(envelope)
+            accepted = _with_pose(corrections, offset, accepted, pose)
+        return EditedEvent(accepted, units, gone)
 
 
-def edit_event(
-    corrections: Corrections,
-    offset: Offset,
-    accepted: Accepted,
-    units: Sequence[Units | None] | None,
-) -> EditedEvent | None:
-    """The corrected event; None if it is left out. ``units`` runs parallel to the detections.
-
-    Raises ImpossibleCommand for a pose that a correction moves out of the map.
-    """
-    envelope, dropped = accepted.envelope, corrections.dropped
-    if corrections.is_forgotten(envelope.run_id, envelope.keyframe_id):
-        return None
-    gone: tuple[DetId, ...] = ()
-    if dropped and not dropped.isdisjoint(accepted.det_ids):
-        gone = tuple(det_id for det_id in accepted.det_ids if det_id in dropped)
-        kept = corrections.kept(accepted)
-        units = None if units is None else [units[i] for i in kept]
-        accepted = Accepted(
-            envelope.model_copy(update={"detections": tuple(envelope.detections[i] for i in kept)}),
-            tuple(accepted.det_ids[i] for i in kept),
-            tuple(accepted.vectors[i] for i in kept),
-        )
-    if envelope.run_id in corrections.poses:
-        accepted = _with_pose(corrections, offset, accepted)
-    return EditedEvent(accepted, units, gone)
-
-
-def _with_pose(corrections: Corrections, offset: Offset, accepted: Accepted) -> Accepted:
+def _with_pose(
+    corrections: Corrections, offset: Offset, accepted: Accepted, pose: Pose | None
+) -> Accepted:
     envelope = accepted.envelope
-    pose = corrections.pose(envelope)
     if pose is None or pose == (envelope.map_x, envelope.map_y, envelope.map_yaw):
         return accepted
     x, y, yaw = pose

@@ -50,7 +50,7 @@ from .deltas import (
     RunSeen,
     SkipKind,
 )
-from .edited_events import edit_event, edits_events
+from .edited_events import EventEdits
 from .embedding_space import Reembedded, Space
 from .envelope_evidence import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
 from .evidence_fusion import EvidenceFusion
@@ -90,10 +90,10 @@ class SemanticMap:
     def __init__(self, settings: Settings, corrections: Corrections = NO_CORRECTIONS) -> None:
         self.settings = settings
         self.corrections = corrections
-        self._edits_events = edits_events(corrections)
+        self.event_edits = EventEdits(corrections)
         self.names = PlaceNames(corrections.names)
         self._anchors = self._all_anchors()
-        self._is_corrected = self._edits_events or bool(self._anchors)
+        self._is_corrected = self.event_edits.any or bool(self._anchors)
         self.next_offset = FIRST_OFFSET
         self.folded_ids = FoldedIds()
         self.floors = Floors(settings.floor_height_m)
@@ -134,8 +134,8 @@ class SemanticMap:
         """
         dropped: tuple[DetId, ...] = ()
         is_corrected = self._is_corrected
-        if is_corrected and self._edits_events:
-            edited = edit_event(self.corrections, offset, accepted, units)
+        if is_corrected and self.event_edits.any:
+            edited = self.event_edits.edited(offset, accepted, units)
             if edited is None:
                 self.next_offset = Offset(offset + 1)
                 run_id, keyframe_id = accepted.envelope.run_id, accepted.envelope.keyframe_id
@@ -212,7 +212,7 @@ class SemanticMap:
         self.corrections = corrections  # first: see `LiveFold`
         older, self.names = self.names, PlaceNames(corrections.names)
         self._anchors = self._all_anchors()
-        self._is_corrected = self._edits_events or bool(self._anchors)
+        self._is_corrected = self.event_edits.any or bool(self._anchors)
         for anchor in self.names.newest:
             keyframe = self.folded_ids.find(*anchor)
             if keyframe is not None:

@@ -3,9 +3,12 @@
 import gc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
+from math import ceil
 from typing import NamedTuple
 
-from eventsrc.envelope.ingest import Rejected
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, LogReader
@@ -23,6 +26,8 @@ from .snapshot_cache import SnapshotCache
 from .space_vectors import new_map, with_vectors
 from .view import MapView
 
+_MOST_AHEAD = 1024
+"""Events read ahead where poses are corrected together; they take 20 MB."""
 SNAPSHOT_MIN_EVENTS = 5_000
 """Events; folding fewer takes about as long as reading a snapshot of them."""
 
@@ -47,9 +52,36 @@ def fold_events(
     ``next_offset`` is that event's offset, and ``semantic_map.skip(offset)`` passes over it.
     Continue with another call from the offset after it; events read ahead are lost with this one.
     """
-    for stretch in parsed_stretches(events, ahead):
+    parsed = parsed_stretches(events, ahead)
+    if ahead > 1 and semantic_map.event_edits.expects:
+        parsed = _expected(parsed, semantic_map, ceil(_MOST_AHEAD / ahead))
+    for stretch in parsed:
         for event in stretch:
             yield FoldedEvent(event.offset, fold_parsed(event, semantic_map))
+
+
+def _expected(
+    parsed: Iterator[list[ParsedEvent]], semantic_map: SemanticMap, stretches: int
+) -> Iterator[list[ParsedEvent]]:
+    """The stretches of events, so many read ahead for `EventEdits.expect`. What precedes damage is
+    yielded before LogDamaged is raised."""
+    damage: LogDamaged | None = None
+    events: list[ParsedEvent] | None = None
+    while damage is None and events != []:
+        events = []
+        try:
+            for stretch in islice(parsed, stretches):
+                events += stretch
+        except LogDamaged as error:
+            damage = error
+        semantic_map.event_edits.expect(
+            (event.offset, event.parsed.envelope)
+            for event in events
+            if isinstance(event.parsed, Accepted)
+        )
+        yield events
+    if damage is not None:
+        raise damage
 
 
 def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
