@@ -1,13 +1,13 @@
 """The effect of a command on the map of the events before it: counts, and the whole difference."""
 
+import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted
-from eventsrc.envelope.commands import Command
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.commands import Command, UseSettings, encode_command
 from eventsrc.log import cache_folder, make_cache_folder, write_cache_file
 from projections.fold.corrections import (
     Corrections,
@@ -16,14 +16,15 @@ from projections.fold.corrections import (
     map_fingerprint,
 )
 from projections.fold.deltas import PlaceOrdinal
+from projections.fold.settings import Settings
 from projections.history.diff import Difference, difference_of, rows_of
 from projections.map.view import MapView
 
-from .current import CurrentMap
+from .current import CurrentMap, SettingsOf
 
 _CACHE = "effects.json"
 _COMPARING = "comparing the maps"
-_VERSION = 1
+_VERSION = 2
 """The version of cached effects; to be raised when a fold gives another map of the same log."""
 _MAX_CACHE_BYTES = 16 * 1024 * 1024
 
@@ -66,12 +67,6 @@ class Change:
     def by(cls, current: CurrentMap, command: Command) -> "Change":
         """The change made by one further command."""
         return cls(current, [*current.commands, RecordedCommand(current.end, command)])
-
-    @property
-    def identity(self) -> str:
-        """Equal for equal changes of one log."""
-        before = map_fingerprint(self.current.settings, self.current.corrections)
-        return f"{self.current.end} {before} {map_fingerprint(self.settings, self.corrections)}"
 
     @property
     def after(self) -> MapView:
@@ -130,7 +125,8 @@ def _differing(first: dict[Any, Any], second: dict[Any, Any]) -> set[Any]:
 
 
 class EffectCache:
-    """A cache of effects: ``<log>.snapshots/effects.json``, safe to delete."""
+    """A cache of effects: ``<log>.snapshots/effects.json``, safe to delete. Its keys are those of
+    `effect_keys`."""
 
     def __init__(self, current: CurrentMap) -> None:
         self._note = current.note
@@ -140,13 +136,13 @@ class EffectCache:
         self._path = cache_folder(log, "snapshots") / _CACHE
         self._effects = self._read()
 
-    def get(self, change: Change) -> Effect | None:
-        """The effect of a change, if it is known."""
-        return self._effects.get(change.identity)
+    def get(self, key: str) -> Effect | None:
+        """The effect of a command, if it is known."""
+        return self._effects.get(key)
 
-    def put(self, change: Change, effect: Effect) -> None:
+    def put(self, key: str, effect: Effect) -> None:
         """Keep an effect. A cache that cannot be written is left as it is, with a note."""
-        self._effects = {**self._read(), change.identity: effect}
+        self._effects = {**self._read(), key: effect}
         document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
         data = json.dumps(document).encode()
         try:
@@ -169,6 +165,37 @@ class EffectCache:
             return {}
 
 
+def cache_effect(current: CurrentMap, command: Command, effect: Effect) -> None:
+    """Keep the effect of a command that was recorded right behind the events of the map."""
+    commands = [*current.commands, RecordedCommand(current.end, command)]
+    *_, key = effect_keys(current.settings_of, commands)
+    EffectCache(current).put(key, effect)
+
+
+def effect_keys(settings_of: SettingsOf, commands: Iterable[RecordedCommand]) -> Iterator[str]:
+    """The key of the effect of each command of a log: the same for the same commands up to it and
+    the same settings under each that could be in force.
+
+    Made from the key before it, not from what the commands compile to: that would take as long for
+    each as for all.
+    """
+
+    def fingerprint_under(settings: Settings | None) -> str:
+        return settings_of(Corrections(settings=settings)).fingerprint()
+
+    known: dict[bytes, str] = {}
+    digest = hashlib.sha256(fingerprint_under(None).encode())
+    for offset, command in commands:
+        encoded = encode_command(command)
+        digest.update(f" {offset} {len(encoded)} ".encode() + encoded)
+        if isinstance(command, UseSettings):
+            named = json.dumps(command.settings).encode()
+            if named not in known:
+                known[named] = fingerprint_under(Settings.from_document(command.settings))
+            digest.update(known[named].encode())
+        yield digest.hexdigest()[:32]
+
+
 def effects_of(
     current: CurrentMap, known_only: bool
 ) -> list[tuple[RecordedCommand, Effect | None]]:
@@ -177,27 +204,32 @@ def effects_of(
     With ``known_only`` nothing is folded, and effects not in the cache are None.
     """
     cache = EffectCache(current)
-    corrections = compile_corrections(())
-    found: list[tuple[RecordedCommand, Effect | None]] = []
-    before: MapView | None = None
-    follows = Offset(-1)
-    for number, recorded in enumerate(current.commands):
+    keys = effect_keys(current.settings_of, current.commands)
+    known = [cache.get(key) for key in keys]
+    found = list(zip(current.commands, known, strict=True))
+    if known_only or None not in known:
+        return found
+    change: Change | None = None
+    keys = effect_keys(current.settings_of, current.commands)
+    for number, ((recorded, effect), key) in enumerate(zip(found, keys, strict=True)):
+        if effect is not None:
+            change = None
+            continue
         then = CurrentMap(
             current.reader,
             current.settings_of,
             until=recorded.offset,
             commands=current.commands[:number],
-            corrections=corrections,
+            corrections=None if change is None else change.corrections,
         )
-        if before is not None and recorded.offset == follows:
-            then.set_view(before)  # only commands in between, which change nothing by themselves
+        if (
+            change is not None
+            and change.known_after is not None
+            and recorded.offset == change.current.end + 1
+        ):  # a command changes nothing by itself
+            then.set_view(change.known_after)
         change = Change.by(then, recorded.command)
-        corrections = change.corrections
-        effect = cache.get(change)
-        before = None
-        if effect is None and not known_only:
-            effect = change.effect()
-            cache.put(change, effect)
-            before, follows = change.known_after, Offset(recorded.offset + 1)
-        found.append((recorded, effect))
+        effect = change.effect()
+        cache.put(key, effect)
+        found[number] = recorded, effect
     return found

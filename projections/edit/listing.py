@@ -1,6 +1,7 @@
 """The list of a log's commands, as text and as JSON."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 from eventsrc.base.advised import advised
@@ -55,13 +56,18 @@ def what(command: Command) -> str:
         case CorrectPoses():
             return f"{command.run_id}: {_poses(command)}"
         case UseSettings():
-            plain, given = Settings().by_name(), settings_by_name(command.settings)
+            plain, given = _default_settings(), settings_by_name(command.settings)
             changed = {name: value for name, value in given.items() if plain.get(name) != value}
             return ", ".join(assignment_texts(changed)) or "the defaults"
         case Reembed():
             return f"{counted(command.detections, 'detection')} in {command.space}"
         case Undo():
             return command.undone
+
+
+@cache
+def _default_settings() -> Mapping[str, Any]:
+    return Settings().by_name()
 
 
 def _name(anchor: Any) -> str:

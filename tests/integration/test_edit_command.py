@@ -19,7 +19,7 @@ from eventsrc.envelope.commands import Command, NamePlace, parse_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
 from projections.edit.current import CurrentMap
-from projections.edit.effect import Change, Effect, EffectCache, effect_of
+from projections.edit.effect import Change, Effect, effect_of
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
@@ -389,4 +389,3 @@ def test_a_change_that_is_none_is_folded_no_second_time(mapfold: Commands) -> No
         change = Change(current, current.commands)
         assert change.effect().none
         assert change.after is current.view
-        assert EffectCache(current).get(change) is None

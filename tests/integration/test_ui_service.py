@@ -1,14 +1,18 @@
 """The service behind the page without HTTP: folds given up, and how many maps are kept."""
 
+import asyncio
 import contextlib
 import json
 import multiprocessing
 import shutil
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from starlette.datastructures import QueryParams
+from starlette.requests import Request
+from starlette.types import Message
 
 from eventsrc.base.errors import LogError, MapfoldError
 from eventsrc.envelope.model import Offset
@@ -19,6 +23,7 @@ from projections.history import parallel
 from projections.history.parallel import Rules, fold_all
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
+from projections.surfaces.ui.app import create_app
 from projections.surfaces.ui.comparisons import whatif_answer
 from projections.surfaces.ui.edits import Edit, Editor
 from projections.surfaces.ui.live import LiveWatch
@@ -214,3 +219,30 @@ def test_other_settings_are_folded_as_far_as_the_log_is(log: Path, tmp_path: Pat
         assert service.ask(["eps_m=0.8"], digest).result(WAIT_S) == folded(
             grown, Settings(eps_m=0.8)
         )
+
+
+async def _stays() -> Message:
+    """A client that does not leave."""
+    await asyncio.Event().wait()
+    raise AssertionError
+
+
+def test_commands_are_listed_while_the_map_and_a_fold_are_busy(
+    service: UiService, log: Path
+) -> None:
+    """And the map answers while they are listed."""
+    held = threading.Event()
+    with LiveWatch(service) as watch:
+        app = create_app(service, watch)
+    service.ask([], digest).result(WAIT_S)
+    busy = [service.ask([], lambda *_: held.wait(WAIT_S))]
+    busy += [service.ask_apart(lambda *_: held.wait(WAIT_S))]
+    try:
+        (route,) = (each for each in app.routes if getattr(each, "path", "") == "/api/corrections")
+        request = Request({"type": "http", "query_string": b"", "headers": []}, _stays)
+        answer = asyncio.run(asyncio.wait_for(route.endpoint(request), WAIT_S))
+        assert json.loads(answer.body)["corrections"] == []
+        listing = service.ask_apart(lambda *_: held.wait(WAIT_S), folds=False)
+    finally:
+        held.set()
+    assert [each.result(WAIT_S) for each in [*busy, listing]] == [True] * 3

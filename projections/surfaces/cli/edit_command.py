@@ -17,7 +17,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.log import LogReader
 from eventsrc.record.transport.session import open_session
-from projections.edit.effect import EffectCache
+from projections.edit.effect import cache_effect
 from projections.edit.make import Stamp
 from projections.edit.outcome import void_text
 from projections.edit.record import Made, MakeCommand, make_command, record_command
@@ -208,7 +208,7 @@ def keep_effect(made: Made) -> None:
     their effect by it."""
     outcome = made.outcome
     if outcome.effect is not None and made.offset == made.current.end:
-        EffectCache(made.current).put(outcome.change, outcome.effect)
+        cache_effect(made.current, made.command, outcome.effect)
     _say_void(made)
 
 

@@ -191,15 +191,27 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     answers(
         "conditions", "The functions of conditions, and the error in one", conditions_answer, "text"
     )
-    answers("corrections", "The commands of the log, and what is undone", corrections_answer)
     answers("search", "Things whose name matches a text", search_answer, "q", "kind", *_AT_W)
     answers(
         "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W
     )
 
-    async def apart(request: Request, work: Callable[[Offset, GoOn], bytes]) -> Response:
-        content = await _awaited(request, functools.partial(service.ask_apart, work))
-        return Response(content, media_type="application/json")
+    async def apart(
+        request: Request, work: Callable[[Offset, GoOn], bytes], *, folds: bool = True
+    ) -> Response:
+        ask = functools.partial(service.ask_apart, work, folds=folds)
+        return Response(await _awaited(request, ask), media_type="application/json")
+
+    @app.get(
+        "/api/corrections",
+        summary="The commands of the log, and what is undone",
+        dependencies=[_only()],
+    )
+    async def corrections(request: Request) -> Response:
+        def work(end: Offset, go_on: GoOn) -> bytes:
+            return encoded(corrections_answer(service.opened, end, go_on))
+
+        return await apart(request, work, folds=False)
 
     @app.get(
         "/api/whatif",

@@ -11,16 +11,15 @@ from collections.abc import Callable
 from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, StrictStr, ValidationError
-from starlette.datastructures import QueryParams
 
 from eventsrc.base.errors import LogError, MisuseError
 from eventsrc.base.text import counted, visible, visible_lines
 from eventsrc.envelope.commands import Command
-from eventsrc.envelope.model import describe_error
+from eventsrc.envelope.model import Offset, describe_error
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import CurrentMap
-from projections.edit.effect import EffectCache, effects_of
+from projections.edit.effect import cache_effect, effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
 from projections.edit.outcome import void_text
@@ -30,7 +29,6 @@ from projections.fold.settings import Settings
 from projections.history.rendering import difference_text
 
 from .comparisons import MOST_LINES
-from .log_map import LogMap
 from .log_prefix import PrefixReader
 from .moment import command_line
 from .opened import Opened
@@ -120,20 +118,23 @@ KINDS: Final = {
 """The kinds of `mapfold edit` that the page can give; of ``correct-poses`` those by a transform."""
 
 
-def corrections_answer(shown: LogMap, _: QueryParams) -> dict[str, Any]:
-    """The commands of the log: author, reason, effect, and whether it is undone. Effects are given
-    only where they are known already."""
-    current = CurrentMap(shown.reader, shown.opened.settings)
-    found = effects_of(current, known_only=True)
-    times = {event.offset: event.logged_ns for event in current.command_events()}
+def corrections_answer(opened: Opened, through: int, go_on: Callable[[], None]) -> dict[str, Any]:
+    """The commands among the first ``through`` events: author, reason, effect, and whether it is
+    undone. Effects are given only where they are known already."""
+    with PrefixReader(opened.log, Offset(through), go_on) as reader:
+        current = CurrentMap(reader, opened.settings)
+        found = effects_of(current, known_only=True)
+        times = {event.offset: event.logged_ns for event in current.command_events()}
+    go_on()
     return {
+        "through": through,
         "corrections": [
             {**each, "text": visible(f"{each['kind']} {each['what']}")}
             for each in edits_document(found, times)
         ],
         "kinds": [{"kind": kind, "arguments": each.names} for kind, each in KINDS.items()],
         "lines": visible_lines(edits_text(found, times)).splitlines(),
-        "command": command_line(shown.opened, "edits", *shown.opened.words()),
+        "command": command_line(opened, "edits", *opened.words()),
     }
 
 
@@ -165,7 +166,7 @@ class Editor:
         )
         effect = made.outcome.effect
         if effect is not None and made.offset == made.current.end:
-            EffectCache(made.current).put(made.outcome.change, effect)
+            cache_effect(made.current, made.command, effect)
         return self._document(through, asked, made, notes)
 
     def _checked(self, make_: MakeCommand) -> MakeCommand:

@@ -1,8 +1,8 @@
 """The service of the page: the log's map under its own settings, and under a few others.
 
-Answers are made on two threads: one for the log's own map, one for maps under other settings and
-for answers whose folds take long. The first fold begins at once on the first of them. A fold is
-stopped when no client waits for it any more.
+Answers are made on three threads: one for the log's own map, one for maps under other settings and
+for answers whose folds take long, one for answers that read the log and fold nothing. The first
+fold begins at once on the first of them. A fold is stopped when no client waits for it any more.
 """
 
 import threading
@@ -113,6 +113,7 @@ class UiService:
         self._through = FIRST_OFFSET
         self._own = self._stack.enter_context(_Thread(self._ending))
         self._others = self._stack.enter_context(_Thread(self._ending))
+        self._reading = self._stack.enter_context(_Thread(self._ending))
         self._loaded = self._own.submit(self._load, _always, _WATCH)
 
     def __enter__(self) -> Self:
@@ -153,17 +154,23 @@ class UiService:
         return self._others.submit(lambda: work(*self._alternative(key)), wanted)
 
     def ask_apart(
-        self, work: Callable[[Offset, GoOn], Result], wanted: Callable[[], bool] = _always
+        self,
+        work: Callable[[Offset, GoOn], Result],
+        wanted: Callable[[], bool] = _always,
+        *,
+        folds: bool = True,
     ) -> "Future[Result]":
-        """Run ``work`` that reads the log itself and takes long; it gets the number of events that
-        answers cover, and a function to call while it folds."""
+        """Run ``work`` that reads the log itself, beside the questions to the map; it gets the
+        number of events that answers cover, and a function to call while it works. What ``folds``
+        takes long; what does not waits for no fold but the first."""
+        thread = self._others if folds else self._reading
 
         def asked() -> Result:
             wait([self._loaded])
             self._check_there()
-            return work(self._through, self._others.go_on)
+            return work(self._through, thread.go_on)
 
-        return self._others.submit(asked, wanted)
+        return thread.submit(asked, wanted)
 
     def refresh(self) -> "Future[bool]":
         """Look for new events; the result is whether there are any, or another problem."""

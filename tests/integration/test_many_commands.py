@@ -1,0 +1,123 @@
+"""Many commands of a kind: what they cost grows with their number."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.envelope.commands import CorrectPoses, RigidTransform, UseSettings
+from eventsrc.envelope.model import KeyframeId, RunId
+from eventsrc.log import LogReader
+from projections.edit.current import CurrentMap
+from projections.edit.effect import effect_keys, effects_of
+from projections.edit.listing import edits_document, edits_text
+from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
+from projections.map.digest import map_digest
+from projections.map.fold import fold_events, fold_log
+from projections.map.space_vectors import new_map
+from projections.map.view import MapView
+from tests.bench.commands import KINDS, commands_of, large_undo_merge, mixed, undone
+from tests.commands_in_logs import command
+from tests.corrected_logs import write_rooms
+
+SAMPLE = Path("logs/sample")
+EVERY = {**KINDS, "mixed": mixed}
+
+
+def calls_of(work: Callable[[], object]) -> int:
+    """The number of functions that are called, of Python and C."""
+    number = 0
+
+    def count(_: Any, event: str, __: Any) -> None:
+        nonlocal number
+        number += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return number
+
+
+def settings_of(corrections: Corrections) -> Settings:
+    return corrections.settings or Settings()
+
+
+@pytest.mark.parametrize("given", [commands_of, undone])
+@pytest.mark.parametrize("kind", EVERY.values(), ids=EVERY)
+def test_twice_the_commands_are_about_twice_the_work(kind: Any, given: Any) -> None:
+    """Compiling them, their fingerprint, a map without events and the list of them."""
+    events = [RecordedCommand(n, c) for n, c in enumerate(given(kind, 400))]
+
+    def all_of(commands: list[RecordedCommand]) -> None:
+        corrections = compile_corrections(commands)
+        corrections.fingerprint()
+        SemanticMap(Settings(), corrections)
+        with LogReader(SAMPLE) as reader:
+            current = CurrentMap(reader, settings_of, commands=commands, corrections=corrections)
+            found = effects_of(current, known_only=True)
+        times = {recorded.offset: 0 for recorded in commands}
+        edits_document(found, times)
+        edits_text(found, times)
+
+    all_of(events[:10])  # what is imported and cached
+    half, whole = (calls_of(lambda n=n: all_of(events[:n])) for n in (len(events) // 2, None))
+    assert whole < 2.6 * half
+
+
+def test_undone_merges_of_all_keyframes_are_compiled_as_sets() -> None:
+    """445 keyframes are 98,790 pairs; 20 commands of them are fewer calls than one has pairs."""
+    events = [RecordedCommand(n, c) for n, c in enumerate(commands_of(large_undo_merge, 20))]
+    assert calls_of(lambda: compile_corrections(events)) < len(compile_corrections(events).apart)
+
+
+def chains(n: int) -> list[RecordedCommand]:
+    """Transforms of a run and of parts of it, and stated poses, more than are applied singly."""
+    given = []
+    for number in range(n):
+        transform = RigidTransform.of(0.001 * number, 0.01, 0.1)
+        span = [None, KeyframeId(number % 24)][:: (-1) ** number]
+        given.append(
+            command(
+                CorrectPoses,
+                run_id=RunId("run-a"),
+                transform=transform,
+                first=span[0],
+                last=span[1],
+            )
+        )
+    return [RecordedCommand(30 + number, each) for number, each in enumerate(given)]
+
+
+def test_poses_corrected_together_make_the_map_of_poses_corrected_one_by_one(
+    tmp_path: Path,
+) -> None:
+    corrections = compile_corrections(chains(150))
+    with LogReader(write_rooms(tmp_path / "log")) as reader:
+        together = map_digest(fold_log(reader, Settings(), corrections=corrections)[1])
+        view = MapView(Settings(), corrections=corrections)
+        for folded in fold_events(reader.read(), new_map(reader, Settings(), corrections)):
+            view.apply_event(folded.offset, folded.deltas)
+    assert together == map_digest(view)
+    assert corrections.poses[RunId("run-a")].are_many
+
+
+def test_the_key_of_an_effect_is_of_the_commands_up_to_it_and_of_the_options() -> None:
+    named = [command(UseSettings, settings={"eps_m": eps}) for eps in (1.0, 1.5, 1.0)]
+    commands = [RecordedCommand(n, each) for n, each in enumerate([*named, *named])]
+    keys = list(effect_keys(settings_of, commands))
+    assert len(set(keys)) == len(commands)
+    assert list(effect_keys(settings_of, commands[:2])) == keys[:2]
+
+    def set_eps(corrections: Corrections) -> Settings:
+        return settings_of(corrections).with_assignments(["eps_m=1.5"])
+
+    others = list(effect_keys(set_eps, commands))
+    assert not set(others) & set(keys), "the same settings now, but not under each command"
+    moved = [RecordedCommand(each.offset + 1, each.command) for each in commands]
+    assert not set(effect_keys(settings_of, moved)) & set(keys)
