@@ -3,15 +3,18 @@ once, garbage in its folder, and a log that grows while it is read."""
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import pytest
 
+from eventsrc.base.errors import LogError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS
@@ -222,3 +225,37 @@ def test_numpy_reads_a_part(log: Path, right: str) -> None:
     (part,) = (path for path in kept(log) if path.suffix == ".npz")
     with np.load(part) as archive:
         assert archive["0/keyframe.keyframe_id"].tolist() == list(range(EVENTS))
+
+
+@pytest.mark.parametrize("cache", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("change", ["other log", "no log", "no history", "grown"])
+def test_an_open_timeline_whose_log_changes(log: Path, change: str, cache: bool) -> None:
+    with kept_early(), Timeline(log, RULES, cache=cache) as timeline:
+        before = told(timeline, [EVENTS, 100])
+        if change == "grown":
+            write_log(log, drive(EVENTS, EVENTS + 40))
+        elif change == "no history":
+            shutil.rmtree(log.with_name("log.history"), ignore_errors=True)
+        else:
+            shutil.rmtree(log)
+            if change == "other log":
+                write_log(log, drive(7, EVENTS + 80))
+        timeline.refresh()
+        with Timeline(log, RULES, cache=False) if change == "grown" else nullcontext() as fresh:
+            expected = before if fresh is None else told(fresh, [EVENTS, 100])
+        assert told(timeline, [EVENTS, 100]) == expected
+
+
+def test_damage_is_not_repaired_from_another_log(log: Path) -> None:
+    answers(log, [])
+    with kept_early(), Timeline(log, RULES) as timeline:
+        shown = timeline.at()  # which reads the keyframes later
+        for path in (path for path in kept(log) if path.suffix == ".npz"):
+            data = path.read_bytes()
+            manifest = data.index(b'{"about"')
+            with path.open("r+b") as file:  # the same file, as it is mapped
+                file.write(bytes(byte ^ 0x55 for byte in data[:manifest]))
+        shutil.rmtree(log)
+        write_log(log, drive(7, EVENTS + 80))
+        with pytest.raises(LogError, match="is another one now or has lost events; open it again"):
+            _ = [keyframe.timestamp for keyframe in shown.keyframes]
