@@ -8,6 +8,7 @@ from . import (
     damage,
     exposure,
     files,
+    interrupts,
     junk,
     kills,
     projections,
@@ -18,6 +19,7 @@ from . import (
 ATTACKS: dict[str, Attack] = {
     "kills": kills.attack,
     "files": files.attack,
+    "interrupts": interrupts.attack,
     "publishers": publishers.attack,
     "junk": junk.attack,
     "damage": damage.attack,
