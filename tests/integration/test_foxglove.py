@@ -158,14 +158,14 @@ def test_a_recording_has_the_walls_of_each_floor(mapfold: Commands, tmp_path: Pa
         (("--every", "3", "--dot", "m.dot"), "--every is for --foxglove"),
         (("--foxglove", "m.mcap", "--floor", "a"), "--foxglove shows all floors"),
         (("--foxglove", "file/m.mcap"), "file/m.mcap: cannot be written: File exists"),
-        (("--foxglove", "link.mcap"), "link.mcap: cannot be written: No such file or directory"),
+        (("--foxglove", "folder"), "folder: cannot be written: Is a directory"),
     ],
 )
 def test_what_cannot_be_recorded_is_said(
     mapfold: Commands, options: tuple[str, ...], says: str
 ) -> None:
     (mapfold.folder / "file").touch()
-    (mapfold.folder / "link.mcap.partial").symlink_to("missing/m.mcap")
+    (mapfold.folder / "folder").mkdir()
     assert says in mapfold("export", SAMPLE, *options, code=2).err
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from eventsrc.adapters.sim import SimulatedRun, simulate_run
 from eventsrc.adapters.sim.detector import DIM
 from eventsrc.adapters.sim.run import truth_path, write_run
+from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
 from tests.simulated import simulated
 from tests.thorough import stride
@@ -170,3 +171,19 @@ def test_a_written_run_reads_back_and_has_its_truth_beside_it(tmp_path: Path, na
     written = out.read_bytes()
     write_run(run, out)
     assert out.read_bytes() == written
+
+
+def test_a_file_of_other_bytes_is_not_replaced(tmp_path: Path) -> None:
+    run, out = simulated(run="b"), tmp_path / "run.jsonl"
+    truth = write_run(run, out)
+    written = out.read_bytes(), truth.read_bytes()
+    write_run(run, out)  # the same once more
+    truth.write_bytes(b"mine")
+    out.unlink()
+    with pytest.raises(MisuseError, match=r"run\.truth\.jsonl: there is another file of this name"):
+        write_run(run, out)
+    assert not out.exists()
+    assert truth.read_bytes() == b"mine"
+    truth.unlink()
+    write_run(run, out)
+    assert (out.read_bytes(), truth.read_bytes()) == written

@@ -3,12 +3,15 @@
 import json
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 from urllib.parse import quote
 
-from eventsrc.base.errors import MisuseError, SpoolFull, TransportError
+from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, TransportError
+from eventsrc.base.output_files import written_whole
+from eventsrc.base.text import counted
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session
 
@@ -48,40 +51,33 @@ class Output(Protocol):
 
 
 class FileOutput:
-    """Envelopes as JSON lines in a new file. Raises MisuseError if it exists already or cannot be
-    written."""
+    """Envelopes as JSON lines in a new file, which gets its name when it is closed, or when a write
+    fails: then it has the whole lines before. Raises MisuseError if the file exists already or
+    cannot be made, MapfoldError where writing fails."""
 
     def __init__(self, path: Path) -> None:
         self.delivered = Delivered()
-        self._path = path
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # A FIFO or a device, such as /dev/stdout, holds nothing to be lost.
-            self._file = path.open("xb" if path.is_file() or not path.exists() else "wb")
-        except FileExistsError:
-            raise MisuseError(
-                f"--out {path}: there is such a file; remove it, or choose another"
-            ) from None
-        except OSError as error:
-            raise self._unwritable(error) from None
+        if path.is_file():
+            raise MisuseError(f"--out {path}: there is such a file; remove it, or choose another")
+        self._path, self._stack = path, ExitStack()
+        self._file = self._stack.enter_context(written_whole(path))
 
     def send(self, keyframe: Keyframe) -> None:
         """Write its envelope."""
+        whole = self._file.tell() if self._file.seekable() else None
         try:
             self._file.write(_encode(keyframe.envelope) + b"\n")
-        except OSError as error:
-            raise self._unwritable(error) from None
+        except MapfoldError as error:
+            if whole is not None:  # keyframes of a camera cannot be had a second time
+                self._file.truncate(whole)
+            self._stack.close()
+            count = counted(self.delivered.published, "keyframe")
+            raise MapfoldError(f"{error}; {self._path} has the {count} before") from None
         self.delivered.published += 1
 
     def close(self, wait_s: float) -> None:  # noqa: ARG002  as `Output` has it
         """Close the file."""
-        try:
-            self._file.close()
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> MisuseError:
-        return MisuseError(f"--out {self._path}: {error.strerror}; choose another file")
+        self._stack.close()
 
 
 class ZenohOutput:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError, TransportError
+from eventsrc.base.output_files import write_files, written_whole
 from eventsrc.base.progress import reported
 from eventsrc.envelope.model import RunId
 from eventsrc.record.transport.session import Session
@@ -285,30 +286,33 @@ def _at_rate(poses: Iterator[TruePose], per_s: float) -> Iterator[TruePose]:
 def write_pictures(pictures: Iterator[CameraPicture], folder: Path, stop: threading.Event) -> int:
     """Write pictures, poses and truth until ``stop`` is set; return the number of pictures.
 
-    Raises MisuseError if the folder is not empty or cannot be written.
+    Poses and truth get their names at the end, so that a folder without them is incomplete. Raises
+    MisuseError if the folder is not empty or no file can be made in it, MapfoldError where writing
+    fails.
     """
     written = 0
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise MisuseError(f"--camera {folder}: this folder is not empty; choose another")
-        with (
-            (folder / "poses.csv").open("w", encoding="utf-8") as poses,
-            (folder / "truth.jsonl").open("wb") as truth,
-        ):
-            poses.write("stamp,x,y,yaw\n")
-            for picture in pictures:
-                if stop.is_set():
-                    break
-                (folder / f"{picture.stamp_s:.3f}.jpg").write_bytes(picture.jpeg)
-                at = picture.pose
-                poses.write(f"{picture.stamp_s:.3f},{at['x']},{at['y']},{at['yaw']}\n")
-                truth.write(encode(picture.truth) + b"\n")
-                written += 1
     except OSError as error:
         raise MisuseError(
             f"--camera {folder}: cannot be written: {error.strerror}; choose another"
         ) from None
+    with (
+        written_whole(folder / "poses.csv") as poses,
+        written_whole(folder / "truth.jsonl") as truth,
+    ):
+        poses.write(b"stamp,x,y,yaw\n")
+        for picture in pictures:
+            if stop.is_set():
+                break
+            write_files({folder / f"{picture.stamp_s:.3f}.jpg": picture.jpeg})
+            at = picture.pose
+            line = f"{picture.stamp_s:.3f},{at['x']},{at['y']},{at['yaw']}\n"
+            poses.write(line.encode())
+            truth.write(encode(picture.truth) + b"\n")
+            written += 1
     return written
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError, TransportError
+from eventsrc.base.output_files import write_files
 from eventsrc.base.progress import reported
 from eventsrc.envelope.model import KeyframeId, RunId, default_det_id
 from eventsrc.record.transport.session import Session
@@ -155,18 +156,27 @@ def publish_run(
 def write_run(run: SimulatedRun, out: Path) -> Path:
     """Write ``run`` as JSON lines to ``out`` (gzip if it ends in .gz); returns the truth's path.
 
-    Raises MisuseError if a file cannot be written.
+    A file that is there stays as it is, since it may be a recorded run: it must hold the same bytes
+    already. Raises MisuseError where it holds others or no file can be made, MapfoldError where
+    writing it fails.
     """
     truth = truth_path(out)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        _write_lines(out, run.envelopes)
-        _write_lines(truth, run.truth)
-    except OSError as error:
-        raise MisuseError(
-            f"{out}: cannot be written: {error.strerror}; choose another --out"
-        ) from None
+    contents = {out: _lines(out, run.envelopes), truth: _lines(truth, run.truth)}
+    missing = {path: text for path, text in contents.items() if not _holds(path, text)}
+    write_files(missing)
     return truth
+
+
+def _holds(path: Path, text: bytes) -> bool:
+    """Whether ``path`` is a file of these bytes; raises MisuseError if it is one of others."""
+    if not path.is_file() or path.is_relative_to("/dev"):
+        return False
+    with path.open("rb") as file:
+        if file.read(len(text) + 1) == text:
+            return True
+    raise MisuseError(
+        f"--out {path}: there is another file of this name; remove it, or choose another"
+    )
 
 
 def truth_path(out: Path) -> Path:
@@ -175,8 +185,8 @@ def truth_path(out: Path) -> Path:
     return out.with_name(f"{stem}.truth{out.name.removeprefix(stem)}")
 
 
-def _write_lines(path: Path, documents: Iterable[dict[str, Any]]) -> None:
+def _lines(path: Path, documents: Iterable[dict[str, Any]]) -> bytes:
     text = b"".join(encode(document) + b"\n" for document in documents)
     if path.suffix == ".gz":  # without name and time, so that a run always gives the same file
         text = gzip.compress(text, mtime=0)
-    path.write_bytes(text)
+    return text

@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.output_files import write_files
 from projections.map.view import MapView
 
 from .labels import Extent
@@ -63,25 +64,24 @@ class Canvas:
         self.figure.text(0.02, y, text, fontsize=8.5, color=colour, va="center")
 
     def save(self, out: Path) -> None:
-        """Write the picture; the same picture gives the same bytes."""
-        self._take_texts_literally()
+        """Write the picture; the same picture gives the same bytes.
+
+        Raises MisuseError where no file can be made there, MapfoldError where writing it fails.
+        """
+        suffix = out.suffix.lower()
         # PDF and SVG carry a date, SVG also ids with a random salt: left out, or fixed.
         undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            with _drawing():
-                self.figure.savefig(out, dpi=_DPI, metadata=undated.get(out.suffix.lower()))
-        except OSError as error:
-            raise MisuseError(
-                f"{out}: cannot be written: {error.strerror or error}; choose another"
-            ) from None
+        write_files({out: self._drawn(suffix[1:], undated.get(suffix))})
 
     def png(self) -> bytes:
         """The picture as a PNG."""
+        return self._drawn("png")
+
+    def _drawn(self, kind: str, metadata: dict[str, None] | None = None) -> bytes:
         self._take_texts_literally()
         out = BytesIO()
         with _drawing():
-            self.figure.savefig(out, dpi=_DPI, format="png")
+            self.figure.savefig(out, dpi=_DPI, format=kind, metadata=metadata)
         return out.getvalue()
 
     def _take_texts_literally(self) -> None:

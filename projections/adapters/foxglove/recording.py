@@ -1,9 +1,14 @@
 """A recording of how a map came about, an MCAP file for Foxglove."""
 
+import io
+import os
 from pathlib import Path
+from typing import Any
 
 from foxglove import Context, open_mcap
 
+from eventsrc.base.errors import MapfoldError
+from eventsrc.base.output_files import OutputFile, written_whole
 from projections.fold.deltas import KeyframeAdded, MapGiven
 from projections.map.change_lines import change_lines
 from projections.map.scenes import RecordedFold
@@ -14,13 +19,13 @@ from .messages import MapTopics
 def write_recording(fold: RecordedFold, path: Path) -> int:
     """Record a fold's events and the maps that they make; returns the number of scenes.
 
-    The same log gives the same bytes. ``path`` is replaced when all is written. Raises OSError
-    where it cannot be written, FoldError at an event that cannot be folded.
+    The same log gives the same bytes. Raises FoldError at an event that cannot be folded, and what
+    `written_whole` raises.
     """
     context, scenes = Context(), 0
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        with open_mcap(partial, context=context, allow_overwrite=True):
+    with written_whole(path) as file:
+        sink = _Sink(file)
+        with open_mcap(sink, context=context):
             topics = MapTopics(context)
             for event, now, deltas, is_scene in fold:
                 topics.event(event, now)
@@ -33,7 +38,36 @@ def write_recording(fold: RecordedFold, path: Path) -> int:
                 if is_scene:
                     topics.scene(fold.view, fold.merges, now)
                     scenes += 1
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+                sink.check()
+        sink.check()
     return scenes
+
+
+class _Sink(io.RawIOBase):
+    """What the SDK writes to. It would print a line for each message after a failed write, so the
+    error is kept for `check`, and what comes after it is dropped."""
+
+    def __init__(self, file: OutputFile) -> None:
+        self._file = file
+        self._position = 0
+        self._failed: Exception | None = None
+
+    def write(self, data: Any, /) -> int:
+        try:
+            if self._failed is None:
+                self._file.write(data)
+        except (MapfoldError, OSError) as error:
+            self._failed = error
+        self._position += len(data)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        self._position = offset + (self._position if whence == os.SEEK_CUR else 0)
+        if self._failed is None:
+            self._position = self._file.seek(offset, whence)
+        return self._position
+
+    def check(self) -> None:
+        """Raise the error of the first write that failed, if one did."""
+        if self._failed is not None:
+            raise self._failed

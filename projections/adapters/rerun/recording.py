@@ -12,7 +12,10 @@ robots' time (`Moments`). The same log gives the same data, but not the same byt
 its chunks and rows at random.
 """
 
+import os
+import threading
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path as File
@@ -23,6 +26,8 @@ import rerun
 from numpy.typing import NDArray
 from rerun import blueprint
 
+from eventsrc.base.errors import MapfoldError
+from eventsrc.base.output_files import OutputFile, written_whole
 from eventsrc.base.text import visible
 from eventsrc.log import Event
 from projections.map.change_lines import change_lines
@@ -33,6 +38,7 @@ from .scene import Arrow, Graph, Lines, Part, Path, Points, map_parts, robot_par
 
 APPLICATION: Final = "mapfold"
 _MARGIN_M: Final = 1.0
+_PIPED_BYTES: Final = 1 << 20
 _NEVER: Final = timedelta(days=1_000)
 """Rerun ends a chunk at a size or after a time; by size alone the same log gives the same
 chunks."""
@@ -50,11 +56,9 @@ _Y_UP: Final = rerun.Transform3D(scale=[1.0, -1.0, 1.0])
 def write_recording(fold: RecordedFold, path: File, recording_id: str) -> int:
     """Record the maps of a fold; returns the number of scenes.
 
-    The viewer shows two recordings of one ``recording_id`` as one. ``path`` is replaced when all is
-    written. Raises OSError where it cannot be written, FoldError at an event that cannot be folded.
+    The viewer shows two recordings of one ``recording_id`` as one. Raises FoldError at an
+    event that cannot be folded, and what `written_whole` raises.
     """
-    partial = path.with_name(f"{path.name}.partial")
-    partial.open("wb").close()  # here: its error names what is wrong better than Rerun's
     was_strict = rerun.strict_mode()
     rerun.set_strict_mode(True)
     try:
@@ -66,17 +70,41 @@ def write_recording(fold: RecordedFold, path: File, recording_id: str) -> int:
         )
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
-        recording.save(partial, default_blueprint=_blueprint())
-        scenes = _record(fold, recording)
-        recording.flush()
-        recording.disconnect()
-        partial.replace(path)
-    except RuntimeError as error:  # what Rerun raises where a file cannot be written to
-        raise OSError(str(error)) from error
+        with written_whole(path) as file, _copied_to(file) as pipe:
+            recording.save(pipe, default_blueprint=_blueprint())
+            scenes = _record(fold, recording)
+            recording.flush()
+            recording.disconnect()
     finally:
         rerun.set_strict_mode(was_strict)
-        partial.unlink(missing_ok=True)
     return scenes
+
+
+@contextmanager
+def _copied_to(file: OutputFile) -> Iterator[File]:
+    """The path of a pipe; what Rerun saves to it is written to ``file``. Rerun itself prints where
+    a write fails, and may wait for ever for its own thread."""
+    failed: list[Exception] = []
+    reading, writing = os.pipe()
+
+    def copy() -> None:
+        with open(reading, "rb", buffering=0) as pipe:  # noqa: PTH123  # no path
+            while data := pipe.read(_PIPED_BYTES):
+                try:
+                    if not failed:
+                        file.write(data)
+                except (MapfoldError, OSError) as error:
+                    failed.append(error)  # the rest is read and dropped
+
+    copying = threading.Thread(target=copy, name="copy of a recording")
+    copying.start()
+    try:
+        yield File(f"/dev/fd/{writing}")
+    finally:
+        os.close(writing)
+        copying.join()
+    if failed:
+        raise failed[0]
 
 
 def _record(fold: RecordedFold, recording: rerun.RecordingStream) -> int:

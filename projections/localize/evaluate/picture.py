@@ -1,8 +1,10 @@
 """Picture of an evaluation: each question's true position, and a line to a wrong answer."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
+from eventsrc.base.output_files import write_files
 from projections.map.view import MapView
 
 from .trials import Trial
@@ -11,7 +13,8 @@ _GOOD, _BAD, _UNKNOWN, _DRIVE = "#2a7f62", "#c0392b", "#8e8e8e", "#d9d9d9"
 
 
 def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
-    """Draw to ``out`` (.png, .svg or .pdf). Raises OSError when it cannot be written."""
+    """Draw to ``out`` (.png, .svg or .pdf). Raises MisuseError where no file can be made
+    there, MapfoldError where writing it fails."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -31,7 +34,9 @@ def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
         "green: within 1.5 m   red: not, with a line to the answer   grey: answered 'unknown'"
     )
     axes.set_aspect("equal")
-    figure.savefig(out)
+    picture = BytesIO()
+    figure.savefig(picture, format=out.suffix[1:])
+    write_files({out: picture.getvalue()})
 
 
 def _draw(axes: object, trial: Trial) -> None:

@@ -391,7 +391,9 @@ def _output(
     patient: bool,
 ) -> Output:
     if out is not None:
-        return FileOutput(out)
+        file = FileOutput(out)
+        stack.callback(file.close, 0.0)
+        return file
     publisher = stack.enter_context(EnvelopePublisher(options, spool, key))
     sender = None if crops is None else CropSender(crops, CROPS_KEY, _note)
     return ZenohOutput(publisher, sender, stop, patient=patient, note=_note)

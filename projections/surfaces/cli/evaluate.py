@@ -25,7 +25,6 @@ from .options import (
     camera_from,
     check_picture,
     settings_of,
-    writing,
 )
 from .relocalize import method_from
 from .terminal import display, emit, say
@@ -175,8 +174,7 @@ def evaluate(
     else:
         _print_scores(found, asked=asked)
     if picture is not None:  # last: the scores are printed if it cannot be written
-        with writing(picture):
-            draw_failures(result.view, result.trials[3], picture)
+        draw_failures(result.view, result.trials[3], picture)
 
 
 def _print_scores(found: "_Scored", *, asked: bool) -> None:

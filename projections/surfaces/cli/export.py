@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.output_files import write_files
 from eventsrc.base.text import counted
 from eventsrc.log import LogReader
 from eventsrc.record.transport.config import is_loopback
@@ -29,7 +30,6 @@ from .options import (
     known_point,
     point,
     settings_from,
-    writing,
 )
 from .signals import stop_on_signals
 from .terminal import Bar, say
@@ -130,7 +130,7 @@ def export(
                 write = _recorder(
                     name, f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
                 )
-                with writing(file), Bar() as bar:
+                with Bar() as bar:
                     fold = RecordedFold(
                         reader,
                         settings,
@@ -157,9 +157,7 @@ def export(
         texts[nav2] = formats.nav2_waypoints(view)
     if csv is not None:
         texts |= {csv / name: text for name, text in formats.tables(view).items()}
-    for path, text in texts.items():
-        with writing(path):
-            path.write_text(text, "utf-8", newline="")
+    write_files({path: text.encode() for path, text in texts.items()})
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
     say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
 
@@ -226,8 +224,7 @@ def foxglove(
         ) from None
     settings_from(settings_file, set_)  # a bad value is an error before the log is opened
     if layout is not None:
-        with writing(layout):
-            layout.write_text(layout_json(), "utf-8")
+        write_files({layout: layout_json().encode()})
         say(f"wrote {layout}")
     with LogReader(log) as reader:
         end = reader.next_offset

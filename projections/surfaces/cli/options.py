@@ -306,15 +306,3 @@ def check_picture(out: Path | None) -> None:
     from projections.adapters.drawing.canvas import check_suffix
 
     check_suffix(out)
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Make the folder of a file that is written inside the block; an OSError becomes a
-    MisuseError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        reason = error.strerror or error  # errors of Foxglove and Rerun have no strerror
-        raise MisuseError(f"{path}: cannot be written: {reason}; choose another") from None
