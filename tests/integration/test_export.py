@@ -52,7 +52,7 @@ def test_all_formats_at_once_hold_the_map_of_state(mapfold: Commands, log: Path)
     places = {p["place_id"]: (p["centroid_x"], p["centroid_y"]) for p in state["places"]}
     folder = mapfold.folder
     graph = networkx.read_graphml(folder / "m.graphml")
-    assert {n: (v["x"], v["y"]) for n, v in graph.nodes(data=True) if v["label"] == "Place"} == (
+    assert {n: (v["x"], v["y"]) for n, v in graph.nodes(data=True) if v["kind"] == "Place"} == (
         places
     )
     with (folder / "t/places.csv").open(newline="") as table:

@@ -1,7 +1,9 @@
 """The map as a graph of Places and Objects, in GraphML and in Graphviz' DOT.
 
-Labels are those of the database's graph: Place, Object, ADJACENT_TO, LOCATED_IN. Node ids are
-place_id and object_id. A property that is unknown is left out.
+A node's ``kind`` and an edge's ``label`` are the labels of the database's graph: Place, Object,
+ADJACENT_TO, LOCATED_IN. A node's ``label`` is what viewers show: the name, likely type or id of a
+Place, the class of an Object. Node ids are place_id and object_id; where they are escaped, a
+backslash is doubled, so that different ids stay different. A property that is unknown is left out.
 """
 
 import re
@@ -14,7 +16,7 @@ from projections.map.view import MapView
 if TYPE_CHECKING:
     import networkx
 
-_NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_NOT_IN_XML: Final = re.compile("[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _graph(view: MapView) -> "networkx.Graph":
@@ -27,7 +29,8 @@ def _graph(view: MapView) -> "networkx.Graph":
         graph.add_node(
             place.place_id,
             **_known(
-                label="Place",
+                kind="Place",
+                label=place.name or (kind.type if kind is not None else None) or place.place_id,
                 name=place.name,
                 floor=view.floor_of(place.ordinal),
                 type=kind.type if kind is not None and typed else None,
@@ -42,7 +45,8 @@ def _graph(view: MapView) -> "networkx.Graph":
         graph.add_node(
             found.object_id,
             **_known(
-                label="Object",
+                kind="Object",
+                label=found.class_name,
                 class_name=found.class_name,
                 x=x,
                 y=y,
@@ -65,8 +69,8 @@ def _known(**values: Any) -> dict[str, Any]:
 
 
 def graphml(view: MapView) -> str:
-    """GraphML 1.0, for Gephi, yEd, Cytoscape and networkx. Characters that XML cannot hold are
-    written as escapes (``\\x1b``)."""
+    """GraphML 1.0, for Gephi, yEd, Cytoscape and networkx. Characters that XML cannot hold
+    or does not keep (tabs, line breaks) are written as escapes (``\\x1b``), backslashes doubled."""
     import networkx
 
     graph = _graph(view)
@@ -77,7 +81,8 @@ def graphml(view: MapView) -> str:
 
 
 def _in_xml(text: str) -> str:
-    return _NOT_IN_XML.sub(lambda found: ascii(found[0])[1:-1], text)
+    doubled = text.replace("\\", "\\\\")
+    return _NOT_IN_XML.sub(lambda found: ascii(found[0])[1:-1], doubled)
 
 
 def dot(view: MapView) -> str:
@@ -86,28 +91,32 @@ def dot(view: MapView) -> str:
     graph = _graph(view)
     lines = [
         "graph semantic_map {",
-        "  graph [outputorder=edgesfirst, overlap=false];",
+        "  graph [outputorder=edgesfirst, overlap=true];",  # any other value moves Places too
         "  node [fontsize=10, margin=0.03, width=0, height=0];",
     ]
-    lines += [f"  {_quoted(n)} {_attributes(_node(n, v))};" for n, v in graph.nodes(data=True)]
+    lines += [f"  {_id(n)} {_attributes(_node(v))};" for n, v in graph.nodes(data=True)]
     for a, b, values in graph.edges(data=True):
         located = {"style": "dotted", "len": "0.7"}
         adjacent = {"label": f"×{values.get('shared_transitions')}", "style": "bold"}
         shown = adjacent if values["label"] == "ADJACENT_TO" else located
-        lines.append(f"  {_quoted(a)} -- {_quoted(b)} {_attributes(shown)};")
+        lines.append(f"  {_id(a)} -- {_id(b)} {_attributes(shown)};")
     return "\n".join([*lines, "}"]) + "\n"
 
 
-def _node(node: str, values: Mapping[str, Any]) -> dict[str, str]:
+def _node(values: Mapping[str, Any]) -> dict[str, str]:
     at = f"{values['x']:.3f},{values['y']:.3f}"
-    if values["label"] == "Object":
-        return {"label": values["class_name"], "pos": at, "shape": "plaintext"}
-    text = values.get("name") or values.get("type") or node
+    text = values["label"]
+    if values["kind"] == "Object":
+        return {"label": text, "pos": at, "shape": "plaintext"}
     return {"label": text, "pos": f"{at}!", "shape": "box", "style": "filled", "fontsize": "14"}
 
 
 def _attributes(values: Mapping[str, str]) -> str:
     return "[" + ", ".join(f"{name}={_quoted(value)}" for name, value in values.items()) + "]"
+
+
+def _id(text: str) -> str:
+    return _quoted(text.replace("\\", "\\\\"))
 
 
 def _quoted(text: str) -> str:

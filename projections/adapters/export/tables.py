@@ -1,31 +1,38 @@
-"""The map as four tables of comma-separated values (RFC 4180); the first line has the names."""
+"""The map as four tables of comma-separated values (RFC 4180); the first line has the names.
+
+A spreadsheet takes a cell that begins with ``=``, ``+``, ``-``, ``@``, a tab or a line break for a
+formula, and names come from the network: such texts, and those that begin with an apostrophe, get
+an apostrophe before them, unless the tables are ``raw``. Numbers stay as they are.
+"""
 
 import csv
 import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from projections.map.view import MapView
 
+_Table = tuple[Sequence[str], Iterable[Sequence[Any]]]
+_BEGINNINGS: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "'")
 
-def tables(view: MapView) -> dict[str, str]:
+
+def tables(view: MapView, *, raw: bool = False) -> dict[str, str]:
     """Text of each table, by the name of its file: places, objects, keyframes, adjacency.
 
     Rows are in the order in which the fold met what they are about. What is unknown is empty.
     """
-    return {
+    edges = ((view.place_id(a), view.place_id(b), count) for a, b, count in view.edges())
+    found = {
         "places.csv": _places(view),
         "objects.csv": _objects(view),
         "keyframes.csv": _keyframes(view),
-        "adjacency.csv": _table(
-            ("a", "b", "shared_transitions"),
-            ((view.place_id(a), view.place_id(b), count) for a, b, count in view.edges()),
-        ),
+        "adjacency.csv": (("a", "b", "shared_transitions"), edges),
     }
+    return {name: _text(*table, raw=raw) for name, table in found.items()}
 
 
-def _places(view: MapView) -> str:
+def _places(view: MapView) -> _Table:
     objects = Counter(found.place for found in view.objects.values())
     rows = []
     for place in view.places.values():
@@ -45,10 +52,10 @@ def _places(view: MapView) -> str:
             )
         )
     names = ("place_id", "name", "type", "type_probability", "floor", "centroid_x", "centroid_y")
-    return _table((*names, "keyframe_count", "object_count"), rows)
+    return (*names, "keyframe_count", "object_count"), rows
 
 
-def _objects(view: MapView) -> str:
+def _objects(view: MapView) -> _Table:
     rows = []
     for found in view.objects.values():
         at = found.estimate
@@ -70,22 +77,27 @@ def _objects(view: MapView) -> str:
         )
     names = ("object_id", "class_name", "place_id", "mean_x", "mean_y", "est_x", "est_y")
     more = ("est_sigma_m", "obs_count", "first_seen", "last_seen", "missing")
-    return _table((*names, *more), rows)
+    return (*names, *more), rows
 
 
-def _keyframes(view: MapView) -> str:
+def _keyframes(view: MapView) -> _Table:
     names = ("offset", "run_id", "keyframe_id", "timestamp", "map_x", "map_y", "map_yaw")
     rows = []
     for k in view.keyframes:
         pose = (None,) * 3 if k.pose is None else (k.pose.x_m, k.pose.y_m, k.pose.yaw_rad)
         where = (*pose, view.place_id(k.place), k.floor)
         rows.append((k.offset, k.run_id, k.keyframe_id, k.timestamp, *where))
-    return _table((*names, "place_id", "floor"), rows)
+    return (*names, "place_id", "floor"), rows
 
 
-def _table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def _text(names: Sequence[str], rows: Iterable[Sequence[Any]], *, raw: bool) -> str:
     text = io.StringIO()
     writer = csv.writer(text)  # its line ends are those of RFC 4180
     writer.writerow(names)
-    writer.writerows(rows)
+    writer.writerows(rows if raw else ([_cell(value) for value in row] for row in rows))
     return text.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    begins_formula = isinstance(value, str) and value.startswith(_BEGINNINGS)
+    return f"'{value}" if begins_formula else value

@@ -58,6 +58,13 @@ def export(
             metavar="DIR", help="Four tables: places, objects, keyframes and adjacency .csv."
         ),
     ] = None,
+    csv_raw: Annotated[
+        bool,
+        typer.Option(
+            "--csv-raw",
+            help="For programs: no apostrophe before texts that a spreadsheet takes for formulas.",
+        ),
+    ] = False,
     nav2: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="A waypoint for each Place, as Nav2's RViz panel loads."),
@@ -111,6 +118,8 @@ def export(
         raise MisuseError(f"nothing to write; give at least one of {names}")
     if origin is not None and geojson is None:
         raise MisuseError("--origin is for --geojson")
+    if csv_raw and csv is None:
+        raise MisuseError("--csv-raw is for --csv")
     if every is not None and not any(recordings.values()):
         raise MisuseError("--every is for --foxglove and --rerun")
     if floor is not None and foxglove is not None:
@@ -156,7 +165,7 @@ def export(
     if nav2 is not None:
         texts[nav2] = formats.nav2_waypoints(view)
     if csv is not None:
-        texts |= {csv / name: text for name, text in formats.tables(view).items()}
+        texts |= {csv / name: text for name, text in formats.tables(view, raw=csv_raw).items()}
     write_files({path: text.encode() for path, text in texts.items()})
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
     say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
