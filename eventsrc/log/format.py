@@ -150,7 +150,10 @@ def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], in
 
 def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
     if not data.startswith(_mcap.MAGIC) and not _mcap.MAGIC.startswith(data):
-        raise NotALog(f"{path} is no MCAP file; it does not belong in a log, move it away")
+        raise NotALog(
+            f"{path} is no MCAP file; move it away if it does not belong in a log, and run "
+            f"`{advised('log', 'recover', path.parent)}`"
+        )
     try:
         head = _find_head(data)
     except BadRecord as error:
@@ -325,6 +328,20 @@ def list_segments(log: Path) -> list[SegmentPath]:
 
 def segment_files(log: Path) -> list[SegmentPath]:
     """All files of ``log`` with a segment's name; two of one base while it is being sealed."""
+    return [s for s in _with_segment_names(log) if not _is_other(s.path)]
+
+
+def not_files(log: Path) -> list[Path]:
+    """What has the name of a segment and is no file: a folder, a pipe, a device. Opening one may
+    wait for ever, so these count as missing segments. A link to a disk that is away does not."""
+    return [s.path for s in _with_segment_names(log) if _is_other(s.path)]
+
+
+def _is_other(path: Path) -> bool:
+    return path.exists() and not path.is_file()
+
+
+def _with_segment_names(log: Path) -> list[SegmentPath]:
     matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
     return sorted(
         (

@@ -12,13 +12,14 @@ import fcntl
 import json
 import os
 import socket
+import stat
 import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from eventsrc.base.clock import Clock
-from eventsrc.base.errors import LogBusy
+from eventsrc.base.errors import LogBusy, LogError
 
 from .format import LOCK
 
@@ -32,8 +33,9 @@ class WriterLock:
 
     def __init__(self, log: Path, clock: Clock) -> None:
         self._folder = -1
-        self._fd = os.open(log / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        self._fd = os.open(log / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
         try:
+            _check_regular(self._fd, log / LOCK)
             self._folder = os.open(log, os.O_RDONLY | os.O_DIRECTORY)
             _lock(self._fd)
             _lock_folder(self._folder)
@@ -55,7 +57,8 @@ class WriterLock:
     def release(self) -> None:
         """Release the lock. The file stays: deleting it would race with the next writer."""
         if self._fd >= 0:
-            os.ftruncate(self._fd, 0)
+            with contextlib.suppress(OSError):  # its text is then that of a holder long gone
+                os.ftruncate(self._fd, 0)
             self._close()
 
     def _close(self) -> None:
@@ -69,6 +72,11 @@ class WriterLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def _check_regular(fd: int, path: Path) -> None:
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        raise LogError(f"{path} is no regular file; delete it")
 
 
 def _lock(fd: int) -> None:
@@ -98,7 +106,7 @@ def is_held(log: Path) -> bool:
 
 def _is_locked(path: Path) -> bool:
     try:
-        fd = os.open(path, os.O_RDONLY)
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError:  # no lock file, or one that may not be read
         return False
     try:

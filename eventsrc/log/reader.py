@@ -198,7 +198,7 @@ class LogReader:
         """Where to divide a segment; nowhere if it cannot be opened."""
         try:
             segment = self.open_segment(entry)
-        except LogDamaged:
+        except (LogDamaged, NotALog):
             return
         first, length = start, 0
         for chunk in segment.chunks:
@@ -220,7 +220,7 @@ class LogReader:
         """The events of one segment; returns the offset after the last one yielded or reported."""
         try:
             segment = self.open_segment(entry)
-        except LogDamaged as error:
+        except (LogDamaged, NotALog) as error:
             report(Unreadable(start, Offset(end - 1), str(error)))
             return end
         wanted = _wanted_channels(segment, keys)

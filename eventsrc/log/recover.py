@@ -106,8 +106,8 @@ def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryR
             return _Recovery(log, max_losses).run()
     except OSError as error:
         raise LogError(
-            f"{log}: {error.strerror or error}; no event that could be read was removed. "
-            "Free space or fix the disk, then recover again"
+            f"{error.filename or log}: {error.strerror or error}; no event that could be read was "
+            "removed. Free space or fix the disk, then recover again"
         ) from error
 
 

@@ -10,6 +10,7 @@ because people copy, restore and rename files. The rules:
   aside as ``….duplicate``.
 * A file with a damaged head keeps its name, unless another file claims it: then it is set aside as
   ``….damaged``.
+* A folder, pipe or device with the name of a segment is set aside as ``….damaged``.
 * With an MCAP file that another program wrote, without our metadata, nothing is done at all.
 
 Nothing is deleted. A file is renamed in two steps, by way of ``….misnamed``; a recovery that was
@@ -42,6 +43,7 @@ from .format import (
     free_name,
     half_renamed,
     head_at_any_base,
+    not_files,
     segment_files,
     segment_path,
 )
@@ -94,7 +96,7 @@ def rename_segments(log: Path, noted: str | None) -> RenamedSegments:
     files = [_inspect(segment.path, segment) for segment in segment_files(log)]
     files += [_inspect(path, _target_of(path)) for path in half_renamed(log)]
     log_id = own_log_id((c for f in files if (c := _carried(f)) is not None), noted)
-    moved: list[Moved] = []
+    moved = [quarantine(path, DAMAGED, "it is no file") for path in not_files(log)]
     by_base: defaultdict[Offset, list[_SegmentFile]] = defaultdict(list)
     for file in files:
         if file.log_id in (None, log_id):

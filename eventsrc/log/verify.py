@@ -23,6 +23,7 @@ from .format import (
     WrongPlace,
     head_at_any_base,
     head_of,
+    not_files,
     segment_path,
 )
 from .lock import is_held
@@ -91,6 +92,8 @@ class _Verifier:
                 reach = None if self._end is None else self._end.reach(segment.base)
             size += self._verify_segment(segment, reach)
         self._check_sealed_end()
+        for path in not_files(self._log):
+            self._add("crc", "is no file, but a folder, a pipe or a device", path.name)
         report_progress("verifying", 1, 1, "MB")
         return Verification(
             self._log,

@@ -14,9 +14,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.gaps import gap_of
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss
 from eventsrc.log import Event, LogReader
 from eventsrc.log import mcap_records as _mcap
@@ -127,6 +128,8 @@ def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInf
     tally = _Tally(Counter(), [], _RobotStamps(), {})
     with LogReader(path) as reader:
         segments = tuple(_count(reader, entry, tally) for entry in reader.segments)
+        if note is not None:
+            _note_missing(reader, segments, note)
         tally.stamps.read_doubtful(reader)
         return LogInfo(
             log_id=reader.log_id,
@@ -143,6 +146,20 @@ def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInf
             last_stamp_ns=tally.stamps.last,
             formats={key: tuple(sorted(tally.formats[key])) for key in sorted(tally.formats)},
         )
+
+
+def _note_missing(
+    reader: LogReader, segments: tuple[SegmentInfo, ...], note: Callable[[str], None]
+) -> None:
+    """Note the offsets between segments: of segments that were deleted."""
+    expected = FIRST_OFFSET
+    for segment in segments:
+        if segment.base > expected:
+            note(
+                f"{reader.path}: offsets {expected} to {segment.base - 1} are missing before "
+                f"{segment.name}; run `{advised('log', 'verify', reader.path)}`"
+            )
+        expected = Offset(segment.base + segment.events)
 
 
 def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:

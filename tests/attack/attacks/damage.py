@@ -2,6 +2,7 @@
 another log, and everything that could be read is there."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -43,6 +44,23 @@ def exchanged_names(_: Arena, log: Path, __: Oracle) -> int:
     second.rename(first)
     aside.rename(second)
     return EVENTS
+
+
+def sealed_cut_or_deleted(arena: Arena, log: Path, _: Oracle) -> int:
+    """The last sealed segment, behind which nothing comes, is cut at any byte or deleted. What it
+    lacks must be losses, so that no offset is given twice."""
+    (active,) = log.glob("*.active")
+    sealed_to = int(active.name.partition(".")[0])
+    active.unlink()
+    last = max(log.glob("*.mcap"))
+    if arena.rng.random() < 0.2:
+        last.unlink()
+    else:
+        os.truncate(last, arena.rng.randrange(last.stat().st_size))
+    if arena.rng.random() < 0.2:
+        last.unlink(missing_ok=True)
+        os.mkfifo(last)
+    return sealed_to
 
 
 def rewritten(_: Arena, log: Path, __: Oracle) -> int:
@@ -90,6 +108,7 @@ def by_chance(arena: Arena, log: Path, _: Oracle) -> int:
 CASES: tuple[Damage, ...] = (
     foreign_over_active,
     exchanged_names,
+    sealed_cut_or_deleted,
     rewritten,
     forged_mark_in_key,
     forged_mark_at_end,
