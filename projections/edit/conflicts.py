@@ -73,14 +73,17 @@ _T = TypeVar("_T", bound=Hashable)
 
 def _made_one(pairs: Iterable[tuple[_T, _T]], start: _T) -> dict[_T, tuple[_T, _T] | None]:
     """All that these pairs join to ``start``, each with the first pair on the way to it."""
-    pairs = list(pairs)
+    of: dict[_T, list[tuple[_T, _T]]] = {}
+    for pair in pairs:
+        for thing in pair:
+            of.setdefault(thing, []).append(pair)
     reached: dict[_T, tuple[_T, _T] | None] = {start: None}
     frontier = [start]
     while frontier:
         at = frontier.pop()
-        for pair in pairs:
-            for near, far in (pair, pair[::-1]):
-                if near == at and far not in reached:
+        for pair in of.get(at, ()):
+            for far in pair:
+                if far not in reached:
                     reached[far] = reached[at] or pair
                     frontier.append(far)
     return reached

@@ -4,7 +4,7 @@ A command names keyframes and det_ids. It is about a place if a keyframe that it
 place, and about an object if a detection that it names is one of the object's.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from eventsrc.base.text import counted
@@ -18,10 +18,12 @@ from eventsrc.envelope.commands import (
     SameObject,
     UndoMerge,
 )
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import FIRST_OFFSET, KeyframeId, Offset, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader
 from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
+from projections.fold.pose_corrections import PoseCorrection
 from projections.map.command_text import command_document, command_name, command_title
 from projections.store.history import History
 from projections.store.records import Cause, PlaceHistory, Refusal
@@ -38,16 +40,19 @@ class EntryMaker:
 
     def __init__(self, reader: LogReader) -> None:
         self._reader = reader
-        self._causes: dict[Offset, Cause] = {}
+        self._stamps_ns: dict[Offset, int] = {}
+        self._read_to = FIRST_OFFSET
 
     def cause(self, recorded: RecordedCommand) -> Cause:
-        """The event of a command; its time is read from the log, once."""
+        """The event of a command; the times of all commands up to it are read together, once."""
         offset = recorded.offset
-        if offset not in self._causes:
-            (event,) = self._reader.read(offset, Offset(offset + 1))
-            name = command_name(recorded.command)
-            self._causes[offset] = Cause(offset, "command", event.stamp_ns / _NS, what=name)
-        return self._causes[offset]
+        if offset >= self._read_to:
+            end = Offset(offset + 1)
+            for event in self._reader.read(self._read_to, end, keys=(COMMAND_KEY,)):
+                self._stamps_ns[event.offset] = event.stamp_ns
+            self._read_to = end
+        name = command_name(recorded.command)
+        return Cause(offset, "command", self._stamps_ns[offset] / _NS, what=name)
 
     def entry(self, recorded: RecordedCommand, text: str, **facts: Any) -> Entry:
         """An entry: ``text`` (what the command did), its kind and id, its author and its reason."""
@@ -63,11 +68,17 @@ def place_commands(
     """Commands that named, kept apart, joined or moved something of a place, and the merges of it
     that they refused, after the events below ``end``."""
     place, moment = record.formed.place, _last_moment(record, end)
-    entries = [
-        maker.entry(recorded, text)
+    members: dict[RunId, set[KeyframeId]] = {}
+    if history.corrections.poses:
+        for keyframe in history.keyframes:
+            if history.place_at(keyframe.keyframe, moment) == place:
+                members.setdefault(keyframe.run_id, set()).add(keyframe.keyframe_id)
+    texts = [
+        (recorded, text)
         for recorded in history.corrections.in_force
-        for text in _place_texts(history, recorded, place, moment, end)
+        for text in _place_texts(history, recorded, place, members, moment, end)
     ]
+    entries = [maker.entry(*each) for each in reversed(texts)][::-1]  # the last one reads all times
     refused = (r for r in history.refusals if r.cause.offset < end and place in (r.a, r.b))
     return [*entries, *(_refusal_entry(history, refusal, place) for refusal in refused)]
 
@@ -79,7 +90,12 @@ def _last_moment(record: PlaceHistory, end: Offset) -> Offset:
 
 
 def _place_texts(
-    history: History, recorded: RecordedCommand, place: PlaceOrdinal, moment: Offset, end: Offset
+    history: History,
+    recorded: RecordedCommand,
+    place: PlaceOrdinal,
+    members: Mapping[RunId, Collection[KeyframeId]],
+    moment: Offset,
+    end: Offset,
 ) -> Iterator[str]:
     """What a command did to a place as it is after ``moment`` events; joins are judged after
     ``end``."""
@@ -97,7 +113,7 @@ def _place_texts(
             if own:
                 yield _join_text(history, command, end)
         case CorrectPoses():
-            moved = _moved(history, command, place, moment)
+            moved = _moved(command, members.get(command.run_id, ()))
             if moved:
                 yield f"{counted(moved, 'keyframe')} of it moved"
 
@@ -234,18 +250,10 @@ def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
     return ", ".join(dict.fromkeys(named))
 
 
-def _moved(history: History, command: CorrectPoses, place: PlaceOrdinal, end: Offset) -> int:
-    """The number of keyframes of a place whose pose the command corrects."""
-    given = {pose.keyframe_id for pose in command.poses}
-    first, last = command.first, command.last
-    return sum(
-        k.run_id == command.run_id
-        and (
-            k.keyframe_id in given
-            if command.transform is None
-            else (first is None or k.keyframe_id >= first)
-            and (last is None or k.keyframe_id <= last)
-        )
-        and history.place_at(k.keyframe, end) == place
-        for k in history.keyframes
-    )
+def _moved(command: CorrectPoses, keyframes: Collection[KeyframeId]) -> int:
+    """The number of keyframes, of some of the command's run, whose pose the command corrects."""
+    correction = PoseCorrection.of(command)
+    if command.transform is None:
+        return sum(keyframe_id in correction.poses for keyframe_id in keyframes)
+    first, last = correction.span
+    return sum(first <= keyframe_id <= last for keyframe_id in keyframes)

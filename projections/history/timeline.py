@@ -33,6 +33,8 @@ settings recorded in the log."""
 
 _MOST_HISTORIES = 4
 """Histories that are kept; each may take as much memory as the map."""
+_MOST_COMPILED = 16
+"""Corrections that are kept, of the moments of knowledge asked about last."""
 
 
 class Timeline:
@@ -97,6 +99,8 @@ class Timeline:
         """The corrections compiled from the commands before ``known_at``, from all for None."""
         commands = self.commands(end=checked_end(self.reader, known_at))
         if len(commands) not in self._compiled:
+            for oldest in list(self._compiled)[: 1 - _MOST_COMPILED]:
+                del self._compiled[oldest]
             self._compiled[len(commands)] = compile_corrections(commands)
         return self._compiled[len(commands)]
 

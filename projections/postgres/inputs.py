@@ -29,6 +29,10 @@ _PAGE_FUSION: Final = {
 """The settings that change Objects alone, or nothing in the map, with their defaults."""
 
 
+_MOST_MADE: Final = 16
+"""Inputs that are kept: each has all commands before it."""
+
+
 @dataclass(frozen=True, slots=True)
 class MapInputs:
     """``corrections`` are of the commands before the offset ``known_at``.
@@ -105,6 +109,8 @@ class LogInputs:
         if len(known) not in self._made:
             corrections = compile_corrections(known)
             settings = self.settings_of(corrections)
+            for oldest in list(self._made)[: 1 - _MOST_MADE]:
+                del self._made[oldest]
             self._made[len(known)] = MapInputs.of(settings, corrections, known_at)
         return self._made[len(known)].known_to(known_at)
 

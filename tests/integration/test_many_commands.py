@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from eventsrc.envelope.commands import CorrectPoses, RigidTransform, UseSettings
-from eventsrc.envelope.model import KeyframeId, RunId
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.log import LogReader
 from projections.edit.current import CurrentMap
 from projections.edit.effect import effect_keys, effects_of
@@ -16,11 +16,19 @@ from projections.edit.listing import edits_document, edits_text
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
+from projections.history import Timeline
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
-from tests.bench.commands import KINDS, commands_of, large_undo_merge, mixed, undone
+from tests.bench.commands import (
+    KINDS,
+    commands_of,
+    large_undo_merge,
+    mixed,
+    undone,
+    write_log,
+)
 from tests.commands_in_logs import command
 from tests.corrected_logs import write_rooms
 
@@ -121,3 +129,26 @@ def test_the_key_of_an_effect_is_of_the_commands_up_to_it_and_of_the_options() -
     assert not set(others) & set(keys), "the same settings now, but not under each command"
     moved = [RecordedCommand(each.offset + 1, each.command) for each in commands]
     assert not set(effect_keys(settings_of, moved)) & set(keys)
+
+
+def test_why_reads_the_times_of_all_commands_together(tmp_path: Path) -> None:
+    """As many calls for twice the commands, but for twice the entries."""
+
+    def calls(count: int) -> int:
+        log = write_log(tmp_path / str(count), commands_of(KINDS["name-place"], count))
+        with Timeline(log, cache=False) as timeline:
+            known = timeline.knowing()
+            _ = known.history
+            return calls_of(lambda: known.why("sim-7-a_p0"))
+
+    calls(1)
+    assert calls(200) < 2.6 * calls(100)
+
+
+def test_few_compiled_corrections_are_kept(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", commands_of(KINDS["name-place"], 50))
+    with Timeline(log) as timeline:
+        for known_at in range(445, 496):
+            found = timeline.corrections(Offset(known_at))
+            assert len(found.in_force) == known_at - 445
+        assert len(timeline._compiled) <= 16
