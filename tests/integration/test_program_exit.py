@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from projections.surfaces.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
+from tests import prefork
 from tests.commands import TIMEOUT_S, Commands
 from tests.docs.console import ROOT
 from tests.fixtures_timetravel import write_damaged_log, write_log
@@ -72,6 +73,27 @@ def test_ctrl_c_is_one_line_and_130(tmp_path: Path, module: str, args: tuple[str
         check=False,
     )
     assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, "mapfold: interrupted\n")
+
+
+_CTRL_C_TWICE = """
+import signal
+from projections.surfaces.cli import program
+say = program.say
+def interrupted(line):
+    signal.raise_signal(signal.SIGINT)
+    say(line)
+def app():
+    raise KeyboardInterrupt
+program.say = interrupted
+signal.signal(signal.SIGINT, signal.default_int_handler)
+program.run_app(app)
+"""
+
+
+def test_a_second_ctrl_c_while_the_first_is_reported_is_one_line_too() -> None:
+    env = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}
+    done = prefork.run(_CTRL_C_TWICE, ["-c"], env=env, cwd=ROOT, timeout=TIMEOUT_S)
+    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, b"mapfold: interrupted\n")
 
 
 @pytest.mark.slow

@@ -189,7 +189,7 @@ class TestFull:
         (request("POST", "/", b"", {"Content-Length": "-1"}), 400),
         (request("POST", "/", b"", {"Content-Length": "1, 2"}), 400),
         (b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n" + b"1\r\na\r\n", 411),
-        (b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: gzip\r\n\r\n", 501),
+        (b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: gzip\r\n\r\n", 411),
         (b"GET / HTTP/1.1 x\r\n\r\n", 400),
     ],
     ids=lambda value: str(value)[:50],

@@ -24,6 +24,8 @@ REFUSED = [
     (405, "/metrics", b"", {}),
     (405, "/health", None, {"method": "OPTIONS"}),
     (411, "/relocalize", b"", {"Transfer-Encoding": "chunked", "method": "POST"}),
+    (411, "/health", None, {"Transfer-Encoding": "chunked"}),
+    (411, "/metrics", None, {"Transfer-Encoding": "gzip"}),
     (421, "/health", None, {"Host": "evil.example"}),
     (431, "/health", None, {"Junk": "x" * 400_000}),
 ]

@@ -1,6 +1,7 @@
 """Signals: Ctrl-C takes effect between two steps; what a second signal does to a command that ends
 after the first."""
 
+import os
 import signal
 from collections.abc import Iterator
 
@@ -11,6 +12,7 @@ from projections.surfaces.cli.signals import (
     stop_on_signals,
     unwind_on_signals,
 )
+from tests import prefork
 
 _HANDLER = signal.getsignal(signal.SIGINT)
 
@@ -89,6 +91,23 @@ def test_signals_unwind_a_command_once(number: signal.Signals) -> None:
     assert ended.value.code == 128 + number
     assert closed == ["all"]
     assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_DFL] * 2
+
+
+_AT_ONCE = """
+import os, signal, sys
+from projections.surfaces.cli.signals import stop_on_signals, unwind_on_signals
+with (stop_on_signals if sys.argv[1] == "stop" else unwind_on_signals)():
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGHUP})
+    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.SIGHUP)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM, signal.SIGHUP})
+"""
+
+
+@pytest.mark.parametrize(("kind", "codes"), [("stop", {0}), ("unwind", {129, 143})])
+def test_signals_that_come_at_once_leave_no_traceback(kind: str, codes: set[int]) -> None:
+    done = prefork.run(_AT_ONCE, ["-c", kind], env={**os.environ}, cwd=prefork.ROOT, timeout=60.0)
+    assert (done.returncode in codes, done.stderr) == (True, b"")
 
 
 @pytest.mark.usefixtures("unhandled")

@@ -319,6 +319,7 @@ def _exit_code(app: Callable[..., Any]) -> int:
     except _ReaderGone:
         return EXIT_READER_GONE
     except (_Interrupted, KeyboardInterrupt):
+        signal.signal(signal.SIGINT, _exit_interrupted)  # a second one must not end in a traceback
         say("mapfold: interrupted")
         return EXIT_INTERRUPTED
     return 0

@@ -28,6 +28,11 @@ class _PollingEvent(threading.Event):
         return True
 
 
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """Ignore a signal. With SIG_IGN instead Python reports one that came with the first, and that
+    it has not handled yet, with a traceback."""
+
+
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that SIGINT, SIGTERM and SIGHUP set, so that the command can finish its work.
@@ -44,7 +49,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
     def set_stop(_number: int, _frame: FrameType | None) -> None:
         for number, handler in usual.items():
-            signal.signal(number, handler if number == signal.SIGINT else signal.SIG_IGN)
+            signal.signal(number, handler if number == signal.SIGINT else _ignore)
         # In another thread: the handler may have interrupted this one inside `stop.wait`, while it
         # holds the lock that `stop.set` takes.
         threading.Thread(target=stop.set, name="stop").start()
@@ -73,7 +78,7 @@ def unwind_on_signals() -> Iterator[None]:
 
     def leave(signum: int, _frame: FrameType | None) -> None:
         for number in ours:
-            signal.signal(number, signal.SIG_IGN)
+            signal.signal(number, _ignore)
         sys.exit(128 + signum)
 
     for number in ours:

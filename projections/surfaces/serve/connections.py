@@ -38,6 +38,7 @@ REQUEST_S: Final = 10.0
 ANSWER_S: Final = 60.0
 _CLOSE_S: Final = 1.0
 _MAX_SHOWN: Final = 200
+_NO_LENGTH: Final = "send a Content-Length instead of chunks"
 
 
 class Connections:
@@ -110,6 +111,8 @@ class _Requests(h11.Connection):
             _refuse_chunks(event)
         except h11.RemoteProtocolError as error:
             self.fault = error.error_status_hint, str(error)[:_MAX_SHOWN]
+            if error.error_status_hint == 501:  # an encoding that is not chunked
+                self.fault = 411, _NO_LENGTH
             raise
         return event
 
@@ -118,7 +121,7 @@ def _refuse_chunks(event: Any) -> None:
     if isinstance(event, h11.Request):
         for name, _ in event.headers:
             if name == b"transfer-encoding":
-                raise h11.RemoteProtocolError("send a Content-Length instead of chunks", 411)
+                raise h11.RemoteProtocolError(_NO_LENGTH, 411)
 
 
 class Connection(H11Protocol):

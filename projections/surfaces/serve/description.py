@@ -170,6 +170,7 @@ _EVERYWHERE: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (404, "No such path", {}),
     (405, "The path does not have this method", _ALLOW),
     (408, "The request did not end within 10 seconds", {}),
+    (411, "The body came in chunks; send a Content-Length", {}),
     (421, "The Host header does not name this service", {}),
     (431, "The head of the request is too long", {}),
     (500, "A fault of the service, which it logs", {}),
@@ -178,15 +179,11 @@ _ASKING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (429, "More questions a second than --rate", _RETRY_AFTER),
     (503, "The database cannot be queried now, or too many questions wait", _RETRY_AFTER),
 )
-_SENDING: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
-    (411, "The body came in chunks; send a Content-Length", {}),
-)
 
 
-def refusals(*, asking: bool = False, sending: bool = False) -> dict[int | str, dict[str, Any]]:
-    """The refusals of a path; ``asking`` for a path that queries the database, ``sending`` for one
-    with a body."""
-    known = _EVERYWHERE + (_ASKING if asking else ()) + (_SENDING if sending else ())
+def refusals(*, asking: bool = False) -> dict[int | str, dict[str, Any]]:
+    """The refusals of a path; ``asking`` for a path that queries the database."""
+    known = _EVERYWHERE + (_ASKING if asking else ())
     return {
         status: {"model": Refusal, "description": text} | ({"headers": headers} if headers else {})
         for status, text, headers in sorted(known)

@@ -81,7 +81,7 @@ def create_app(
         summary="Ranked Places, a pose and a confidence",
         openapi_extra=QUESTION,
         response_model=Answer,
-        responses=refusals(asking=True, sending=True),
+        responses=refusals(asking=True),
         dependencies=[only(*OPTIONS)],
     )
     async def relocalize(

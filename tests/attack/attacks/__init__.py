@@ -14,6 +14,7 @@ from . import (
     projections,
     publishers,
     questions,
+    requests,
 )
 
 ATTACKS: dict[str, Attack] = {
@@ -26,6 +27,7 @@ ATTACKS: dict[str, Attack] = {
     "bombs": bombs.attack,
     "questions": questions.attack,
     "connections": connections.attack,
+    "requests": requests.attack,
     "projections": projections.attack,
     "exposure": exposure.attack,
 }
