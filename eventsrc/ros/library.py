@@ -218,6 +218,10 @@ class SqliteBag:
                 raise BadBag(f"it cannot be opened: {name} is no table")
             self._reader = Reader(path)
             self._reader.open()
+            for each in self._reader.connections:
+                names: tuple[object, ...] = (each.topic, each.msgtype)
+                if not all(isinstance(name, str) for name in names):
+                    raise BadBag("it cannot be opened: a topic whose name or type is no text")
         except self._faults as error:
             raise BadBag(f"it cannot be opened: {error}") from None
         finally:

@@ -211,6 +211,16 @@ def test_a_view_whose_rows_have_no_end_is_not_read(
         imported(tmp_path / "log", bag)
 
 
+def test_a_topic_whose_name_is_no_text_is_one_line(drives: dict[str, Path], tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite"], bag)
+    with sqlite3.connect(bag / "drive.db3") as database:
+        database.execute("UPDATE topics SET name = x'ff' WHERE name = '/tf'")
+    database.close()
+    with pytest.raises(MapfoldError, match="a topic whose name or type is no text"):
+        imported(tmp_path / "log", bag)
+
+
 def test_a_type_is_read_as_the_bag_defines_it_and_a_broken_definition_is_told(
     drives: dict[str, Path], tmp_path: Path
 ) -> None:

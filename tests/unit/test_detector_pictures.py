@@ -164,3 +164,8 @@ def test_how_a_crop_is_fitted() -> None:
     padded = fitted(half, (40, 40), "pad", cubic=False)
     assert padded[2, 2, 0] == 0
     assert padded[20, 2, 0] == 200
+
+
+def test_a_picture_over_64_mib_is_not_taken() -> None:
+    with pytest.raises(PictureError, match=r"67,108,864|64 MiB"):
+        decode(JPEG + bytes(64 * 1024 * 1024))

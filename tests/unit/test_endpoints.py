@@ -38,6 +38,7 @@ def test_an_endpoint_passes_unchanged(endpoint: str) -> None:
         ("tcp/127.0.0.1:70000", "'70000' is no port"),
         ("tcp/127.0.0.1:٧", "is no port"),
         ("tcp/127.0.0.1:-1", "'-1' is no port"),
+        ("tcp/127.0.0.1:" + "9" * 5_000, "is no port"),
     ],
 )
 def test_a_malformed_endpoint_is_named(text: str, complaint: str) -> None:
@@ -60,7 +61,7 @@ def test_an_address_is_a_port_or_host_and_port(text: str, address: tuple[str, in
     assert parse_address(text, "--metrics") == address
 
 
-@pytest.mark.parametrize("text", ["", "x", ":1", "host:", "70000", "host:-1"])
+@pytest.mark.parametrize("text", ["", "x", ":1", "host:", "70000", "host:-1", "9" * 5_000])
 def test_an_invalid_address_names_the_option(text: str) -> None:
     with pytest.raises(MisuseError, match=f"--metrics {text!r}"):
         parse_address(text, "--metrics")

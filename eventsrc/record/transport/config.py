@@ -10,6 +10,7 @@
 
 import ipaddress
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _is_port(text: str) -> bool:
-    return text.isascii() and text.isdigit() and int(text) <= 65_535
+    return re.fullmatch("[0-9]{1,5}", text) is not None and int(text) <= 65_535
 
 
 def _check_host_and_port(text: str, address: str) -> None:

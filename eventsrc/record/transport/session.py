@@ -244,6 +244,8 @@ def check_keys(key_exprs: Sequence[str]) -> None:
             parsed.append(zenoh.KeyExpr(text))
         except zenoh.ZError as error:
             raise MisuseError(f"key expression {text!r}: {one_line(error)}") from None
+        except UnicodeEncodeError:
+            raise MisuseError(f"key expression {text!r}: not UTF-8 text") from None
     for one, other in itertools.combinations(parsed, 2):
         if one.intersects(other):
             raise MisuseError(

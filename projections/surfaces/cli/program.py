@@ -17,6 +17,7 @@ both on to `run_app` as exceptions of their own.
 """
 
 import contextlib
+import errno
 import gc
 import importlib
 import inspect
@@ -32,7 +33,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO
 import typer
 from typer.core import TyperGroup
 
-from eventsrc.base.errors import MapfoldError
+from eventsrc.base.errors import MapfoldError, MisuseError
 
 from . import COMMANDS, SECTIONS
 from .in_force import remember_running
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 EXIT_INTERRUPTED: Final = 130
+_MAX_NAME: Final = 80
 EXIT_READER_GONE: Final = 141
 """128 + SIGPIPE, as a shell shows a program that writes to a closed pipe."""
 
@@ -314,6 +316,11 @@ def _exit_code(app: Callable[..., Any]) -> int:
     except MapfoldError as error:
         say(f"mapfold: {error}")
         return error.exit_code
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:  # of a name that was given
+            raise
+        say(f"mapfold: {str(error.filename)[:_MAX_NAME]}…: {error.strerror}; check the path")
+        return MisuseError.exit_code
     except OutputLost as lost:
         return _report_lost_output(lost)
     except _ReaderGone:
