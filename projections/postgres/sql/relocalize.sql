@@ -51,12 +51,13 @@ CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
 
 -- name: of_graph
 -- The same of the graph, and in the same row the properties of the Objects and Places in `followed`, by id.
+-- `concat`, as AGE 1.5 casts only scalars to text.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
     SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
     FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps},
-    (SELECT json_object_agg(id::text, properties::text) FROM {object}
+    (SELECT json_object_agg(id::text, concat(properties)) FROM {object}
      WHERE id = ANY(ARRAY(SELECT thing FROM observes))),
-    (SELECT json_object_agg(id::text, properties::text) FROM {place}
+    (SELECT json_object_agg(id::text, concat(properties)) FROM {place}
      WHERE id = ANY(ARRAY(SELECT place FROM located UNION SELECT place FROM in_place)))) END,
 {edges}
 
