@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 import psycopg
 
-from projections.database.server_user import server_identity, server_user
+from projections.postgres.server_user import server_identity, server_user
 from tests.servers import CARELESS
 
 PACKAGES: Final = ("base-files", "dash", "postgresql-17-age", "postgresql-17-pgvector")

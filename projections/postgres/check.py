@@ -36,7 +36,7 @@ from .connection import (
     describe_target,
     pin_session_settings,
 )
-from .cypher import PARENTS
+from .cypher import PARENTS, refuse_without_age
 from .graph_render import Row, expected_rows
 from .inputs import LogInputs, SettingsOf
 from .labels import GRAPH, LABELS, MAP_TABLE, TABLE, VERTEX_LABELS
@@ -188,6 +188,8 @@ def _check_sink(
         connection.read_only = True
         with database_errors(url):
             pin_session_settings(connection)
+            if sink == "graph":
+                refuse_without_age(connection)
             connection.commit()
             locked = _lock_tables(connection, sink)
             checkpoint = checkpoints.load(connection, sink)

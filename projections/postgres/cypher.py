@@ -70,6 +70,17 @@ def _load_age(connection: Connection) -> None:
     connection.execute('SET search_path = ag_catalog, "$user", public')
 
 
+def refuse_without_age(connection: Connection) -> None:
+    """Raise ExtensionMissing if this user may not use AGE's operators, which reads of the graph's
+    tables by id need too; the server's own message would name an operator."""
+    row = connection.execute(
+        "SELECT has_schema_privilege(oid, 'USAGE') FROM pg_catalog.pg_namespace"
+        " WHERE nspname = 'ag_catalog'"
+    ).fetchone()
+    if row is not None and not row[0]:
+        raise ExtensionMissing(_age_forbidden(connection))
+
+
 def _age_forbidden(connection: Connection) -> str:
     connection.rollback()
     user, version = connection.info.user, extension_version(connection, "age") or ""

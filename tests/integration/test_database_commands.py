@@ -96,6 +96,17 @@ def test_check_and_repair(own_server: Commands, log: Path) -> None:
     assert not server(own_server).running
 
 
+def test_status_and_check_try_a_question(mapfold: Commands, log: Path, pg_url: str) -> None:
+    assert mapfold("replay", log).code == 0
+    with psycopg.connect(pg_url) as connection:
+        connection.execute(
+            "UPDATE mapfold.checkpoint SET settings = %s WHERE sink = 'graph'", ['{"no_such": 1}']
+        )
+    for command in (["status", log], ["db", "check", log]):
+        assert "questions cannot be answered: database" in mapfold(*command, code=3).out
+        assert "question_error" in mapfold(*command, "--json", code=3).json
+
+
 def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     append_raw(log, b"neither fish nor fowl")
     assert "cannot be folded" in mapfold("replay", log, code=1).err

@@ -15,6 +15,7 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, extension_version
 from projections.postgres.cypher import connect_for_cypher, enforces_row_security
 from projections.postgres.grants import roles_sql
+from projections.postgres.queries.relocalize import CandidateReader
 from projections.postgres.status import projection_status
 from tests.drops import wait_for_drops
 from tests.logs import bridge, walk, write_log
@@ -216,6 +217,12 @@ def test_without_row_security_readers_may_not_use_cypher_and_status_names_who_ca
     url = as_role(projected, "a_reader").graph_url
     with pytest.raises(ExtensionMissing, match="a_reader may not use Apache AGE"):
         connect_for_cypher(url)
+    for ask in (
+        lambda: CandidateReader(Targets(url, url)),
+        lambda: check(log, Targets(url, url), SETTINGS),
+    ):
+        with pytest.raises(ExtensionMissing, match="a_reader may not use Apache AGE"):
+            ask()
     with connect(url) as connection:
         assert connection.execute('SELECT properties FROM semantic_map."Place"').fetchall()
 

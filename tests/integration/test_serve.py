@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.record.transport.session import ZenohOptions, open_session
-from projections.fold.errors import DatabaseUnavailable, ProjectionMissing
+from projections.fold.errors import DatabaseError, DatabaseUnavailable, ProjectionMissing
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Connection, Targets, connect
@@ -167,6 +167,17 @@ def test_health_is_at_most_a_second_old_and_fresh_after_a_question_that_failed(
         with pytest.raises(ProjectionMissing):
             answerer.relocalize(question(), {})
         assert not healthy()
+
+
+def test_health_tries_a_question(one_database: Targets, tmp_path: Path) -> None:
+    """Server, checkpoints and rows are there, and yet no question can be answered."""
+    rebuild(write_log(tmp_path / "log", walk(10)), one_database, Settings())
+    with Pools(one_database, 1) as pools:
+        answerer = Answerer(pools, per_second=10_000.0)
+        with connect(one_database.graph_url, autocommit=True) as owner:
+            owner.execute("ALTER TABLE detection_embeddings RENAME COLUMN map_yaw TO turned")
+        with pytest.raises(DatabaseError, match=r'"map_yaw" does not exist'):
+            answerer.health()
 
 
 @pytest.mark.slow

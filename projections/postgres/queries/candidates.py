@@ -103,6 +103,16 @@ class CandidateSearch:
         refuse_unknown_classes(crops, found.matches, self._class_names)
         return found
 
+    def try_question(self) -> None:
+        """Ask a question of one observation that is stored, if there is one. Raises DatabaseError
+        when questions cannot be answered."""
+        with _query_errors(self._targets.vector_url):
+            row = self._vectors.execute(
+                "SELECT embedding FROM public.detection_embeddings LIMIT 1", binary=True
+            ).fetchone()
+        if row is not None:
+            self.candidates([Crop(row[0].to_numpy())])
+
     def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Linked]":
         """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
         Places."""

@@ -13,7 +13,7 @@ from pgvector.psycopg import register_vector
 from psycopg import sql
 
 from eventsrc.base.advised import advised
-from projections.fold.errors import ExtensionMissing
+from projections.fold.errors import DatabaseError, ExtensionMissing
 from projections.localize.relocalize import (
     NEIGHBOURS,
     Answer,
@@ -31,6 +31,7 @@ from projections.postgres.connection import (
     database_errors,
     describe_connection,
 )
+from projections.postgres.cypher import refuse_without_age
 
 from .candidates import CandidateSearch
 from .known_constants import ConstantsMemory
@@ -52,12 +53,25 @@ def relocalize(
         return rank(question, reader.candidates(crops), top=top, method=method, camera=camera)
 
 
+def question_error(targets: Targets) -> str | None:
+    """Why questions cannot be answered, found by asking one; None if they can."""
+    try:
+        with CandidateReader(targets) as reader:
+            reader.try_question()
+    except DatabaseError as error:
+        return str(error)
+    return None
+
+
 def prepare_graph(connection: Connection) -> None:
     """Set up a session for joins of the graph's tables by id; ag_catalog comes last in the path.
+
+    Raises ExtensionMissing for a user who may not use AGE.
 
     A question joins a few hundred ids. By default the planner reads whole tables into hashes for
     that: 300 ms instead of 10 at 300,000 observations.
     """
+    refuse_without_age(connection)
     connection.execute('SET search_path = "$user", public, ag_catalog')
     for setting in ("jit", "enable_hashjoin", "enable_mergejoin"):
         connection.execute(sql.SQL("SET {} = off").format(sql.Identifier(setting)))
@@ -82,8 +96,8 @@ def prepare_vectors(connection: Connection) -> None:
 class CandidateReader:
     """Connections to the databases of one projection, for one question after the other."""
 
-    def __init__(self, targets: Targets) -> None:
-        self._targets, self._memory = targets, ConstantsMemory()
+    def __init__(self, targets: Targets, memory: ConstantsMemory | None = None) -> None:
+        self._targets, self._memory = targets, memory or ConstantsMemory()
         self._vectors = connect(targets.vector_url, application="mapfold query", autocommit=True)
         self._graph = self._vectors
         try:
@@ -93,15 +107,22 @@ class CandidateReader:
                 self._graph = connect(
                     targets.graph_url, application="mapfold query", autocommit=True
                 )
-            prepare_graph(self._graph)
+            with database_errors(targets.graph_url):
+                prepare_graph(self._graph)
         except BaseException:
-            self._vectors.close()
+            self.close()
             raise
 
     def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
         """The ``neighbours`` observations most similar to each crop, with their Places."""
-        search = CandidateSearch(self._targets, self._vectors, self._graph, self._memory)
-        return search.candidates(crops, neighbours)
+        return self._search().candidates(crops, neighbours)
+
+    def try_question(self) -> None:
+        """Ask one question. Raises DatabaseError when questions cannot be answered."""
+        self._search().try_question()
+
+    def _search(self) -> CandidateSearch:
+        return CandidateSearch(self._targets, self._vectors, self._graph, self._memory)
 
     def disable_index(self) -> None:
         """From now on search exactly, without the HNSW index: slow."""

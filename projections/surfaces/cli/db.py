@@ -2,7 +2,7 @@
 embedded server, check and repair of the databases, roles, retry."""
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -14,7 +14,9 @@ from projections.postgres.check import CheckReport
 from projections.postgres.check import check as check_projections
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.grants import roles_sql
+from projections.postgres.queries.relocalize import question_error
 from projections.postgres.retry import retry
+from projections.postgres.sink import SinkName
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .databases import OnlyOption, only_of
@@ -89,7 +91,8 @@ def check(
     settings_file: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the databases with LOG at their checkpoints, row by row; exit 3 if they differ."""
+    """Compare the databases with LOG at their checkpoints, row by row, and try one question; exit 3
+    if they differ or it fails."""
     settings = settings_of(settings_file, assignments)
     with databases(db, vector_db) as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
@@ -105,17 +108,20 @@ def check(
                 known_at=report.known_at,
                 only=report.sink,
             )
+        failure = question_error(targets) if len(reports) == len(get_args(SinkName)) else None
     if as_json:
-        emit({"sinks": [_check_document(r) for r in reports], "repaired": bool(repaired)})
+        document = {"sinks": [_check_document(r) for r in reports], "repaired": bool(repaired)}
+        emit(_with_failure(document, failure))
     else:
         _print_check(reports)
+        _print_failure(failure)
         for report in repaired:
             say(f"{report.sink}: rebuilt")
         if wrong and not repair:
             say(f"to repair it run: {advised('db', 'check', '--repair', log)}")
         elif len(repaired) < len(wrong):
             say("graph: not rebuilt, as that would drop what is not ours; remove it first")
-    finish(findings=not all(report.sound for report in reports))
+    finish(findings=failure is not None or not all(report.sound for report in reports))
 
 
 @group.command()
@@ -185,7 +191,7 @@ def status(
     settings_file: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show offsets, lag, checkpoints, dead letters, rejected, losses, versions.
+    """Show offsets, lag, checkpoints, dead letters, rejected, losses, versions; try one question.
 
     Exit 3 on findings.
     """
@@ -193,11 +199,25 @@ def status(
     info = log_info(log)
     with databases(db, vector_db) as targets:
         found = projection_status(log, targets, settings)
+        away = any(sink.condition in ("missing", "unreachable") for sink in found.sinks)
+        failure = None if away else question_error(targets)
     if as_json:
-        emit(status_document(info, found))
+        emit(_with_failure(status_document(info, found), failure))
     else:
         _print_status(info, found)
-    finish(findings=not found.healthy or bool(info.rejected) or bool(info.lost))
+        _print_failure(failure)
+    wrong = not found.healthy or failure is not None
+    finish(findings=wrong or bool(info.rejected) or bool(info.lost))
+
+
+def _with_failure(document: dict[str, Any], failure: str | None) -> dict[str, Any]:
+    """The document with ``question_error`` if questions cannot be answered."""
+    return document if failure is None else document | {"question_error": failure}
+
+
+def _print_failure(failure: str | None) -> None:
+    if failure is not None:
+        display(f"questions cannot be answered: {failure}")
 
 
 def status_document(info: LogInfo, found: Status) -> dict[str, Any]:

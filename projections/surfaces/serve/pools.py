@@ -26,7 +26,7 @@ from projections.postgres.connection import (
 )
 from projections.postgres.queries.candidates import CandidateSearch
 from projections.postgres.queries.known_constants import ConstantsMemory
-from projections.postgres.queries.relocalize import prepare_graph, prepare_vectors
+from projections.postgres.queries.relocalize import CandidateReader, prepare_graph, prepare_vectors
 from projections.postgres.sink import SinkName
 
 OUTAGE_TIMEOUT_S: Final = 10.0
@@ -92,7 +92,8 @@ class Pools:
     ) -> None:
         self._targets, self._size, self._outage = targets, size, Outage(note)
         self._memory = ConstantsMemory()
-        self.check()  # a clear error at once; a pool would retry without one
+        self._require_maps()  # a clear error at once; a pool would retry without one
+        CandidateReader(targets).close()
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
         self._graph = self._vectors
         if not targets.one_database:
@@ -103,10 +104,16 @@ class Pools:
         prepare_graph(connection)
 
     def check(self) -> None:
-        """Restart the embedded server if it died. Raises DatabaseError unless there is a map.
+        """Restart the embedded server if it died. Raises DatabaseError unless there is a map that
+        answers a question.
 
         Uses new connections, so that it sees the present state.
         """
+        self._require_maps()
+        with CandidateReader(self._targets, self._memory) as reader:
+            reader.try_question()
+
+    def _require_maps(self) -> None:
         self._targets.restart_embedded()
         _require_map("graph", self._targets.graph_url)
         _require_map("vectors", self._targets.vector_url)
@@ -151,7 +158,7 @@ class Pools:
         """Wait until the server is back; raise its error when it stays away."""
         while True:
             try:
-                self.check()
+                self._require_maps()
             except DatabaseUnavailable as error:
                 self._outage.begin(error)
                 if not self._outage.worth_waiting:
