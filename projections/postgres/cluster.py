@@ -10,16 +10,23 @@
 """
 
 import contextlib
+import errno
 import os
+import select
 import shutil
+import signal
 import socket
+import stat
+import struct
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Final
 
+from eventsrc.base.advised import advised
 from projections.fold.errors import EmbeddedServerError
 
 from .server_user import (
@@ -78,11 +85,19 @@ class Cluster:
     programs: Path
 
     def create(self) -> None:
-        """Make the data folder if it does not exist."""
-        if (self.data / "PG_VERSION").exists():
-            return
+        """Make the data folder if it does not exist. Raises EmbeddedServerError for another."""
+        with _server_errors("read", self.data):
+            if (self.data / "PG_VERSION").exists():
+                return
+            if self.data.is_symlink() or (self.data.exists() and not _is_empty(self.data)):
+                raise EmbeddedServerError(
+                    f"{self.data}: there is no PG_VERSION in it, so it is damaged or no data folder"
+                    f" of PostgreSQL; {reset_advice()}"
+                )
         new = self.data.with_name(self.data.name + ".new")
         with _server_errors("make a data folder", self.data):
+            if new.is_symlink() or new.is_file():
+                new.unlink()
             shutil.rmtree(new, ignore_errors=True)
             new.mkdir(parents=True, mode=0o700)
             give_to_server_user(new)
@@ -93,6 +108,50 @@ class Cluster:
                 "--locale", "C", "--no-instructions", "--no-sync",
             )  # fmt: skip
             new.rename(self.data)
+
+    def set_aside(self) -> Path | None:
+        """Rename the data folder, damaged or not, after its server was stopped; its new name. None
+        if there is none.
+
+        Raises EmbeddedServerError.
+        """
+        if not os.path.lexists(self.data):
+            return None
+        with _server_errors("set aside", self.data):
+            if self._trusted() and self.running():
+                self._stop_listener()
+            numbered = (self.data.with_name(f"{self.data.name}.aside-{n}") for n in count(1))
+            aside = next(name for name in numbered if not os.path.lexists(name))
+            self.data.rename(aside)
+            return aside
+
+    def _stop_listener(self) -> None:
+        """Stop the server that listens on the socket, without a look at any of its files.
+
+        SO_PEERCRED names the process that called listen(), which is the postmaster.
+        """
+        folder = self.socket_dir()
+        if folder is None or not hasattr(socket, "SO_PEERCRED"):
+            self.stop()
+            return
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(PROBE_SECONDS)
+            probe.connect(str(folder / SOCKET_NAME))
+            answer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        process, user, _ = struct.unpack("3i", answer)
+        if user != server_uid():
+            raise EmbeddedServerError(f"{self.data}: user {user} listens on its socket; stop that")
+        ended = os.pidfd_open(process)
+        try:
+            signal.pidfd_send_signal(ended, signal.SIGQUIT)
+            if not select.select([ended], [], [], START_SECONDS)[0]:
+                raise EmbeddedServerError(f"{self.data}: process {process} does not end; kill it")
+        finally:
+            os.close(ended)
+
+    def _trusted(self) -> bool:
+        status = self.data.lstat()
+        return stat.S_ISDIR(status.st_mode) and status.st_uid == server_uid()
 
     def running(self) -> bool:
         """True when a server accepts a connection on this folder's socket.
@@ -133,7 +192,9 @@ class Cluster:
             (self.data / LOG_NAME).replace(self.data / f"{LOG_NAME}.1")
         with _server_errors("start", self.data):
             let_server_user_enter(self.data, self.programs)
-            _remove_stale_locks(self.data / "postmaster.pid", folder / f"{SOCKET_NAME}.lock")
+            _remove_stale_locks(
+                self.data, self.data / "postmaster.pid", folder / f"{SOCKET_NAME}.lock"
+            )
             self._run(
                 "pg_ctl", "start", "--wait", "--timeout", str(START_SECONDS), "--silent",
                 "--pgdata", str(self.data), "--log", str(self.data / LOG_NAME),
@@ -145,10 +206,15 @@ class Cluster:
         with _server_errors("stop", self.data):
             # A folder above may have been closed since the start; pg_ctl must still get in.
             let_server_user_enter(self.data, self.programs)
-            self._run(
-                "pg_ctl", "stop", "--wait", "--timeout", str(STOP_SECONDS), "--mode", "fast",
-                "--silent", "--pgdata", str(self.data),
-            )  # fmt: skip
+            try:
+                self._run(
+                    "pg_ctl", "stop", "--wait", "--timeout", str(STOP_SECONDS), "--mode", "fast",
+                    "--silent", "--pgdata", str(self.data),
+                )  # fmt: skip
+            except subprocess.CalledProcessError as error:
+                if "does not shut down" not in str(error.output):
+                    raise
+                self._stop_listener()  # damaged data can keep it in recovery for ever
 
     def socket_dir(self) -> Path | None:
         """The folder of the server's socket; None when it will be chosen at the next start."""
@@ -169,7 +235,7 @@ class Cluster:
             raise EmbeddedServerError(
                 f"{self.data}: of user {status.st_uid}, mode {status.st_mode & 0o777:o}: only a"
                 f" folder that {server_user()} alone can write is trusted; set MAPFOLD_HOME to"
-                " another folder, or give a database of your own with --db"
+                f" another folder, or make this one again: {reset_advice()}"
             )
 
     def _run(self, program: str, *arguments: str) -> None:
@@ -191,21 +257,22 @@ class Cluster:
             raise subprocess.CalledProcessError(result.returncode, program, text)
 
 
-def _remove_stale_locks(*locks: Path) -> None:
-    """Remove lock files whose process is a zombie; PostgreSQL takes such a server for alive."""
+def _remove_stale_locks(data: Path, *locks: Path) -> None:
+    """Remove lock files whose process is a zombie, or no server of ``data``, which is a server's
+    current folder: after a crash of the machine another process may have its number. PostgreSQL
+    takes both for a server that is alive."""
     for lock in locks:
         # No such file, no such process, or no /proc on this system: nothing to remove.
-        with contextlib.suppress(OSError, IndexError):
-            pid = lock.read_text().split()[0]
-            status = Path("/proc", pid, "stat").read_text()
-            if status.rpartition(")")[2].split()[0] == "Z":
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            process = Path("/proc", str(int(lock.read_text().split()[0])))
+            state = (process / "stat").read_text().rpartition(")")[2].split()[0]
+            if state == "Z" or not (process / "cwd").samefile(data):
                 lock.unlink()
 
 
 @contextlib.contextmanager
 def _server_errors(what: str, data: Path) -> Iterator[None]:
     """Turn failures into one EmbeddedServerError that quotes the program and the server's log."""
-    advice = "or give a database of your own with --db"
     try:
         yield
     except subprocess.CalledProcessError as error:
@@ -213,12 +280,35 @@ def _server_errors(what: str, data: Path) -> Iterator[None]:
         logged = log.read_text("utf-8", "replace") if log.exists() else ""
         reason = " / ".join([*_last_lines(str(error.output)), *_last_lines(logged)])
         raise EmbeddedServerError(
-            f"{data}: the embedded server did not {what}: {reason} (log: {log}); fix it, {advice}"
+            f"{data}: the embedded server did not {what}: {reason} (log: {log});"
+            f" {_advice(what, reason)}"
         ) from None
     except OSError as error:
         raise EmbeddedServerError(
-            f"{data}: the embedded server did not {what}: {error}; fix it, {advice}"
+            f"{data}: the embedded server did not {what}: {error}; {_advice(what, str(error))}"
         ) from None
+
+
+def _advice(what: str, reason: str) -> str:
+    if os.strerror(errno.ENOSPC) in reason:
+        return "free space on that disk, or set MAPFOLD_HOME to a folder on another"
+    if os.strerror(errno.EROFS) in reason:
+        return "set MAPFOLD_HOME to a folder on a disk that can be written"
+    if what in ("start", "read"):
+        return reset_advice()
+    return "fix it, or give a database of your own with --db"
+
+
+def reset_advice() -> str:
+    """What to do about damaged data."""
+    return (
+        f"all in it comes from logs: run `{advised('db', 'reset')}`, which sets it aside and makes"
+        f" a new one, then `{advised('replay')}`; or give a database of your own with --db"
+    )
+
+
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _last_lines(text: str) -> list[str]:

@@ -25,6 +25,7 @@ from psycopg.rows import TupleRow
 from eventsrc.base.errors import MisuseError
 from projections.fold.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
+from .cluster import SUPERUSER, reset_advice
 from .embedded import EmbeddedServer, embedded_log
 
 Connection = psycopg.Connection[TupleRow]
@@ -269,6 +270,9 @@ def _advice(error: psycopg.Error, url: str) -> str:
         )
     if "password" in text or "authentication" in text or "pg_hba" in text:
         return "check user and password in the URL"
+    damaged = ("could not open", "could not read", f'"{SUPERUSER}" does not exist')
+    if log is not None and any(words in text for words in damaged):
+        return f"its data is damaged (log: {log}); {reset_advice()}"
     if "does not exist" in text and "database" in text:
         return "create it with createdb, or name another in the URL"
     if "does not exist" in text and "role" in text:

@@ -159,6 +159,19 @@ class EmbeddedServer:
             self._cluster.stop()
             return False
 
+    def reset(self) -> Path | None:
+        """Set the data folder aside and make a new one; where the old one is now, None if there was
+        none. Refused while another process uses the server."""
+        with self._exclusive(), _signals_blocked():
+            if not self._is_last_user():
+                raise EmbeddedServerError(
+                    f"{self.data}: another command uses the server; end it first, then run"
+                    f" `{advised('db', 'reset')}` again"
+                )
+            aside = self._cluster.set_aside()
+            self._cluster.create()
+            return aside
+
     def __enter__(self) -> Self:
         try:
             return self.start()

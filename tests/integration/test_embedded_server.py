@@ -1,9 +1,12 @@
 """The embedded server: shared by commands, stopped by the last, never left running."""
 
 import os
+import select
+import shutil
 import signal
+import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -14,6 +17,8 @@ import pytest
 from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
 from projections.postgres.connection import connect, database_errors
 from projections.postgres.embedded import EmbeddedServer
+from tests.commands import Commands
+from tests.logs import walk, write_log
 from tests.prefork import Process, start
 from tests.servers import furnish
 from tests.thorough import mostly_slow
@@ -199,3 +204,123 @@ def test_a_missing_library_is_not_taken_for_a_server_that_went_away(
     assert "could not access file" in str(told.value)
     assert "went away" not in str(told.value)
     assert "closed to the server's user" in str(told.value)
+
+
+def _cut(data: Path) -> None:
+    os.truncate(data / "global" / "pg_control", 100)
+
+
+def _unlink_version(data: Path) -> None:
+    (data / "PG_VERSION").unlink()
+
+
+def _empty_lock(data: Path) -> None:
+    (data / "postmaster.pid").touch()
+
+
+def _foreign_line(data: Path) -> None:
+    with (data / "postgresql.conf").open("a") as settings:
+        settings.write("a foreign line\n")
+
+
+def _remove_databases(data: Path) -> None:
+    shutil.rmtree(data / "base")
+
+
+def _link_to_nothing(data: Path) -> None:
+    data.rename(data.with_name("moved"))
+    data.symlink_to("nowhere")
+
+
+def _file_instead(data: Path) -> None:
+    shutil.rmtree(data)
+    data.touch()
+
+
+DAMAGES = (
+    _unlink_version, _cut, _empty_lock, _foreign_line, _remove_databases, _link_to_nothing,
+    _file_instead,
+)  # fmt: skip
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("damage", mostly_slow(DAMAGES))
+def test_damaged_data_names_db_reset_which_makes_it_usable(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
+        mapfold = Commands.in_folder(tmp_path, MAPFOLD_HOME=folder)
+        log = write_log(tmp_path / "log", walk(10))
+        data = furnish(Path(folder)) / "pg"
+        with EmbeddedServer(Path(folder)):
+            pass
+        damage(data)
+        said = mapfold("replay", log, code=1).err
+        assert "run `mapfold db reset`" in said
+        assert "then `mapfold replay " in said
+        done = mapfold("db", "reset", "--json").json
+        assert done == {"data": str(data), "aside": f"{data}.aside-1"}
+        assert os.path.lexists(done["aside"])
+        assert "10 events" in mapfold("replay", log).err
+        assert not EmbeddedServer(Path(folder)).running
+
+
+def test_reset_stops_a_kept_server_whose_lock_file_is_damaged(home: Path) -> None:
+    server = EmbeddedServer(home).start(keep=True)
+    server.stop()
+    process = int((server.data / "postmaster.pid").read_text().split()[0])
+    ended = os.pidfd_open(process)
+    try:
+        (server.data / "postmaster.pid").write_bytes(b"no number\n")
+        aside = server.reset()
+        assert select.select([ended], [], [], WAIT_S)[0]
+    finally:
+        os.close(ended)
+    assert aside == home / "pg.aside-1"
+    shutil.rmtree(server.data)
+    aside.rename(server.data)  # as the other tests of this module go on with it
+    (server.data / "postmaster.pid").unlink(missing_ok=True)
+
+
+@pytest.mark.slow
+def test_a_server_that_damaged_data_keeps_in_recovery_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("projections.postgres.cluster.STOP_SECONDS", 5)
+    with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
+        data = furnish(Path(folder)) / "pg"
+        with EmbeddedServer(Path(folder)):
+            pass
+        (data / "global" / "pg_filenode.map").unlink()
+        with EmbeddedServer(Path(folder)) as server:
+            ended = os.pidfd_open(int((data / "postmaster.pid").read_text().split()[0]))
+            with pytest.raises(psycopg.OperationalError):
+                psycopg.connect(server.url)
+        assert select.select([ended], [], [], 0)[0]
+        os.close(ended)
+        assert server.reset() == data.with_name("pg.aside-1")
+
+
+def test_reset_is_refused_while_another_command_uses_the_server(home: Path) -> None:
+    with holder(home) as (other, _):
+        with pytest.raises(EmbeddedServerError, match="another command uses the server"):
+            EmbeddedServer(home).reset()
+        assert answers(EmbeddedServer(home))
+        assert other.poll() is None
+
+
+def test_a_lock_file_that_names_another_process_does_not_hinder_a_start(home: Path) -> None:
+    """As after a crash of the machine, when another process of the same user has that number."""
+    with EmbeddedServer(home) as server:
+        lock = server.data / "postmaster.pid"
+        left = lock.read_text().splitlines()
+        owner = server.data.stat().st_uid
+    other = subprocess.Popen(["sleep", str(WAIT_S)], cwd="/", user=owner)
+    try:
+        lock.write_text("\n".join([str(other.pid), *left[1:]]) + "\n")
+        with EmbeddedServer(home) as again:
+            assert answers(again)
+        assert other.poll() is None
+    finally:
+        other.kill()
+        other.wait(WAIT_S)

@@ -51,6 +51,7 @@ WITHOUT = {
     "db url": "reads no log",
     "db start": "reads no log",
     "db stop": "reads no log",
+    "db reset": "reads no log",
     "db roles": "reads no log",
     "query similar": "asks the databases",
     "log info": "reads indexes only",

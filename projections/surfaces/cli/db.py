@@ -79,6 +79,22 @@ def stop(as_json: JsonOption = False) -> None:
 
 
 @group.command()
+def reset(as_json: JsonOption = False) -> None:
+    """Set the embedded server's data aside, damaged or not, and make new, empty data.
+
+    Nothing is lost: replay makes the databases again from each log.
+    """
+    server = EmbeddedServer()
+    aside = server.reset()
+    if as_json:
+        emit({"data": str(server.data), "aside": None if aside is None else str(aside)})
+        return
+    if aside is not None:
+        say(f"set aside: {aside}; remove it when you do not need it")
+    say(f"new and empty: {server.data}; fill it with: {advised('replay')}")
+
+
+@group.command()
 def check(
     log: LogArgument,
     only: OnlyOption = None,
