@@ -351,10 +351,13 @@ class TailPass:
             self.plan.on_batch(self.report)
 
     def _use_names(self, fold: LiveFold, offset: Offset) -> None:
-        """Apply the names given by the commands up to ``offset``."""
+        """Apply the names given by the commands up to ``offset``; between a command that changes
+        more and the one that undoes it the map stays as known before both."""
         known_at = Offset(max(self.current.known_at, offset + 1))
         if not self.inputs.has_between(self.current.known_at, known_at):
             self.current = self.current.known_to(known_at)
             return
-        self.current = self.inputs.at(known_at)
-        fold.use_names(offset, self.current.corrections)
+        known = self.inputs.at(known_at)
+        if self.current.differs_only_in_names(known):
+            self.current = known
+            fold.use_names(offset, known.corrections)

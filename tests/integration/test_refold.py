@@ -94,6 +94,17 @@ def test_commands_come_to_the_rows_of_a_fresh_replay(
     assert all_rows(targets) == before
 
 
+def test_a_batch_may_end_between_a_command_and_its_undo(
+    log: Path, one_database: Targets, third_database: Targets
+) -> None:
+    tail(log, one_database, SETTINGS, once=True)
+    given = forget_run("run-b")
+    for each in (given, name_place(3, "kitchen"), undo(given)):
+        append_command(log, each)
+    assert tail(log, one_database, SETTINGS, once=True, batch_events=1).refolds == 0
+    assert all_rows(one_database) == fresh_rows(log, third_database)
+
+
 @pytest.mark.slow
 def test_an_undone_command_gives_the_digest_of_before(log: Path, one_database: Targets) -> None:
     rebuild(log, one_database, SETTINGS)
