@@ -86,8 +86,10 @@ class HistoryFacts:
 
     @property
     def objects_merge(self) -> bool:
-        """Whether two objects become one, or change their class: counts of objects may fall."""
-        return bool(self._history.object_merges) or any(o.classes for o in self._history.objects)
+        """Whether two objects became one, or changed their class: counts of objects may have
+        fallen."""
+        reclassified = (o.classes[0].offset for o in self._history.objects if o.classes)
+        return self._count(self._index.fused) > 0 or any(at < self.end for at in reclassified)
 
     def place_count(self) -> int:
         return self._count(self._index.formed) - self._count(self._index.absorbed)

@@ -279,6 +279,13 @@ def test_a_difference_finds_a_merge_that_a_later_command_made_earlier(corridor: 
     assert diff.absorbed["run-a_p2"][1].offset == 11
 
 
+def test_a_search_does_not_depend_on_objects_that_merge_later(corridor: Open) -> None:
+    timeline = corridor(ONE_CUP)  # by the event at offset 8
+    for end, asked in ((8, 2), (9, 2 + 9)):
+        found = timeline.bisect("object_count > 50", end=Offset(end), known_at=timeline.end)
+        assert found.document()["maps_asked"] == asked
+
+
 def test_objects_made_one(corridor: Open) -> None:
     timeline = corridor(ONE_CUP)
     known = timeline.knowing()
