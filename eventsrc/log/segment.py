@@ -76,8 +76,9 @@ class Scan:
 class SegmentFile:
     """An open segment file with the content of its head."""
 
+    _fd = -1  # for __del__, should opening fail or be interrupted
+
     def __init__(self, path: Path, base: Offset) -> None:
-        self._fd = -1  # for __del__, should opening fail
         self.path = path
         self.base = base
         self.chunks: list[ChunkRef] = []

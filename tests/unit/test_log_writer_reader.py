@@ -12,6 +12,7 @@ import pytest
 from eventsrc.base.errors import LogBusy, LogError, LogNotFound, NotALog
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log.lock import is_held
+from eventsrc.log.sealed_segment import SealedFile
 from eventsrc.record.log_info import log_info
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 
@@ -160,3 +161,8 @@ def test_reading_by_key_gives_only_that_key(log_path: Path) -> None:
     with LogReader(log_path) as reader:
         assert [e.offset for e in reader.read(keys={"k/1"})] == list(range(1, 30, 3))
         assert list(reader.read(keys={"absent"})) == []
+
+
+def test_a_segment_whose_opening_was_interrupted_at_once_closes() -> None:
+    """As when it is deleted: an error there is printed."""
+    SealedFile.__new__(SealedFile).close()
