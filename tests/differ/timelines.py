@@ -162,10 +162,10 @@ class TimelineWays:
         with Timeline(self._log, self._settings, cache=self._rng.random() < 0.5) as timeline:
             for end, known_at in points:
                 asked = partial(timeline.at, Offset(end), known_at=Offset(known_at))
-                with interrupted(int(10 ** self._rng.uniform(0.5, 4.5))):
-                    outcome(lambda: whole(asked()))  # noqa: B023  # called at once
+                ask = partial(outcome, lambda: whole(asked()))  # noqa: B023  # called at once
+                interrupt(ask, int(10 ** self._rng.uniform(0.5, 4.5)))
                 if self._rng.random() < 0.7:
-                    found = outcome(lambda: whole(asked()))  # noqa: B023  # called at once
+                    found = ask()
                     self._tally.compare(
                         "interrupted", found, expected[end, known_at], (end, known_at)
                     )
@@ -184,25 +184,25 @@ class TimelineWays:
         self._tally.compare("threads", digests, [alone[end] for end in asked], asked)
 
 
-@contextmanager
-def interrupted(calls: int) -> Iterator[None]:
-    """Raise at a function call, the ``calls``-th of this block, and suppress that."""
-    left = calls
+def interrupt(work: Callable[[], object], calls: int) -> None:
+    """Do ``work``, in which the ``calls``-th function call raises; suppress that."""
+    left, armed = calls, True
 
     def counted(_frame: FrameType, event: str, _: object) -> None:
         nonlocal left
-        left -= event in ("call", "c_call")
-        if left == 0:
+        left -= armed and event in ("call", "c_call")
+        if armed and left == 0:
             sys.setprofile(None)
             raise Interrupted
 
     try:
         sys.setprofile(counted)
-        try:
-            yield
-        finally:
-            sys.setprofile(None)
+        work()
+        armed = False
     except BaseException:
+        armed = False
         if left > 0:
             raise
         # pydantic makes an error of its own of what is raised in its serializers.
+    finally:
+        sys.setprofile(None)
