@@ -97,9 +97,12 @@ class LogInputs:
     _made: dict[int, MapInputs] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, reader: LogReader, settings: Settings | SettingsOf) -> Self:
-        """Read the commands of the whole log. Raises FoldError for one that cannot be read."""
-        end = reader.next_offset
+    def read(
+        cls, reader: LogReader, settings: Settings | SettingsOf, end: Offset | None = None
+    ) -> Self:
+        """Read the commands before ``end``, of the whole log for None. Raises FoldError for one
+        that cannot be read."""
+        end = reader.next_offset if end is None else end
         settings_of = _fixed(settings) if isinstance(settings, Settings) else settings
         return cls(read_commands(reader, end), settings_of, end)
 

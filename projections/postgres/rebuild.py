@@ -93,7 +93,7 @@ def rebuild(
         workers = default_workers()
     with gc_paused(), LogReader(log) as reader:
         total = reader.next_offset if until is None else min(until, reader.next_offset)
-        inputs = LogInputs.read(reader, settings).at(total if known_at is None else known_at)
+        inputs = LogInputs.read(reader, settings, total if known_at is None else known_at).latest
         fold = LiveFold(inputs.settings, corrections=inputs.corrections, reader=reader)
         folded_at = started
 

@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 
 from eventsrc.envelope.commands import Reembed, UseSettings
-from eventsrc.envelope.model import DetId
+from eventsrc.envelope.model import DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
 from projections.fold.objects import object_id
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
 from tests.commands import Commands
 from tests.commands_in_logs import append_command, command, forget_run, keep_apart
 from tests.corrected_logs import EVENTS, LEFT, documents
@@ -183,3 +186,13 @@ def test_an_answer_does_not_depend_on_later_events(
             if (found := _said(tmp_path, name, *more)) != expected
         ]
     assert not differing
+
+
+@pytest.mark.parametrize("hindrance", mostly_slow(["no command", "unfoldable", "rotten"]))
+def test_a_replay_to_w_does_not_depend_on_later_events(
+    before: Path, tmp_path: Path, hindrance: str, one_database: Targets
+) -> None:
+    log = shutil.copytree(before / "log", tmp_path / "log")
+    expected = rebuild(log, one_database, Settings(), until=Offset(W), workers=0).digest
+    HINDRANCES[hindrance][0](log)
+    assert rebuild(log, one_database, Settings(), until=Offset(W), workers=0).digest == expected
