@@ -6,6 +6,7 @@ from functools import cached_property
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader
@@ -14,7 +15,7 @@ from projections.fold.deltas import PlaceOrdinal, PlacesMerged
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.history import NoSuchThing
-from projections.map.fold import READ_AHEAD, fold_events, fold_log_cached, gc_paused
+from projections.map.fold import READ_AHEAD, fold_events, fold_log_cached
 from projections.map.log_commands import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.space_vectors import new_map

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.commands import (
     Anchor,
     Command,
@@ -98,6 +99,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
         return self._fingerprint
 
     @cached_property
+    @gc_paused()
     def _fingerprint(self) -> str:
         rows = self._canonical()
         if not any(rows):
@@ -231,6 +233,7 @@ def commands_in_force(commands: Iterable[RecordedCommand]) -> list[RecordedComma
     return kept[::-1]
 
 
+@gc_paused()
 def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     """The corrections of a log's commands, given in the order of the log."""
     in_force = commands_in_force(commands)

@@ -8,7 +8,7 @@ Nothing is rounded in another way than by applying the commands one after anothe
 
 import heapq
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from functools import cached_property
 from typing import Final, NamedTuple, TypeAlias
 
@@ -208,8 +208,7 @@ def _directly_before(corrections: Iterable[PoseCorrection]) -> Iterator[set[int]
     transforms, stated = _Stretches(), _Stated()
     for number, correction in enumerate(corrections):
         if correction.transform is None:
-            earlier = {transforms.at(keyframe_id) for keyframe_id in correction.poses}
-            earlier |= {stated.put(keyframe_id, number) for keyframe_id in correction.poses}
+            earlier = transforms.at(correction.poses) | stated.put(correction.poses.keys(), number)
         else:
             first, last = correction.span
             earlier = transforms.put(first, last, number) | stated.take(first, last)
@@ -224,9 +223,12 @@ class _Stretches:
         self._starts: list[int] = [_LEAST]
         self._last: list[int | None] = [None]
 
-    def at(self, keyframe_id: int) -> int | None:
-        """The last transform at an id."""
-        return self._last[bisect_right(self._starts, keyframe_id) - 1]
+    def at(self, keyframe_ids: Iterable[int]) -> set[int | None]:
+        """The last transforms at some ids."""
+        starts, last = self._starts, self._last
+        if len(starts) == 1:
+            return set(last)
+        return {last[bisect_right(starts, keyframe_id) - 1] for keyframe_id in keyframe_ids}
 
     def put(self, first: int, last: int, number: int) -> set[int | None]:
         """Make ``number`` the last from ``first`` to ``last``; returns those that were."""
@@ -253,11 +255,13 @@ class _Stated:
         self._last: dict[int, int] = {}
         self._buckets: dict[int, set[int]] = {}
 
-    def put(self, keyframe_id: int, number: int) -> int | None:
-        """Make ``number`` the last at an id; returns the one that was."""
-        before = self._last.get(keyframe_id)
-        self._last[keyframe_id] = number
-        self._buckets.setdefault(keyframe_id >> _BUCKET_BITS, set()).add(keyframe_id)
+    def put(self, keyframe_ids: Set[int], number: int) -> set[int | None]:
+        """Make ``number`` the last at some ids; returns those that were."""
+        before = set(map(self._last.get, keyframe_ids))
+        if None in before:
+            for new in keyframe_ids - self._last.keys():
+                self._buckets.setdefault(new >> _BUCKET_BITS, set()).add(new)
+        self._last.update(dict.fromkeys(keyframe_ids, number))
         return before
 
     def take(self, first: int, last: int) -> set[int | None]:

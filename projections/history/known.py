@@ -11,13 +11,14 @@ from functools import partial
 from typing import TypeVar
 
 from eventsrc.base.errors import LogDamaged, MisuseError
+from eventsrc.base.garbage import gc_paused
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.errors import FoldError, LogPointError
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached, gc_paused
+from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached
 from projections.map.snapshot_cache import SnapshotCache
 from projections.map.space_vectors import new_map, with_vectors
 from projections.map.view import MapView

@@ -20,14 +20,14 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
-from eventsrc.log import Event, LogReader
+from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
 from projections.fold.deltas import (
     KeyframeAdded,
@@ -41,7 +41,8 @@ from projections.fold.deltas import (
 )
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import READ_AHEAD, ParsedEvent, fold_parsed, gc_paused, parse_events
+from projections.map.fold import ParsedEvent, fold_parsed, read_ahead
+from projections.map.parsing import parsed_stretches
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter
@@ -227,12 +228,12 @@ def fold_in_this_process(
     """As `fold_all`, in this process: one pass over the log for all of ``rules``."""
     with LogReader(log) as reader:
         folds = [_Fold(reader, each) for each in rules]
-        events = reader.read(FIRST_OFFSET, end)
+        parsed = parsed_stretches(reader.read(FIRST_OFFSET, end))
         with gc_paused():
-            while chunk := list(islice(events, READ_AHEAD)):
-                _fold_chunk(chunk, folds)
+            for stretch in read_ahead(parsed, *(fold.map for fold in folds)):
+                _fold_stretch(stretch, folds)
                 if progress is not None:
-                    progress(chunk[-1].offset + 1, end)
+                    progress(stretch[-1].offset + 1, end)
             return [fold.result(truth, keep_view=keep_views) for fold in folds]
 
 
@@ -261,12 +262,10 @@ class _Fold:
         return replace(result, view=self.view) if keep_view else result
 
 
-def _fold_chunk(chunk: Sequence[Event], folds: Sequence[_Fold]) -> None:
-    """As `projections.map.fold.fold_events`, but validating once for all folds."""
-    read = parse_events(chunk)
+def _fold_stretch(stretch: Sequence[ParsedEvent], folds: Sequence[_Fold]) -> None:
     for fold in folds:
         started = time.perf_counter()
-        for event in read:
+        for event in stretch:
             fold.fold(event)
         fold.seconds += time.perf_counter() - started
 

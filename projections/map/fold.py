@@ -1,13 +1,10 @@
 """Folding a log: reads and validates events, and passes them to the pure fold."""
 
-import gc
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from itertools import islice
-from math import ceil
 from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
@@ -53,33 +50,43 @@ def fold_events(
     Continue with another call from the offset after it; events read ahead are lost with this one.
     """
     parsed = parsed_stretches(events, ahead)
-    if ahead > 1 and semantic_map.event_edits.expects:
-        parsed = _expected(parsed, semantic_map, ceil(_MOST_AHEAD / ahead))
-    for stretch in parsed:
+    for stretch in parsed if ahead == 1 else read_ahead(parsed, semantic_map):
         for event in stretch:
             yield FoldedEvent(event.offset, fold_parsed(event, semantic_map))
 
 
-def _expected(
-    parsed: Iterator[list[ParsedEvent]], semantic_map: SemanticMap, stretches: int
+def read_ahead(
+    parsed: Iterator[list[ParsedEvent]], *maps: SemanticMap
 ) -> Iterator[list[ParsedEvent]]:
-    """The stretches of events, so many read ahead for `EventEdits.expect`. What precedes damage is
-    yielded before LogDamaged is raised."""
+    """The stretches of events for a fold, or for several of one pass over the log. Where many
+    commands move poses of one, stretches are joined, and the poses in each are corrected together.
+
+    What precedes damage is yielded before LogDamaged is raised.
+    """
+    expecting = [each.event_edits for each in maps if each.event_edits.expects]
+    if not expecting:
+        yield from parsed
+        return
     damage: LogDamaged | None = None
     events: list[ParsedEvent] | None = None
     while damage is None and events != []:
         events = []
         try:
-            for stretch in islice(parsed, stretches):
+            for stretch in parsed:
                 events += stretch
+                if len(events) >= _MOST_AHEAD:
+                    break
         except LogDamaged as error:
             damage = error
-        semantic_map.event_edits.expect(
+        coming = [
             (event.offset, event.parsed.envelope)
             for event in events
             if isinstance(event.parsed, Accepted)
-        )
-        yield events
+        ]
+        for edits in expecting:
+            edits.expect(coming)
+        if events:
+            yield events
     if damage is not None:
         raise damage
 
@@ -90,7 +97,7 @@ def fold_event(event: Event, semantic_map: SemanticMap) -> list[Delta]:
 
 
 def fold_parsed(event: ParsedEvent, semantic_map: SemanticMap) -> list[Delta]:
-    """Fold one event of `parse_events`. Raises FoldError for a rejected one; see `fold_events`."""
+    """Fold one event of `read_ahead`. Raises FoldError for a rejected one; see `fold_events`."""
     if event.parsed is None:
         semantic_map.skip(event.offset)
         return []
@@ -150,21 +157,3 @@ def _fold_into(
     with gc_paused():
         for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
             view.apply_event(folded.offset, folded.deltas)
-
-
-@contextmanager
-def gc_paused() -> Iterator[None]:
-    """Pause the search for reference cycles: a fold makes none and frees next to nothing.
-
-    The search would traverse all records again and again as a map grows, a fifth of the whole time.
-    Afterwards all objects are in the oldest generation, so that the next search skips them.
-    """
-    was_on = gc.isenabled()
-    try:
-        gc.disable()
-        yield
-    finally:
-        if was_on:
-            gc.freeze()
-            gc.unfreeze()
-            gc.enable()

@@ -6,6 +6,7 @@ give another map than its author asked for.
 """
 
 from eventsrc.base.advised import advised
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.commands import InvalidCommand, UnknownKind, UseSettings, parse_command
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
@@ -39,6 +40,7 @@ def _before(offset: Offset) -> str:
     return f"`{advised('state', '--at', offset)}`"
 
 
+@gc_paused()
 def read_commands(
     reader: LogReader, until: Offset | None = None, start: Offset = FIRST_OFFSET
 ) -> list[RecordedCommand]:
@@ -48,6 +50,7 @@ def read_commands(
     return [read_command(event) for event in events]
 
 
+@gc_paused()
 def read_corrections(reader: LogReader, known_at: Offset | None = None) -> Corrections:
     """The corrections of the commands before ``known_at``, of all for None. Raises FoldError,
     LogDamaged."""

@@ -11,11 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.errors import FoldError
 from projections.fold.settings import Settings
-from projections.map.fold import gc_paused
+from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
 
@@ -100,7 +101,12 @@ def rebuild(
         def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:
             nonlocal folded_at
             _fold_into(
-                fold, parsed.stretches(), writers, total, notify, partial(_advice, log, inputs)
+                fold,
+                read_ahead(parsed.stretches(), fold.map),
+                writers,
+                total,
+                notify,
+                partial(_advice, log, inputs),
             )
             folded_at = time.monotonic()
             last = next(reader.read(Offset(total - 1), total), None)

@@ -25,11 +25,11 @@ from types import TracebackType
 from typing import Final, Self
 
 from eventsrc.base.advised import advised
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.errors import DatabaseError, ImpossibleCommand
 from projections.map.changes import BatchChanges
-from projections.map.fold import gc_paused
 from projections.map.view import MapView
 
 from . import checkpoints, vector_table

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
 from eventsrc.base.errors import LogError
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
@@ -19,7 +20,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, gc_paused, parse_events
+from projections.map.fold import READ_AHEAD, fold_events, parse_events
 from projections.map.space_vectors import new_map
 
 from .column_rows import TableWriter

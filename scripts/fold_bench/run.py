@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from plain import fold_plain
 from streams import DIM, MODEL, house_walk, keyframes, pictures, random_walk
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.core_index import CoreIndex
@@ -23,7 +24,7 @@ from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, fold_log, gc_paused
+from projections.map.fold import READ_AHEAD, fold_events, fold_log
 from projections.map.view import MapView
 
 QUICK = "--quick" in sys.argv

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope.commands import CorrectPoses, RigidTransform, UseSettings
+from eventsrc.envelope.commands import CorrectPoses, RigidTransform, UseSettings, encode_command
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
-from eventsrc.log import LogReader
+from eventsrc.envelope.system_events import COMMAND_KEY
+from eventsrc.log import NEVER, LogReader, LogWriter
 from projections.edit.current import CurrentMap
 from projections.edit.effect import effect_keys, effects_of
 from projections.edit.listing import edits_document, edits_text
@@ -17,10 +18,15 @@ from projections.fold.corrections import Corrections, RecordedCommand, compile_c
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.history import Timeline
+from projections.history.parallel import Rules, fold_in_this_process
+from projections.localize.calibrate.rounds import calibrate
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
+from projections.map.log_commands import read_corrections
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
+from projections.postgres.connection import Targets
+from projections.postgres.rebuild import rebuild
 from tests.bench.commands import (
     KINDS,
     commands_of,
@@ -113,6 +119,32 @@ def test_poses_corrected_together_make_the_map_of_poses_corrected_one_by_one(
             view.apply_event(folded.offset, folded.deltas)
     assert together == map_digest(view)
     assert corrections.poses[RunId("run-a")].are_many
+
+
+def test_every_fold_of_a_log_corrects_poses_together(
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = write_rooms(tmp_path / "log")
+    with LogWriter(log, fsync=NEVER) as writer:
+        for _, each in chains(150):
+            writer.append(COMMAND_KEY, encode_command(each))
+    with LogReader(log) as reader:
+        corrections = read_corrections(reader)
+        one_by_one = MapView(Settings(), corrections=corrections)
+        for folded in fold_events(reader.read(), new_map(reader, Settings(), corrections)):
+            one_by_one.apply_event(folded.offset, folded.deltas)
+        digest = map_digest(one_by_one)
+
+        def alone(*_: object) -> None:
+            raise AssertionError("a pose was corrected alone")
+
+        monkeypatch.setattr(Corrections, "pose", alone)
+        assert map_digest(fold_log(reader, Settings(), corrections=corrections)[1]) == digest
+        rules = [Rules(Settings(), corrections), Rules(Settings())]
+        (found, _) = fold_in_this_process(log, rules, reader.next_offset)
+        assert found.digest == digest
+        calibrate(reader, Settings(), corrections)
+    assert rebuild(log, one_database, Settings()).digest == digest
 
 
 def test_the_key_of_an_effect_is_of_the_commands_up_to_it_and_of_the_options() -> None:

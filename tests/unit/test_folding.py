@@ -4,13 +4,14 @@ import gc
 
 import pytest
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import Event
 from projections.fold.deltas import KeyframeAdded
 from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import fold_event, fold_events, gc_paused
+from projections.map.fold import fold_event, fold_events
 from tests.envelopes import detection, envelope, payload
 
 

@@ -25,6 +25,7 @@ from foxglove.websocket import (
     WebSocketServer,
 )
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
@@ -32,7 +33,7 @@ from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.change_lines import change_lines
 from projections.map.digest import map_digest
-from projections.map.fold import READ_AHEAD, fold_events, gc_paused
+from projections.map.fold import READ_AHEAD, fold_events
 from projections.map.moments import Moments
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView

@@ -8,11 +8,11 @@ the map as its settings make it, with the constants read, is asked its own quest
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Envelope, Offset
 from eventsrc.log import LogReader
@@ -21,7 +21,8 @@ from projections.fold.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.fold.envelope_evidence import camera_of
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Camera, LocalizerConstants, Settings
-from projections.map.fold import READ_AHEAD, fold_parsed, gc_paused, parse_events
+from projections.map.fold import fold_parsed, read_ahead
+from projections.map.parsing import parsed_stretches
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 
@@ -152,10 +153,10 @@ def calibrate(
         nonlocal before
         semantic_map = new_map(reader, used, corrections)
         view, cameras = MapView(used, corrections=corrections), Cameras()
-        coming = iter(reader.read(FIRST_OFFSET, end))
+        parsed = parsed_stretches(reader.read(FIRST_OFFSET, end))
         with gc_paused():
-            while chunk := list(islice(coming, READ_AHEAD)):
-                for event in parse_events(chunk):
+            for stretch in read_ahead(parsed, semantic_map):
+                for event in stretch:
                     deltas = fold_parsed(event, semantic_map)
                     view.apply_event(event.offset, deltas)
                     if isinstance(event.parsed, Accepted):

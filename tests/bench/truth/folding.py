@@ -3,13 +3,14 @@
 import time
 from collections.abc import Iterator, Sequence
 
+from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import Delta
 from projections.fold.exact import unit_vectors
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, gc_paused
+from projections.map.fold import READ_AHEAD
 from projections.map.view import MapView
 
 
