@@ -43,8 +43,8 @@ EXCERPT_BYTES: Final = 4_096
 
 
 class Excerpt(NamedTuple):
-    """What is kept of a refused payload of more than `MAX_KEPT_BYTES`: its first bytes, and size
-    and SHA-256 (hex digits) of the whole."""
+    """What is kept of a refused payload that is too large to be kept whole: its first bytes, and
+    size and SHA-256 (hex digits) of the whole."""
 
     start: bytes
     size: int
@@ -61,11 +61,10 @@ class Excerpt(NamedTuple):
             size += len(piece)
         return cls(start, size, sha.hexdigest())
 
-    @property
-    def reason(self) -> str:
-        """The reason for which the payload was refused."""
+    def reason(self, most: int = MAX_KEPT_BYTES) -> str:
+        """The reason for which the payload was refused where up to ``most`` bytes are kept."""
         return (
-            f"payload of {self.size:,} bytes, more than the {MAX_KEPT_BYTES:,} that are read; its "
+            f"payload of {self.size:,} bytes, more than the {most:,} that are kept whole; its "
             f"first {len(self.start):,} bytes and the SHA-256 of all are kept"
         )
 

@@ -99,7 +99,6 @@ _COUNTERS: Final = (
     ("messages", "Messages of ROS synced to the log."),
     ("rejected", "Payloads refused and kept under mapfold/rejected."),
     ("queue_full", "Messages lost because the queue was full."),
-    ("too_large", "Messages lost because they were too large to be kept as rejected."),
     ("transport_missed", "Messages of advanced publishers that were sent but not received."),
     ("lost_from_log", "Recorded events lost with a segment file that was taken away or cut short."),
 )

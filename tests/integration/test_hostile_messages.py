@@ -1,5 +1,6 @@
 """Hostile messages and keys: the recorder goes on, and nothing is dropped silently."""
 
+import queue
 import subprocess
 import sys
 import threading
@@ -11,12 +12,12 @@ import zenoh
 
 from eventsrc.base.errors import TransportError
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
-from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
+from eventsrc.envelope.system_events import EXCERPT_BYTES, REJECTED_KEY, RejectedPayload
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.record.append import append_payload
 from eventsrc.record.log_info import log_info
 from eventsrc.record.recorder import Recorder
-from eventsrc.record.robot.acks import Refusals, refusal_key
+from eventsrc.record.robot.acks import Refusal, Refusals, payload_sha256, refusal_key
 from eventsrc.record.transport.session import Received, Session
 from tests.envelopes import envelope, payload
 from tests.fixtures_zenoh import DEADLINE_S
@@ -81,28 +82,40 @@ def test_keys_of_any_length_stop_no_recorder(connected: Sessions, tmp_path: Path
     assert verify_log(tmp_path / "log").findings == ()
 
 
-def test_a_message_far_over_the_limit_is_a_reported_loss(
+def test_of_a_message_far_over_the_limit_an_excerpt_is_kept(
     connected: Sessions, tmp_path: Path
 ) -> None:
-    robot = connected()
+    """Its robot hears that it was refused, so it does not send it again."""
+    most = 2 * DEFAULT_MAX_PAYLOAD_BYTES
+    large = [b"%d " % size + bytes(size) for size in (most, 2 * most)]
+    robot, refused = connected(), queue.SimpleQueue[Refusal]()
+    robot.subscribe(
+        refusal_key("t/a"), lambda m: [*map(refused.put, Refusals.decode(m.payload).refused)]
+    )
+    robot.confirm()
     with LogWriter(tmp_path / "log") as writer:
         recorder = Recorder(
-            connected(), writer, ["t/**"], max_events=2, max_payload_bytes=1_000, report_gaps=False
+            connected(), writer, ["t/**"], max_events=4, max_payload_bytes=1_000, report_gaps=False
         )
-        most = 2 * DEFAULT_MAX_PAYLOAD_BYTES
         publisher = robot.publisher("t/a")  # one that blocks: Zenoh's own default drops
-        for size in (most + 1, 2 * most, 2_000):
-            publisher.put(bytes(size))
-        publisher.put(payload(envelope(1)))
+        for message in (*large, bytes(2_000), payload(envelope(1))):
+            publisher.put(message)
         report = recorder.run(threading.Event())
-    assert (report.recorded, report.rejected, report.too_large, report.lost) == (1, 1, 2, 2)
-    assert not report.clean
+        told = {one.sha256: one.size for one in (refused.get(timeout=DEADLINE_S) for _ in range(3))}
+    assert (report.recorded, report.rejected, report.lost, report.clean) == (1, 3, 0, False)
+    assert told.items() >= {(payload_sha256(one), len(one)) for one in large}
     with LogReader(tmp_path / "log") as reader:
-        losses = [Loss.model_validate_json(event.payload) for event in reader.read(keys={LOSS_KEY})]
-    # one event for both, or two if a commit came between them
-    assert {(loss.publisher, loss.cause) for loss in losses} == {("t/a", "too_large")}
-    assert sum(loss.count for loss in losses) == 2
-    assert log_info(tmp_path / "log").lost == 2
+        rejected = [
+            RejectedPayload.model_validate_json(event.payload)
+            for event in reader.read(keys={REJECTED_KEY})
+        ]
+    kept = {(one.sha256, one.size, one.raw) for one in rejected if one.sha256 is not None}
+    assert kept == {(payload_sha256(one), len(one), one[:EXCERPT_BYTES]) for one in large}
+    assert {one.key for one in rejected} == {"t/a"}
+    assert all(
+        f"more than the {most:,} that are kept" in one.reason for one in rejected if one.size
+    )
+    assert log_info(tmp_path / "log").lost == 0
 
 
 def test_keys_that_make_zenoh_panic_are_not_sent(connected: Sessions) -> None:

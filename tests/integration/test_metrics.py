@@ -15,7 +15,6 @@ from tests.http_attacks import answer, ask, connect
 
 REPORT = RecorderReport(
     *(12, 3, 4, 5, 6, 0, 7, 100, 15),
-    too_large=9,
     unsealed=8,
     sealing_error="disk is on fire",
     lost_from_log=10,
@@ -32,7 +31,6 @@ def test_every_metric_is_scraped_with_its_current_value(tmp_path: Path) -> None:
         "mapfold_recorder_recorded_total": 12,
         "mapfold_recorder_rejected_total": 3,
         "mapfold_recorder_queue_full_total": 4,
-        "mapfold_recorder_too_large_total": 9,
         "mapfold_recorder_transport_missed_total": 5,
         "mapfold_recorder_lost_from_log_total": 10,
         "mapfold_recorder_messages_total": 13,

@@ -47,7 +47,6 @@ def test_a_signal_drains_the_queue_and_exits_0(
         "recorded": 30,
         "rejected": 0,
         "queue_full": 0,
-        "too_large": 0,
         "transport_missed": 0,
         "unwritten": 0,
         "lost_from_log": 0,

@@ -187,15 +187,6 @@ def test_large_messages_are_taken_a_few_at_a_time(monkeypatch: pytest.MonkeyPatc
     assert _texts(queue.get(10, 0)) == ["g"]
 
 
-def test_messages_that_are_too_large_are_counted_by_key() -> None:
-    queue = MessageQueue(1)
-    for key in ("a", "b", "a"):
-        queue.count_too_large(key, None)
-    assert queue.too_large == 3
-    assert queue.drain_too_large() == {"a": 2, "b": 1}
-    assert queue.drain_too_large() == {}
-
-
 def test_the_number_of_keys_with_loss_counts_is_bounded() -> None:
     queue = MessageQueue(1, max_wait_s=0)
     queue.put(_message("fits"))

@@ -37,11 +37,11 @@ def test_a_loss_is_warned_of_once() -> None:
     assert status.warnings(NOTHING) == []
     lost = dataclasses.replace(NOTHING, queue_full=5, transport_missed=2)
     (line,) = status.warnings(lost)
-    assert line.startswith("LOST 7 messages (in all 5 in a full queue, 0 too large, 2 on the way)")
+    assert line.startswith("LOST 7 messages (in all 5 in a full queue, 2 on the way)")
     assert "logs/run-7" in line
     assert status.warnings(lost) == []
-    (line,) = status.warnings(dataclasses.replace(lost, too_large=3))
-    assert line.startswith("LOST 3 messages (in all 5 in a full queue, 3 too large, 2 on")
+    (line,) = status.warnings(dataclasses.replace(lost, transport_missed=5))
+    assert line.startswith("LOST 3 messages (in all 5 in a full queue, 5 on the way)")
     status.warnings(lost)
     (line,) = status.warnings(dataclasses.replace(lost, queue_full=6))
     assert line.startswith("LOST 1 message (in all 6 in a full queue")
@@ -70,7 +70,7 @@ def test_sealing_is_mentioned_only_when_it_is_behind_or_fails() -> None:
 def test_a_report_is_clean_if_this_recorder_lost_nothing() -> None:
     assert NOTHING.clean
     assert dataclasses.replace(NOTHING, missing=4, missing_before=4).clean
-    for name in ("rejected", "queue_full", "too_large", "transport_missed", "unwritten", "missing"):
+    for name in ("rejected", "queue_full", "transport_missed", "unwritten", "missing"):
         assert not dataclasses.replace(NOTHING, **{name: 1}).clean, name
 
 

@@ -47,7 +47,7 @@ class BagMessage(NamedTuple):
         """The message with its payload decompressed, if the bag compresses single messages: no CDR
         begins like zstd. Raises ZstdError."""
         if isinstance(self.payload, Excerpt):
-            return self._replace(refused=self.payload.reason)
+            return self._replace(refused=self.payload.reason())
         if not self.payload.startswith(ZSTD_MAGIC):
             return self
         with zstandard.ZstdDecompressor().stream_reader(self.payload) as stream:

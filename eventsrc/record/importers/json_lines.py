@@ -197,7 +197,7 @@ class JsonLines:
     def _too_long(self, number: int, start: bytes, stream: BinaryIO) -> ImportedMessage:
         """The refusal of a line that is too large to be read, of which ``start`` was read."""
         excerpt = Excerpt.of(self._pieces(number, start, stream))
-        return ImportedMessage(b"", refused=excerpt.reason, excerpt=excerpt)
+        return ImportedMessage(b"", refused=excerpt.reason(), excerpt=excerpt)
 
     def _pieces(self, number: int, start: bytes, stream: BinaryIO) -> Iterator[bytes]:
         """The rest of a line, without the byte that ends it."""

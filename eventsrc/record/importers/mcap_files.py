@@ -51,7 +51,7 @@ class McapFile:
                         message.key,
                         message.logged_ns,
                         is_foreign=message.encoding == "json" and message.version is None,
-                        refused=excerpt.reason,
+                        refused=excerpt.reason(),
                         excerpt=excerpt,
                     )
                 elif message.verbatim is not None:

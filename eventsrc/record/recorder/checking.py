@@ -20,9 +20,9 @@ from eventsrc.envelope.crops import (
     encode_crop,
     received_crop,
 )
-from eventsrc.envelope.ingest import Rejected
+from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.envelope.model import ENVELOPE_VERSION, KeyframeId, RunId, has_keyframe_id
-from eventsrc.envelope.system_events import MAP_KEY
+from eventsrc.envelope.system_events import MAP_KEY, Excerpt
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
 from eventsrc.record.append import NewMap, check_payloads, map_event, rejected_event
 from eventsrc.record.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
@@ -41,6 +41,11 @@ _CHECKED_TOGETHER_BYTES: Final = 1024 * 1024
 """Fewer are checked at a time from this size on, since all that is decoded is held at once."""
 
 
+_MAX_KEPT: Final = 2
+"""A rejected message of up to this many times the size limit (or the default limit, if larger) is
+kept whole. Of a larger one only an excerpt is, because it would be in memory several times."""
+
+
 class CheckedMessage(msgspec.Struct, frozen=True, gc=False):
     """A checked message, and what the writer thread needs of the envelope in it. The payload of a
     map is already that of its event; its key is `MAP_KEY`, which no other accepted message has.
@@ -48,7 +53,8 @@ class CheckedMessage(msgspec.Struct, frozen=True, gc=False):
     ``run_id``, ``keyframe_id`` and ``stamp_ns`` are None for a rejected payload and for a form
     older than the envelope. ``refusal`` is the reply to a rejected payload; ``sha256`` is that of
     an envelope's payload, otherwise empty. ``form`` is the format of a crop, or of a message of a
-    bridge, which are kept verbatim.
+    bridge, which are kept verbatim. ``excerpt`` is kept in place of a payload that is
+    too large.
     """
 
     key: str
@@ -60,11 +66,13 @@ class CheckedMessage(msgspec.Struct, frozen=True, gc=False):
     stamp_ns: int | None = None
     sha256: str = ""
     form: MessageFormat | None = None
+    excerpt: Excerpt | None = None
 
     def event(self, logged_ns: int) -> NewEvent:
         """The event to append."""
         if self.refusal is not None:
-            return rejected_event(self.key, self.payload, self.refusal.reason, logged_ns)
+            kept = self.excerpt or self.payload
+            return rejected_event(self.key, kept, self.refusal.reason, logged_ns)
         if self.key == MAP_KEY:
             return map_event(self.payload, logged_ns)
         stamp_ns = logged_ns if self.stamp_ns is None else self.stamp_ns
@@ -108,6 +116,7 @@ class Checker:
         self._queue = queue
         self._writer = writer
         self._max_payload_bytes = max_payload_bytes
+        self._max_kept_bytes = _MAX_KEPT * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES)
         self._left = max_messages
         self._ahead = Batch()
 
@@ -141,6 +150,9 @@ class Checker:
         for message in received:
             if isinstance(message, EditRequest):
                 batch.edits.append(message)
+            elif len(message.payload) > self._max_kept_bytes:
+                batch.messages.append(self._excerpt(message))
+                batch.size += len(message.payload)
             elif isinstance(message, BridgedMessage):
                 batch.bridged.append(message)
                 batch.size += len(message.payload)
@@ -157,6 +169,13 @@ class Checker:
         if self._left is not None:
             self._left -= batch.count - before
         return bool(received)
+
+    def _excerpt(self, message: Received) -> CheckedMessage:
+        """The rejection of a message of which only an excerpt is kept."""
+        excerpt = Excerpt.of((message.payload,))
+        reason = excerpt.reason(self._max_kept_bytes)
+        refusal = Refusal(sha256=excerpt.sha256, size=excerpt.size, reason=reason)
+        return CheckedMessage(message.key, b"", ENVELOPE_VERSION, refusal, excerpt=excerpt)
 
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
         """Validate messages together; the result of each, in order."""

@@ -135,14 +135,11 @@ class MessageQueue:
         self._messages: deque[Received | EditRequest] = deque()
         self._edits = 0
         self._overflow: dict[str, int] = {}
-        self._too_large: dict[str, int] = {}
         self._sequence_gaps = SequenceGaps()
         self.overflowed = 0
         """Messages that did not fit, in all."""
         self.missed = 0
         """Messages that never came by their publishers' sequence numbers, in all."""
-        self.too_large = 0
-        """Messages that were too large to be taken from Zenoh, in all."""
         self._lock = threading.Lock()
         self._filled = threading.Condition(self._lock)
         self._emptied = threading.Condition(self._lock)
@@ -186,14 +183,6 @@ class MessageQueue:
         with self._lock:
             self._sequence_gaps.expect(number, time.monotonic_ns())
 
-    def count_too_large(self, key: str, number: SequenceNumber | None) -> None:
-        """Count a message that is too large to be taken from Zenoh."""
-        with self._lock:
-            if number is not None:
-                self._sequence_gaps.record(number, time.monotonic_ns())
-            self.too_large += 1
-            _count(self._too_large, key)
-
     def get(self, limit: int, timeout_s: float) -> list[Received | EditRequest]:
         """Remove up to ``limit`` messages in order, fewer if they are large; none if none came in
         time or the queue is closed."""
@@ -220,12 +209,6 @@ class MessageQueue:
         with self._lock:
             overflow, self._overflow = self._overflow, {}
             return overflow
-
-    def drain_too_large(self) -> dict[str, int]:
-        """Messages that were too large since the last call, by key."""
-        with self._lock:
-            too_large, self._too_large = self._too_large, {}
-            return too_large
 
     def drain_missed(self, now_ns: int | None) -> list[Gap[str]]:
         """Gaps in sequence numbers, each once: those that have settled at ``now_ns``, or all."""

@@ -6,7 +6,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
 from eventsrc.base.errors import TransportError
-from eventsrc.envelope.crops import MAX_CROP_BYTES
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
@@ -15,7 +14,6 @@ from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
 from eventsrc.record.transport.session import (
     Query,
     Received,
-    SequenceNumber,
     Session,
     SizeLimit,
     check_keys,
@@ -33,10 +31,6 @@ DEFAULT_CROPS: Final = ("tb/crops/*",)
 _CACHE_TIMEOUT_S: Final = 2.0
 _MAX_CACHED: Final = 1_000
 """Limit for the messages fetched from a bridge's cache of one topic."""
-_MAX_REJECTED: Final = 2
-"""A message of up to this many times the size limit (or the default limit, if larger) is rejected,
-kept and answered, so that its robot stops sending it. A larger one is counted as lost, because it
-would be in memory several times before it is on the disk."""
 
 
 class Recorder:
@@ -82,32 +76,26 @@ class Recorder:
             edits=edits,
             bridge=bridge,
         )
-        limit = SizeLimit(
-            _MAX_REJECTED * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES), self._count_too_large
-        )
         # A larger announcement is ignored, as is one that cannot be read: it is no event.
         sent_limit = SizeLimit(MAX_SENT_BYTES, lambda _key, _number: None)
         self._subscriptions = [
             subscription
             for key in keys
             for subscription in (
-                session.subscribe_batches(key, self._receive, limit),
+                session.subscribe_batches(key, self._receive),
                 session.subscribe(sent_key(key), self._queue.put, limit=sent_limit),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
         ]
-        crop_limit = SizeLimit(_MAX_REJECTED * MAX_CROP_BYTES, self._count_too_large)
-        self._subscriptions += [
-            session.subscribe(key, self._receive_crop, limit=crop_limit) for key in crops
-        ]
+        self._subscriptions += [session.subscribe(key, self._receive_crop) for key in crops]
         if edits is not None:
             key = edit_key(writer.log_id)
             self._subscriptions.append(session.queryable(key, self._receive_edit))
         if bridge is not None:
-            self._subscribe_bridge(session, bridge, limit)
+            self._subscribe_bridge(session, bridge)
         session.confirm()
 
-    def _subscribe_bridge(self, session: Session, bridge: Bridge, limit: SizeLimit) -> None:
+    def _subscribe_bridge(self, session: Session, bridge: Bridge) -> None:
         """Subscribe to a bridge's tokens, then to its messages, and get those that it has cached
         for late subscribers."""
         for key in bridge.keys:
@@ -115,14 +103,14 @@ class Recorder:
                 self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
         for key in bridge.keys:
             self._subscriptions += [
-                session.subscribe(key, self._receive_bridged, limit=limit, in_order=True),
+                session.subscribe(key, self._receive_bridged, in_order=True),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             ]
         session.confirm()
         for key in bridge.latched_keys:
             for selector in cache_selectors(key):
                 for message in session.cached(
-                    selector, timeout_s=_CACHE_TIMEOUT_S, limit=limit, most=_MAX_CACHED
+                    selector, timeout_s=_CACHE_TIMEOUT_S, most=_MAX_CACHED
                 ):
                     self._receive_bridged(message)
 
@@ -186,10 +174,6 @@ class Recorder:
             refuse_query(query, fault)
         elif not self._queue.put_edit(EditRequest(query)):
             refuse_query(query, "the recorder is busy or ending; try again in a moment")
-
-    def _count_too_large(self, key: str, number: SequenceNumber | None) -> None:
-        if not key.startswith(ACK_PREFIX):
-            self._queue.count_too_large(key, number)
 
     def _send_reply(self, key: str, payload: bytes) -> None:
         try:

@@ -84,7 +84,7 @@ class RecorderReport:
     """Numbers of a recorder, counted from its start.
 
     ``recorded`` envelopes are synced, ``rejected`` payloads are kept under ``mapfold/rejected``.
-    ``queue_full``, ``too_large`` and ``transport_missed`` messages were sent and are not in the
+    ``queue_full`` and ``transport_missed`` messages were sent and are not in the
     log. ``missing`` keyframes are those that the log's runs lack now, whichever recorder lost them;
     ``missing_before`` is that number at the start. A message lost in the queue is usually also a
     missing keyframe. ``unwritten`` messages were received when the log could not be written any
@@ -103,7 +103,6 @@ class RecorderReport:
     queue_depth: int
     queue_size: int
     next_offset: Offset
-    too_large: int = 0
     unwritten: int = 0
     unsealed: int = 0
     sealing_error: str | None = None
@@ -128,7 +127,7 @@ class RecorderReport:
     @property
     def lost(self) -> int:
         """Messages that were sent and are not, or no longer, in the log."""
-        never_appended = self.queue_full + self.too_large + self.transport_missed
+        never_appended = self.queue_full + self.transport_missed
         return never_appended + self.unwritten + self.lost_from_log
 
     @property
@@ -230,7 +229,6 @@ class WriterThread:
             recorded=self._recorded,
             rejected=self._rejected,
             queue_full=self._queue.overflowed,
-            too_large=self._queue.too_large,
             transport_missed=self._queue.missed,
             missing=self._missing,
             missing_before=self._missing_before,
@@ -386,8 +384,6 @@ class WriterThread:
             self._append_loss(_loss("keyframe_gap", gap))
         for key, count in self._queue.drain_overflow().items():
             self._append_loss(Loss(publisher=key, count=count, cause="queue_full"))
-        for key, count in self._queue.drain_too_large().items():
-            self._append_loss(Loss(publisher=key, count=count, cause="too_large"))
         for of_source in missed:
             self._append_loss(_loss("transport_miss", of_source))
         self._missing = self._ledger.missing if self._report_gaps else 0

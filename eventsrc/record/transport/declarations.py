@@ -176,12 +176,11 @@ class BatchSubscription(Subscription):
         self,
         subscriber: "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]",
         handler: Callable[[list[Received]], None],
-        limit: SizeLimit,
     ) -> None:
         super().__init__(subscriber)
         self._thread = threading.Thread(
             target=_receive_batches,
-            args=(subscriber.handler, handler, limit),
+            args=(subscriber.handler, handler),
             name="zenoh-batches",
             daemon=True,
         )
@@ -196,7 +195,6 @@ class BatchSubscription(Subscription):
 def _receive_batches(
     channel: "zenoh.handlers.Handler[zenoh.Sample]",
     handler: Callable[[list[Received]], None],
-    limit: SizeLimit,
 ) -> None:
     """Call ``handler`` with the messages in a channel until the subscription has ended and the
     channel is empty. An exception is reported and ends one batch only, as Zenoh does with those of
@@ -204,37 +202,42 @@ def _receive_batches(
     pause = threading.Event()  # never set
     while True:
         try:
-            first = channel.recv()
+            count = _receive_batch(channel.recv(), channel, handler)
         except zenoh.ZError:  # empty and closed
             return
-        batch: list[Received] = []
-        try:
-            _fill_batch(first, channel, batch, limit)
-            handler(batch)
-        except Exception:  # noqa: BLE001 - reported
-            raised, thread = sys.exc_info(), threading.current_thread()
-            threading.excepthook(threading.ExceptHookArgs((*raised, thread)))
-        if len(batch) >= _PAUSE_FROM:
+        if count >= _PAUSE_FROM:
             pause.wait(_PAUSE_S)
+
+
+def _receive_batch(
+    first: zenoh.Sample,
+    channel: "zenoh.handlers.Handler[zenoh.Sample]",
+    handler: Callable[[list[Received]], None],
+) -> int:
+    """Call ``handler`` with ``first`` and what is in ``channel``; returns how many messages that
+    were, and keeps none of them in memory."""
+    batch: list[Received] = []
+    try:
+        _fill_batch(first, channel, batch)
+        handler(batch)
+    except Exception:  # noqa: BLE001 - reported
+        raised, thread = sys.exc_info(), threading.current_thread()
+        threading.excepthook(threading.ExceptHookArgs((*raised, thread)))
+    return len(batch)
 
 
 def _fill_batch(
     first: zenoh.Sample,
     channel: "zenoh.handlers.Handler[zenoh.Sample]",
     batch: list[Received],
-    limit: SizeLimit,
 ) -> None:
     """Append ``first`` and the messages in ``channel`` to ``batch``, up to its bounds."""
     sample: zenoh.Sample | None = first
     size = 0
     while sample is not None:
-        payload = sample.payload  # each access makes a new object
-        if len(payload) > limit.size_bytes:
-            limit.refuse(str(sample.key_expr), sequence_number(sample))
-        else:
-            data = payload.to_bytes()
-            batch.append(Received(str(sample.key_expr), data, sequence_number(sample)))
-            size += len(data)
+        data = sample.payload.to_bytes()
+        batch.append(Received(str(sample.key_expr), data, sequence_number(sample)))
+        size += len(data)
         if size >= _MAX_BATCH_BYTES or len(batch) >= CHANNEL_SIZE:
             return
         try:

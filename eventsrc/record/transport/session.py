@@ -17,7 +17,7 @@
 
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -101,7 +101,7 @@ class Session:
             return Subscription(self.raw.declare_subscriber(key_expr, called))
 
     def subscribe_batches(
-        self, key_expr: str, handler: Callable[[list[Received]], None], limit: SizeLimit
+        self, key_expr: str, handler: Callable[[list[Received]], None]
     ) -> Subscription:
         """Like `subscribe`, but call ``handler`` with all messages received since its last call, in
         order. For high rates, at which a call for each message would slow down other threads."""
@@ -110,7 +110,7 @@ class Session:
             channel: zenoh.handlers.FifoChannel[zenoh.Sample]
             channel = zenoh.handlers.FifoChannel(CHANNEL_SIZE)
             subscriber = self.raw.declare_subscriber(key_expr, channel)
-        return BatchSubscription(subscriber, handler, limit)
+        return BatchSubscription(subscriber, handler)
 
     def subscribe_heartbeats(
         self, key_expr: str, handler: Callable[[SequenceNumber], None]
@@ -142,24 +142,15 @@ class Session:
                 self.raw.liveliness().declare_subscriber(key_expr, receive, history=True)
             )
 
-    def cached(
-        self, selector: str, *, timeout_s: float, limit: SizeLimit, most: int
-    ) -> list[Received]:
-        """The messages that caches reply to ``selector``, each under its own key; at most ``most``.
-        Those over ``limit`` are not copied out of Zenoh."""
+    def cached(self, selector: str, *, timeout_s: float, most: int) -> Iterator[Received]:
+        """The messages that caches reply to ``selector``, each under its own key, as they come; at
+        most ``most``."""
         check_key_length(selector)
-        found: list[Received] = []
         with transport_errors(f"selector {selector!r} cannot be queried"):
-            for reply in self.raw.get(selector, timeout=timeout_s):
-                sample = reply.ok
-                if sample is None or len(found) >= most:
-                    continue
-                key, payload = str(sample.key_expr), sample.payload
-                if len(payload) > limit.size_bytes:
-                    limit.refuse(key, None)
-                else:
-                    found.append(Received(key, payload.to_bytes()))
-        return found
+            replies = self.raw.get(selector, timeout=timeout_s)
+        samples = (reply.ok for reply in replies)
+        for sample in itertools.islice((sample for sample in samples if sample is not None), most):
+            yield Received(str(sample.key_expr), sample.payload.to_bytes())
 
     def send(self, key: str, payload: bytes) -> None:
         """Send one message without blocking; it is dropped if the network is full."""

@@ -54,12 +54,12 @@ class RecorderStatus:
     def warnings(self, report: RecorderReport) -> list[str]:
         """A line for each kind of loss that has grown since the previous call."""
         lines = []
-        lost = report.queue_full + report.too_large + report.transport_missed
+        lost = report.queue_full + report.transport_missed
         if lost > self._lost:
             lines.append(
                 f"LOST {counted(lost - self._lost, 'message')} (in all {report.queue_full:,} in a "
-                f"full queue, {report.too_large:,} too large, {report.transport_missed:,} on the "
-                f"way); {_shown_by(self._log, LOSS_KEY)}"
+                f"full queue, {report.transport_missed:,} on the way); "
+                f"{_shown_by(self._log, LOSS_KEY)}"
             )
         if report.rejected > self._rejected:
             lines.append(
@@ -233,7 +233,6 @@ def as_json(report: RecorderReport) -> dict[str, Any]:
         "recorded": report.recorded,
         "rejected": report.rejected,
         "queue_full": report.queue_full,
-        "too_large": report.too_large,
         "transport_missed": report.transport_missed,
         "commands": report.commands,
         "crops": report.crops,

@@ -19,6 +19,7 @@ PAUSE_S = 0.1
 """After each message, so that honest ones come between."""
 MB = 1_000_000
 SIXTEEN_MIB = 16 * 1024 * 1024
+FAR_OVER_THE_LIMIT = 100 * 1024 * 1024
 
 Junk = Callable[[Random, int], bytes]
 
@@ -137,6 +138,7 @@ def _messages(arena: Arena) -> Iterator[tuple[bytes, str]]:
         for junk in KINDS:
             yield junk(rng, 2 * MB), "tb/detections"
         yield empty_detections(rng, SIXTEEN_MIB), "tb/detections"
+        yield from [(bytes(FAR_OVER_THE_LIMIT), "tb/detections")] * 3
         for key in keys(rng):
             yield b"{}", key
         return
