@@ -4,6 +4,7 @@ after the first."""
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -119,3 +120,38 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
     with unwind_on_signals():
         signal.raise_signal(signal.SIGHUP)
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+_IN_A_FILE = """
+import os, signal, sys
+from pathlib import Path
+from eventsrc.base.output_files import written_whole
+from projections.surfaces.cli.program import run_app
+
+def command():
+    with written_whole(Path(sys.argv[1])) as file:
+        file.write(b"half")
+        signal.raise_signal(int(sys.argv[2]))
+        file.write(b"of it")
+
+run_app(command)
+"""
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_within_a_file_leaves_the_old_one_and_nothing_else(
+    tmp_path: Path, sent: signal.Signals, code: int
+) -> None:
+    out = tmp_path / "map.svg"
+    out.write_bytes(b"old")
+    done = prefork.run(
+        _IN_A_FILE,
+        ["-c", str(out), str(int(sent))],
+        env={**os.environ},
+        cwd=prefork.ROOT,
+        timeout=60.0,
+    )
+    assert done.returncode == code, done.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == {out: b"old"}

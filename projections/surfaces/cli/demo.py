@@ -8,7 +8,6 @@ import typer
 from eventsrc.adapters.sim import DEFAULT_SEED
 
 from .options import DbOption, JsonOption, VectorDbOption
-from .signals import unwind_on_signals
 from .terminal import emit, finish, say
 
 
@@ -38,8 +37,7 @@ def demo(
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
     from projections.surfaces.demo import DemoOptions, run_demo
 
-    with unwind_on_signals():
-        numbers = run_demo(DemoOptions(out, seed, speed, db, vector_db), say)
+    numbers = run_demo(DemoOptions(out, seed, speed, db, vector_db), say)
     if json_:
         emit(numbers)
     finish(findings=not numbers["sound"])

@@ -31,7 +31,7 @@ from .options import (
     point,
     settings_from,
 )
-from .signals import stop_on_signals, unwind_on_signals
+from .signals import stop_on_signals
 from .terminal import Bar, say
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def export(
                 write = _recorder(
                     name, f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
                 )
-                with unwind_on_signals(), Bar() as bar:
+                with Bar() as bar:
                     fold = RecordedFold(
                         reader,
                         settings,

@@ -39,7 +39,6 @@ from .options import (
     question_from,
     settings_from,
 )
-from .signals import unwind_on_signals
 from .terminal import display, emit, finish, say
 
 fleet_app = typer.Typer(
@@ -100,7 +99,7 @@ def replay(
     sites = sites_of(place)
     _check_reach(engine, db)
     entries: dict[int, dict[str, Any]] = {}
-    with unwind_on_signals(), site_databases(sites, db, vector_db) as databases:
+    with site_databases(sites, db, vector_db) as databases:
         requests = [
             ReplayRequest(
                 site,
@@ -188,7 +187,7 @@ def status(
     chosen = _chosen(settings_file, assignments)
     sites = sites_of(place)
     found: list[SiteStatus] = [SiteStatus()] * len(sites)
-    with unwind_on_signals(), site_databases(sites, db, vector_db) as databases:
+    with site_databases(sites, db, vector_db) as databases:
         requests = [StatusRequest(site, databases[site.name], chosen) for site in sites]
         with ended_sites(look_at_site, requests, sites, "local", jobs) as results:
             for ended in results:
@@ -272,7 +271,7 @@ def relocalize(
 
     question, camera = question_from(query), camera_from(hfov, image)
     sites = sites_of(place)
-    with unwind_on_signals(), site_databases(sites, db, vector_db) as databases:
+    with site_databases(sites, db, vector_db) as databases:
         answer = ask_sites(
             sites, databases, question, top=top, camera=camera, jobs=jobs or 2 * usable_cores()
         )
@@ -308,7 +307,7 @@ def url(
         names = ", ".join(visible(each.name) for each in sites[:_NAMED])
         more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
         raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
-    with unwind_on_signals(), site_databases(sites, db, None) as databases:
+    with site_databases(sites, db, None) as databases:
         display(databases[site].graph_url)
 
 

@@ -14,7 +14,6 @@ from projections.adapters.fleet.engine import Ended, Engine, Task, usable_cores
 from projections.adapters.fleet.local_pool import LocalPool
 from projections.adapters.fleet.sites import Site, find_sites
 
-from .signals import unwind_on_signals
 from .terminal import Bar, people, say
 
 
@@ -88,7 +87,7 @@ def ended_sites(
 ) -> Iterator[Iterator[Ended]]:
     """The results of a task for each site as they come, with a progress bar. SIGTERM ends the
     workers, as Ctrl-C does."""
-    with unwind_on_signals(), open_engine(engine, jobs, len(requests)) as running, Bar() as bar:
+    with open_engine(engine, jobs, len(requests)) as running, Bar() as bar:
         yield _shown(running.run, task, requests, sites, bar)
 
 

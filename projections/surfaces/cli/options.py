@@ -24,7 +24,6 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.errors import QuestionError, SettingsError
 from projections.fold.settings import Settings, read_settings
 
-from .signals import unwind_on_signals
 from .terminal import say
 
 if TYPE_CHECKING:
@@ -163,7 +162,7 @@ def databases(db: str | None, vector_db: str | None) -> "Iterator[Targets]":
     """The databases a command uses; an embedded server it started is stopped, also by a signal."""
     from projections.postgres.connection import open_targets
 
-    with unwind_on_signals(), open_targets(db, vector_db) as targets:
+    with open_targets(db, vector_db) as targets:
         yield targets
 
 

@@ -39,6 +39,7 @@ from . import COMMANDS, SECTIONS
 from .in_force import remember_running
 from .presets import add_presets
 from .reading_bar import ReadingBar
+from .signals import unwind_on_signals
 from .terminal import EXIT_FAILED, OutputLost, output_begins, say
 
 if TYPE_CHECKING:
@@ -309,7 +310,7 @@ def _report_lost_output(lost: OutputLost) -> int:
 
 def _exit_code(app: Callable[..., Any]) -> int:
     try:
-        with ReadingBar():
+        with unwind_on_signals(), ReadingBar():
             app()
     except SystemExit as ended:  # typer raises it after every command
         return ended.code if isinstance(ended.code, int) else 0

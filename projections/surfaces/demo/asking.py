@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from eventsrc.adapters.sim import SimulatedRun
+from eventsrc.base.output_files import write_files
 from eventsrc.envelope.model import RunId
 from projections.adapters.drawing import LostRobot, Spot
 from projections.localize.relocalize import Answer, rank, read_crops
@@ -130,7 +131,8 @@ def _ask(
 ) -> AskedQuestion:
     question = {"crops": detections}
     if folder is not None:
-        folder.question(len(detections)).write_text(json.dumps(question) + "\n", "utf-8")
+        asked = json.dumps(question) + "\n"
+        write_files({folder.question(len(detections)): asked.encode()})
     started = time.monotonic()
     crops = read_crops(question)
     answer = rank(crops, reader.candidates(crops))

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from eventsrc.adapters.sim import DEFAULT_SEED, occupancy_map, simulate_run
 from eventsrc.base.advised import command_line
+from eventsrc.base.output_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections.adapters.drawing import draw_map, floor_of
@@ -59,7 +60,8 @@ def run_demo(options: DemoOptions, print_line: PrintLine) -> dict[str, Any]:
 
 def _play(options: DemoOptions, folder: DemoFolder, print_line: PrintLine) -> dict[str, Any]:
     explorer, lost_run = simulate_run(options.seed, "a"), simulate_run(options.seed, "b")
-    folder.settings.write_text(SETTINGS.model_dump_json(indent=2) + "\n", "utf-8")
+    settings = SETTINGS.model_dump_json(indent=2) + "\n"
+    write_files({folder.settings: settings.encode()})
     clock = _Stages(print_line)
     house = explorer.house
     detections = sum(len(envelope["detections"]) for envelope in explorer.envelopes)
