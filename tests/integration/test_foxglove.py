@@ -1,6 +1,7 @@
 """The map for Foxglove: a recording, and a server that a client's timeline drives."""
 
 import json
+import logging
 import os
 import re
 import struct
@@ -13,12 +14,13 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.adapters.foxglove.playback import PastMaps, Playback
+from projections.adapters.foxglove.playback import PROTOCOL, ClientTroubles, PastMaps, Playback
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.settings import Settings
 from projections.map.moments import Moments
@@ -254,7 +256,7 @@ def playing(log: Path, settings: Settings = SETTINGS) -> Iterator[tuple[Client, 
         try:
             with connect(
                 f"ws://127.0.0.1:{playback.server.port}",
-                subprotocols=[Subprotocol("foxglove.sdk.v1")],
+                subprotocols=[Subprotocol(PROTOCOL)],
                 max_size=None,
             ) as socket:
                 yield Client(socket), maps
@@ -353,6 +355,44 @@ def test_the_command_says_where_it_is_and_ends_by_a_signal(mapfold: Commands) ->
     finally:
         assert server.end() == 0
     assert server.said[-1] == "closed"
+
+
+def test_clients_that_are_refused_or_not_understood_are_reported_once(mapfold: Commands) -> None:
+    read, write = os.pipe()
+    program = mapfold.start("foxglove", SAMPLE, "--port", "0", stderr=write)
+    os.close(write)
+    server = ReadyProgram(program, read, ready_s=WAIT_S, end_s=WAIT_S)
+    try:
+        assert f"it must speak {PROTOCOL}" in server.text
+        (url,) = re.findall(r"ws://127.0.0.1:\d+", server.text)
+        for _ in range(3):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(url, subprotocols=[Subprotocol("foxglove.websocket.v1")])
+            assert refused.value.response.status_code == 400
+        with connect(url, subprotocols=[Subprotocol(PROTOCOL)]) as socket:
+            client = Client(socket)
+            socket.send("no JSON")
+            with pytest.raises(AssertionError, match="Invalid message"):
+                client.until(lambda: False)
+    finally:
+        assert server.end() == 0
+    (refusal,) = (line for line in server.said if "handshake failed" in line)
+    assert refusal.startswith("Dropping client 127.0.0.1: handshake failed; ")
+    assert f"clients must speak {PROTOCOL}" in refusal
+    assert len([line for line in server.said if line.startswith("Invalid message from")]) == 1
+    assert server.said[-2:] == ["2 more troubles with clients", "closed"]
+
+
+def test_troubles_of_clients_are_bounded() -> None:
+    said: list[str] = []
+    logger = logging.getLogger("foxglove.websocket")
+    with ClientTroubles(said.append) as troubles:
+        for number in range(200):
+            logger.error("Invalid message from 127.0.0.1:%d: junk %d", number, number)
+        logger.info("Registered client")
+    logger.debug("not within")
+    assert (len(said), troubles.unsaid) == (50, 150)
+    assert said[7] == "Invalid message from 127.0.0.1: junk 7"
 
 
 def test_the_layout_names_topics_that_there_are(mapfold: Commands) -> None:

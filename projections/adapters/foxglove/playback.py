@@ -5,13 +5,15 @@ The SDK calls the ``on_`` methods in its own thread; they only store the request
 runs `Playback.run` folds and publishes.
 """
 
+import logging
 import math
+import re
 import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Final, Self
 
 from foxglove import Capability, Context, layouts, start_server
 from foxglove.websocket import (
@@ -91,6 +93,50 @@ def layout_json() -> str:
         ],
     )
     return layouts.Layout(content=whole).to_json() + "\n"
+
+
+PROTOCOL: Final = "foxglove.sdk.v1"
+"""The WebSocket subprotocol that a client must offer. The SDK answers others, such as the
+``foxglove.websocket.v1`` of older clients, with status 400 before any method here is called."""
+_MOST_TROUBLES: Final = 50
+_CLIENT: Final = re.compile(r"(client |from )(\S+):[0-9]+")
+
+
+class ClientTroubles(logging.Handler):
+    """Passes to ``note`` what the SDK logs of clients that it refuses or does not understand.
+
+    The same trouble with the same address is said once, and no more than 50: clients try again
+    every few seconds, and choose the text. ``unsaid`` counts the others. A context manager.
+    """
+
+    def __init__(self, note: Callable[[str], None]) -> None:
+        super().__init__(logging.WARNING)
+        self.unsaid = 0
+        self._note, self._said = note, set[str]()
+        self._logger = logging.getLogger("foxglove")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say it, if it is a new trouble."""
+        text = _CLIENT.sub(r"\1\2", record.getMessage())
+        if text in self._said or len(self._said) == _MOST_TROUBLES:
+            self.unsaid += 1
+            return
+        self._said.add(text)
+        if "handshake failed" in text:
+            text += (
+                f"; if it is Foxglove or Lichtblick, update it: clients must speak {PROTOCOL}, and"
+                " older ones speak foxglove.websocket.v1 only"
+            )
+        self._note(text)
+
+    def __enter__(self) -> Self:
+        self._propagated, self._logger.propagate = self._logger.propagate, False
+        self._logger.addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self)
+        self._logger.propagate = self._propagated
 
 
 TICK_S: Final = 0.05

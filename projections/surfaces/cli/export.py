@@ -225,7 +225,13 @@ def foxglove(
     Anybody who can reach the address can read the log. Ctrl-C ends it.
     """
     try:
-        from projections.adapters.foxglove.playback import PastMaps, Playback, layout_json
+        from projections.adapters.foxglove.playback import (
+            PROTOCOL,
+            ClientTroubles,
+            PastMaps,
+            Playback,
+            layout_json,
+        )
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold foxglove needs {error.name}, which is not installed;"
@@ -252,13 +258,18 @@ def foxglove(
             raise MisuseError(
                 f"cannot listen on {host}:{port}: {error}; give another --host or --port"
             ) from None
-        with stop_on_signals() as stop:
+        with stop_on_signals() as stop, ClientTroubles(say) as troubles:
             if not is_loopback(host):
                 say(f"warning: others can reach {host}, and can read the log; there is no token")
             shown = f"[{host}]" if ":" in host else host
             say(f"showing {counted(end, 'event')} of {log} at ws://{shown}:{playback.server.port}")
-            say("in Foxglove: Open connection, Foxglove WebSocket; Ctrl-C ends it")
+            say(
+                f"in Foxglove: Open connection, Foxglove WebSocket (it must speak {PROTOCOL});"
+                " Ctrl-C ends it"
+            )
             _run(playback, stop)
+    if troubles.unsaid:
+        say(f"{counted(troubles.unsaid, 'more trouble')} with clients")
     say("closed")
 
 
