@@ -1,6 +1,7 @@
 """HTTP access control of `mapfold serve`: token, TLS, the Host and Origin headers."""
 
 import json
+import os
 import re
 import ssl
 from pathlib import Path
@@ -158,6 +159,11 @@ class TestMisuse:
         said = mapfold(*args, code=2).err
         assert "the token has 5 characters" in said
         assert "short" not in said
+
+    def test_a_fifo_in_place_of_a_token_file_blocks_nothing(self, mapfold: Commands) -> None:
+        os.mkfifo(mapfold.folder / "fifo")
+        args = ("serve", "--no-zenoh", "--http", "127.0.0.1:0", "--token-file", "fifo")
+        assert "--token-file fifo: not a regular file" in mapfold(*args, code=2).err
 
     def test_an_empty_token_in_the_environment(self, tmp_path: Path) -> None:
         mapfold = Commands.in_folder(tmp_path, MAPFOLD_TOKEN="")

@@ -41,6 +41,26 @@ def test_our_own_errors_are_one_line(mapfold: Commands, args: tuple[str, ...], s
     assert line.startswith(f"mapfold: {says}")
 
 
+@pytest.mark.parametrize(
+    ("args", "name"),
+    [
+        (("export", "log", "--foxglove="), "--foxglove"),
+        (("export", "log", "--rerun", ""), "--rerun"),
+        (("simulate", "--out="), "--out"),
+        (("reembed", "log", "--encoder="), "--encoder"),
+        (("db", "check", ""), "LOG"),
+        (("state", "log", "--settings="), "--settings"),
+        (("import", "other", ""), "FILE"),
+    ],
+)
+def test_an_empty_path_is_refused(mapfold: Commands, args: tuple[str, ...], name: str) -> None:
+    before = {*mapfold.folder.iterdir()}
+    said = mapfold(*args, code=2).err
+    assert name in said
+    assert "empty" in said
+    assert {*mapfold.folder.iterdir()} == before
+
+
 def test_a_value_that_is_not_offered(mapfold: Commands) -> None:
     said = mapfold("replay", "log", "--only", "foo", code=2).err
     assert "Invalid value for '--only': 'foo' is not one of 'graph', 'vectors'" in said

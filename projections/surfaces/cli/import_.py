@@ -122,6 +122,8 @@ def import_(
     Ctrl-C keeps the events appended so far and prints how far the import got.
     """
     names = files or []
+    if "" in names:
+        raise MisuseError("a FILE is empty; give the path of a file, or - for stdin")
     if not names and map_ is None:
         raise MisuseError("nothing to import; give a FILE, or a map by --map")
     check_sources(names)

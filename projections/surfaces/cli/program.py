@@ -27,8 +27,9 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO, get_args
 
 import typer
 from typer.core import TyperGroup
@@ -132,9 +133,43 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
     for module in dict.fromkeys(modules[name] for name in names):
         importlib.import_module(module).register(app)
     add_presets(app)
+    _refuse_empty_paths(app)
     remember_running(app)
     _list_whole_sentences(app)
     return app
+
+
+class _GivenPath(type(Path())):  # type: ignore[misc]
+    """Makes the Path of an option or argument that is not empty: ``Path("")`` would be the working
+    folder, so ``--out=$UNSET`` would name that."""
+
+    def __new__(cls, text: str | Path) -> Path:  # type: ignore[misc]
+        if text == "":
+            raise typer.BadParameter("the path is empty")
+        return Path(text)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, *_: object) -> Any:  # newer versions of typer call it
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(cls)
+
+
+def _refuse_empty_paths(app: typer.Typer) -> None:
+    """Make every path of the commands a `_GivenPath`."""
+    for command in app.registered_commands:
+        parameters = inspect.signature(command.callback, eval_str=True).parameters.values()  # type: ignore[arg-type]
+        for annotation in (each.annotation for each in parameters):
+            if _has_path(annotation):
+                for note in annotation.__metadata__:
+                    note.path_type = _GivenPath
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            _refuse_empty_paths(group.typer_instance)
+
+
+def _has_path(annotation: Any) -> bool:
+    return annotation is Path or any(map(_has_path, get_args(annotation)))
 
 
 def _list_whole_sentences(app: typer.Typer) -> None:

@@ -24,6 +24,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.user_files import FileFault, open_file
 
 TOKEN_VARIABLE: Final = "MAPFOLD_TOKEN"  # noqa: S105  the name of a variable
 MIN_TOKEN: Final = 16
@@ -50,11 +51,11 @@ def read_token(
         given = environment.get(TOKEN_VARIABLE)
         return None if given is None else _checked(given, f"{TOKEN_VARIABLE} of the environment")
     try:
-        with file.open("rb") as opened:
-            status, raw = os.fstat(opened.fileno()), opened.read(_MAX_FILE + 1)
-    except OSError as error:
-        raise MisuseError(f"--token-file {file}: {error.strerror or error}") from None
-    if stat.S_ISREG(status.st_mode) and status.st_mode & (stat.S_IRGRP | stat.S_IROTH):
+        with open_file(file) as opened:
+            mode, raw = os.fstat(opened.fileno()).st_mode, opened.read(_MAX_FILE + 1)
+    except (FileFault, OSError) as error:
+        raise MisuseError(f"--token-file {file}: {error}") from None
+    if mode & (stat.S_IRGRP | stat.S_IROTH):
         note(f"--token-file {file}: other users may read it; run chmod 600 {file}")
     return _checked(raw[:_MAX_FILE].decode("latin-1"), f"--token-file {file}")
 
