@@ -6,20 +6,20 @@ from functools import cached_property
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import Corrections, Keyframe, RecordedCommand, compile_corrections
-from projections.fold.deltas import PlaceOrdinal, PlacesMerged
+from projections.fold.deltas import PlaceOrdinal
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.history import NoSuchThing
-from projections.map.fold import READ_AHEAD, fold_events, fold_log_cached
 from projections.map.log_commands import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
-from projections.map.space_vectors import new_map
 from projections.map.view import MapView
+from projections.store.history_recorder import HistoryRecorder
+from projections.store.records import Merge
+from projections.store.timeline_cache import TimelineCache
 
 SettingsOf = Callable[[Corrections], Settings]
 """The settings of the map, given the log's corrections."""
@@ -29,8 +29,8 @@ class CurrentMap:
     """A log, the commands in it, and the map that it is folded to under ``settings_of`` these.
 
     With ``until`` it is the log as of its first ``until`` events. ``note`` is called with a
-    message for each snapshot that could not be used. ``commands`` are those before ``until`` and
-    ``corrections`` what they compile to, where the caller has them.
+    message for each part of a kept history that could not be used. ``commands`` are those before
+    ``until`` and ``corrections`` what they compile to, where the caller has them.
     """
 
     def __init__(
@@ -69,9 +69,17 @@ class CurrentMap:
 
     def fold(self, corrections: Corrections, settings: Settings) -> MapView:
         """The map under other corrections or settings."""
-        return fold_log_cached(
-            self.reader, settings, self.end, note=self.note, corrections=corrections
-        )[1]
+        if corrections is self.corrections and settings == self.settings:
+            return self._own.at(self.end)
+        return self._recorder(corrections, settings).at(self.end)
+
+    @cached_property
+    def _own(self) -> HistoryRecorder:
+        return self._recorder(self.corrections, self.settings)
+
+    def _recorder(self, corrections: Corrections, settings: Settings) -> HistoryRecorder:
+        cache = TimelineCache(self.reader, settings, corrections, self.note)
+        return HistoryRecorder(self.reader, settings, corrections, cache, None)
 
     @property
     def view(self) -> MapView:
@@ -85,18 +93,10 @@ class CurrentMap:
         self._view = view
 
     @cached_property
-    def merges(self) -> list[PlacesMerged]:
-        """Every merge of places, in order; from a fold of the whole log."""
-        semantic_map = new_map(self.reader, self.settings, self.corrections)
-        view = MapView(self.settings, keep_embeddings=False, corrections=self.corrections)
-        merges: list[PlacesMerged] = []
-        events = self.reader.read(FIRST_OFFSET, self.end)
-        with gc_paused():
-            for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
-                view.apply_event(folded.offset, folded.deltas)
-                merges += [d for d in folded.deltas if isinstance(d, PlacesMerged)]
-        self._view = self._view or view
-        return merges
+    def merges(self) -> list[Merge]:
+        """Every merge of places, in order."""
+        merges = self._own.history(self.end).merges
+        return [merge for merge in merges if merge.cause.offset < self.end]
 
     @cached_property
     def keyframes(self) -> dict[Keyframe, KeyframeRecord]:

@@ -272,7 +272,7 @@ def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
     Raises MisuseError with the offsets of merges when nothing merged there, and EditRefused when a
     ``join`` command merged them, or when the event made several merges.
     """
-    found = [merge for merge in current.merges if merge.offset == offset]
+    found = [merge for merge in current.merges if merge.cause.offset == offset]
     if not found:
         _check_not_undone(current, offset)
         raise MisuseError(_nothing_merged(current, offset))
@@ -304,7 +304,9 @@ def _check_not_undone(current: CurrentMap, offset: int) -> None:
 
 
 def _nothing_merged(current: CurrentMap, offset: int) -> str:
-    offsets = sorted({m.offset for m in current.merges}, key=lambda at: (abs(at - offset), at))
+    offsets = sorted(
+        {m.cause.offset for m in current.merges}, key=lambda at: (abs(at - offset), at)
+    )
     if not offsets:
         return f"nothing merged at offset {offset}; no places were merged in this log"
     near = ", ".join(map(str, sorted(offsets[:_MOST_OFFSETS])))

@@ -7,22 +7,19 @@ that knows it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import TypeVar
 
 from eventsrc.base.errors import LogDamaged, MisuseError
-from eventsrc.base.garbage import gc_paused
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.errors import FoldError, LogPointError
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events, fold_log_cached
-from projections.map.snapshot_cache import SnapshotCache
-from projections.map.space_vectors import new_map, with_vectors
+from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events
+from projections.map.space_vectors import new_map
 from projections.map.view import MapView
-from projections.store.history_recorder import HistoryRecorder, map_at
+from projections.store.history_recorder import HistoryRecorder
 from projections.store.history_recorder import Progress as Progress
 from projections.store.records import Merge, ObjectMerge, Refusal
 from projections.store.stored_history import StoredHistory
@@ -62,8 +59,8 @@ class KnownHistory:
     """The history of a log under ``settings`` and ``corrections``; an ``end`` is a number of
     events.
 
-    ``progress`` is called while events are folded, ``note`` with a line about each snapshot or kept
-    history that could not be used. Without ``cache`` no history is read or kept beside the log.
+    ``progress`` is called while events are folded, ``note`` with a line about each part of a
+    kept history that could not be used. Without ``cache`` none is read or kept beside the log.
     """
 
     def __init__(
@@ -79,13 +76,10 @@ class KnownHistory:
         self.reader = reader
         self.settings = settings
         self.corrections = corrections
-        self._note = note
-        self._snapshot_tried = False
-        self._cache = TimelineCache(reader, settings, corrections, note) if cache else None
-        self._recorder = HistoryRecorder(reader, settings, corrections, self._cache, progress)
-        self._history: StoredHistory | None = None
+        kept = TimelineCache(reader, settings, corrections, note) if cache else None
+        self._recorder = HistoryRecorder(reader, settings, corrections, kept, progress)
         self._latest: StoredView | None = None
-        self._index: CountIndex | None = None
+        self._index: tuple[StoredHistory, CountIndex] | None = None
         self._entries = EntryMaker(reader)
 
     @property
@@ -105,7 +99,7 @@ class KnownHistory:
 
     def _whole_view(self, history: StoredHistory) -> StoredView:
         if self._latest is None or self._latest.next_offset != history.next_offset:
-            self._latest = StoredView(history, history.next_offset, self._cache)
+            self._latest = self._recorder.at(history.next_offset)
         return self._latest
 
     def covering(self, end: Offset) -> StoredHistory:
@@ -120,57 +114,25 @@ class KnownHistory:
 
     def _history_of(self, end: Offset) -> StoredHistory:
         """The history of ``end`` events or more."""
-        tables = self._recorder.up_to(end)
-        if self._history is None or self._history.tables is not tables:
-            self._index = None
-            self._history = StoredHistory(
-                self.settings, self.corrections, tables, partial(map_at, self.reader)
-            )
-        return self._history
+        return self._recorder.history(end)
 
     def at(self, end: Offset | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; the caller may change it.
 
-        Its observations carry no embeddings, only their checksums. Without a history that was kept,
-        the first call folds from the nearest snapshot beside the log, if there is one; a later call
-        folds the history, from then on it is a look-up.
+        Its observations carry no embeddings, only their checksums. The first call folds the
+        history, unless one was kept; from then on it is a look-up.
         """
         wanted = self._checked(end)
-        if not self._recorder.has(wanted) and not self._snapshot_tried:
-            self._snapshot_tried = True
-            if self._has_snapshot(wanted):
-                return self.folded(wanted)
-        known = self._recorder.has(wanted)
-        return self._view(self._history_of(wanted) if known else self.covering(wanted), wanted)
-
-    def at_once(self, end: Offset) -> MapView:
-        """`at`, for one question: events from ``end`` on are not folded."""
-        if not self._recorder.has(end) and self._has_snapshot(end):
-            return self.folded(end)
-        return self._view(self._history_of(end), end)
-
-    def folded(self, end: Offset) -> MapView:
-        """The map at ``end``, folded from the nearest snapshot."""
-        return fold_log_cached(
-            self.reader, self.settings, end, note=self._note, corrections=self.corrections
-        )[1]
-
-    def _view(self, history: StoredHistory, end: Offset) -> MapView:
-        """The map at ``end`` from a history of as many events or more."""
-        with gc_paused():
-            return StoredView(history, end, self._cache)
+        if not self._recorder.has(wanted):
+            self.covering(wanted)  # folds the whole log, not only up to ``wanted``
+        return self._recorder.at(wanted)
 
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> Iterator[FoldedEvent]:
-        """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
-        nearest snapshot."""
-        found = self._snapshots().latest(self._checked(start))
-        if found is None:
-            semantic_map = new_map(self.reader, self.settings, self.corrections)
-        else:
-            semantic_map = with_vectors(found[0], self.reader)
-        events = self.reader.read(semantic_map.next_offset, self._checked(end))
+        """The deltas of each event from ``start`` to before ``end``, by a separate fold."""
+        semantic_map = new_map(self.reader, self.settings, self.corrections)
+        events = self.reader.read(FIRST_OFFSET, self._checked(end))
         folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
         return (event for event in folded if event.offset >= start)
 
@@ -224,9 +186,9 @@ class KnownHistory:
         """The map after ``end`` events, for evaluating conditions."""
         last = self._checked(end)
         history = self.covering(last)
-        if self._index is None:
-            self._index = CountIndex(history)
-        return HistoryFacts(history, self._index, last)
+        if self._index is None or self._index[0] is not history:
+            self._index = history, CountIndex(history)
+        return HistoryFacts(history, self._index[1], last)
 
     def bisect(
         self,
@@ -250,33 +212,6 @@ class KnownHistory:
 
     def _checked(self, end: Offset | None) -> Offset:
         return checked_end(self.reader, end)
-
-    def _has_snapshot(self, end: Offset) -> bool:
-        return any(offset <= end for offset in self._snapshots().offsets())
-
-    def _snapshots(self) -> SnapshotCache:
-        return SnapshotCache(
-            self.reader.path,
-            self.reader.log_id,
-            self.settings,
-            self._note,
-            corrections=self.corrections,
-        )
-
-
-def map_after(
-    reader: LogReader,
-    settings: Settings,
-    end: Offset,
-    *,
-    corrections: Corrections,
-    note: Callable[[str], None],
-    cache: bool = True,
-) -> MapView:
-    """The map after ``end`` events, for one question: from the history that is kept beside the log,
-    else from the nearest snapshot. Without either the events are folded, and their history kept."""
-    known = KnownHistory(reader, settings, corrections, note=note, cache=cache)
-    return known.at_once(end) if cache else known.folded(end)
 
 
 def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:

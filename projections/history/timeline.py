@@ -42,7 +42,7 @@ class Timeline:
 
     ``settings`` are those of every fold, or a function of the corrections; by default those
     recorded in the log. ``progress`` is called while events are folded, ``note`` with a line about
-    each snapshot or kept history that could not be used. ``reader`` reads ``log`` instead of a new
+    each part of a kept history that could not be used. ``reader`` reads ``log`` instead of a new
     reader; the timeline closes it. At most ``histories`` are kept in memory. Without ``cache`` none
     is read or kept beside the log.
     """

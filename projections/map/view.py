@@ -10,6 +10,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from eventsrc.base.crc import crc32
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from projections.fold import deltas
@@ -378,6 +381,17 @@ class MapView:
             "buildings": int(bool(self.all_places or self.floors)),
             "PART_OF": len(self.places) + len(self.floors),
         } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}
+
+    def embedded(self) -> NDArray[np.int64]:
+        """The observations that have a vector of the map's space, as ascending ordinals; none in a
+        view without embeddings."""
+        found = (o.ordinal for o in self.observations if o.embedding is not None)
+        return np.fromiter(found, np.int64)
+
+    def vectors(self, observations: NDArray[np.int64]) -> NDArray[np.int32]:
+        """The unit vectors of some of `embedded`, in units of 2⁻²⁰, shape (n, dim)."""
+        rows = [self.observations[ordinal].embedding for ordinal in observations.tolist()]
+        return np.array(rows, np.int32)
 
     def _sums(self) -> tuple[int, int, int]:
         """The numbers of keyframes with a pose, and of observations with an Object and with a

@@ -1,5 +1,6 @@
-"""Folds a log into the tables of a history, from the end of the cached history on.
+"""The maps of a log: folds it into the tables of a history, from the end of the cached history on.
 
+Every answer about the map after W events is read from here (`map_after`, `HistoryRecorder.at`).
 Long folds are cached beside the log, so that the next process folds only later events.
 
 **An interrupted fold is continued or discarded.** An exception, such as that of Ctrl-C, can come at
@@ -9,6 +10,7 @@ then are fold and tables kept, both by one assignment. Until then there are the 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple, TypeAlias
 
 from eventsrc.base.errors import LogError
@@ -16,15 +18,19 @@ from eventsrc.base.garbage import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
-from projections.fold.corrections import Corrections
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, parse_events
+from projections.map.fold import READ_AHEAD, fold_events, fold_log, parse_events
 from projections.map.space_vectors import new_map
+from projections.map.view import MapView
 
 from .column_rows import TableWriter
 from .columns import STRIPE_EVENTS, Stripe, joined
+from .recorded_vectors import RecordedVectors
+from .stored_history import StoredHistory
+from .stored_view import StoredView
 from .tables import DamagedPart, Tables
 from .timeline_cache import TimelineCache
 
@@ -59,6 +65,25 @@ class HistoryRecorder:
         self._reader, self._settings, self._corrections = reader, settings, corrections
         self._cache, self._progress = cache, progress
         self._folded: _Folded | None = None
+        self._history: StoredHistory | None = None
+
+    def history(self, end: Offset) -> StoredHistory:
+        """The history of ``end`` events or more; raises as `up_to`."""
+        tables, history = self.up_to(end), self._history
+        if history is None or history.tables is not tables:
+            map_of = partial(map_at, self._reader)
+            history = StoredHistory(self._settings, self._corrections, tables, map_of)
+            self._history = history
+        return history
+
+    def at(self, end: Offset, *, embeddings: bool = False) -> StoredView:
+        """The map after ``end`` events; the caller may change it. Its observations carry no
+        embeddings, only their checksums; with ``embeddings`` its `vectors` are read from the log.
+        Raises as `up_to`."""
+        history = self.history(end)
+        vectors = RecordedVectors(self._reader, history) if embeddings else None
+        with gc_paused():
+            return StoredView(history, end, self._cache, vectors)
 
     def has(self, end: Offset) -> bool:
         """Whether ``end`` events are folded, or in the cache."""
@@ -151,6 +176,33 @@ def _with_short_joined(stripes: Sequence[Stripe], first: int) -> list[Stripe]:
             break
         found[-2:] = [joined([one, other])]
     return found
+
+
+def map_after(
+    reader: LogReader,
+    settings: Settings,
+    end: Offset | None = None,
+    *,
+    corrections: Corrections = NO_CORRECTIONS,
+    note: Callable[[str], None] = lambda _: None,
+    cache: bool = True,
+    embeddings: bool = False,
+) -> MapView:
+    """The map after ``end`` events, all of them for None: from the history that is kept beside the
+    log, folding only events that it lacks. With ``embeddings`` the map has `vectors`.
+
+    ``note`` is called with a line about each part of the history that could not be used or kept.
+    Without ``cache`` the log is folded and nothing kept. Raises FoldError, LogDamaged.
+    """
+    last = reader.next_offset if end is None else end
+    if not cache:
+        return fold_log(
+            reader, settings, last, keep_embeddings=embeddings, corrections=corrections
+        )[1]
+    kept = TimelineCache(reader, settings, corrections, note)
+    return HistoryRecorder(reader, settings, corrections, kept, None).at(
+        last, embeddings=embeddings
+    )
 
 
 def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:

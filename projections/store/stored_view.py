@@ -10,6 +10,7 @@ from itertools import pairwise, repeat
 from typing import Any, Final, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import Delta, PlaceOrdinal, Pose, SkipKind
@@ -20,6 +21,7 @@ from projections.map.view import MapView
 from .columns import NONE
 from .lazy_rows import Chunks
 from .moment import Moment
+from .recorded_vectors import RecordedVectors
 from .stored_history import StoredHistory
 from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
 from .timeline_cache import TimelineCache
@@ -30,15 +32,24 @@ _LAZY: Final = ("keyframes", "observations")
 class StoredView(MapView):
     """The map after ``end`` events of a history of tables; the caller may change it.
 
-    Its digest is kept in ``cache``, if there is one.
+    Its digest is kept in ``cache``, if there is one. Its observations have embeddings only in
+    ``recorded``, as which `vectors` gives them.
     """
 
     def __init__(
-        self, history: StoredHistory, end: Offset, cache: TimelineCache | None = None
+        self,
+        history: StoredHistory,
+        end: Offset,
+        cache: TimelineCache | None = None,
+        recorded: RecordedVectors | None = None,
     ) -> None:
-        super().__init__(history.settings, keep_embeddings=False, corrections=history.corrections)
+        super().__init__(
+            history.settings,
+            keep_embeddings=recorded is not None,
+            corrections=history.corrections,
+        )
         self._is_changed = False
-        self._cache = cache
+        self._cache, self._recorded = cache, recorded
         self._moment = moment = Moment(history, end)
         self.all_places = places_of(moment)
         for merge in moment.merges:
@@ -103,6 +114,18 @@ class StoredView(MapView):
             return super().det_ids()
         count = self._moment.count("observation")
         return [each or "" for each in self._moment.tables.texts("observation", "det_id", 0, count)]
+
+    def embedded(self) -> NDArray[np.int64]:
+        """The observations that have a vector of the map's space."""
+        if self._recorded is None or self._is_changed:
+            return super().embedded()
+        return np.flatnonzero(self._moment.column("observation", "crc") != NONE)
+
+    def vectors(self, observations: NDArray[np.int64]) -> NDArray[np.int32]:
+        """The unit vectors of some of `embedded`. Raises LogError, FoldError."""
+        if self._recorded is None:
+            return super().vectors(observations)
+        return self._recorded.of(observations)
 
     def floor_of(self, place: PlaceOrdinal) -> str | None:
         """The name of the floor that a place is on; None if the log has none."""

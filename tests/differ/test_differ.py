@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from projections.history.known import map_after
 from projections.map.view import MapView
+from projections.store.history_recorder import map_after
 from tests.differ.__main__ import main
 from tests.differ.growing_log import GrowingLog
 

@@ -16,10 +16,10 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.edit.current import CurrentMap
 from projections.history import Timeline
-from projections.history.known import map_after
 from projections.history.parallel import Rules, fold_all
 from projections.map.fold import fold_log_cached
 from projections.map.log_commands import read_corrections
+from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
 from tests.history_answers import whole
 from tests.property.test_timeline_cache import kept_early

@@ -19,8 +19,8 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.history import Timeline
-from projections.history.known import map_after
 from projections.map.fold import fold_log
+from projections.store.history_recorder import map_after
 from projections.store.timeline_cache import TimelineCache
 from tests import prefork
 from tests.envelopes import detection, envelope

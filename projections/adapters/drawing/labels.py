@@ -8,8 +8,10 @@ the rings is left out; the caller reports how many were.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 _ANGLES = 16
+_CELL_M = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,21 +61,43 @@ def place_labels(
 
     ``rings`` are distances from the anchor to the box's nearest edge, ascending.
     """
-    boxes = list(occupied)
     placed: list[Extent | None] = []
+    taken = _Taken(occupied)
     for label in requests:
-        free = next(
-            (
-                box
-                for box in _candidates(label, rings)
-                if box.inside(bounds) and not any(box.overlaps(other) for other in boxes)
-            ),
-            None,
-        )
+        boxes = (box for box in _candidates(label, rings) if box.inside(bounds))
+        free = next((box for box in boxes if not taken.overlap(box)), None)
         if free is not None:
-            boxes.append(free)
+            taken.add(free)
         placed.append(free)
     return placed
+
+
+class _Taken:
+    """Boxes by the cells of a grid that they touch, so that a box is compared with those near it
+    only."""
+
+    def __init__(self, boxes: Iterable[Extent]) -> None:
+        self._by_cell: dict[tuple[int, int], list[Extent]] = {}
+        for box in boxes:
+            self.add(box)
+
+    def add(self, box: Extent) -> None:
+        for cell in _cells(box):
+            self._by_cell.setdefault(cell, []).append(box)
+
+    def overlap(self, box: Extent) -> bool:
+        """Whether one of the boxes overlaps ``box``."""
+        return any(
+            box.overlaps(other) for cell in _cells(box) for other in self._by_cell.get(cell, ())
+        )
+
+
+def _cells(box: Extent) -> Iterable[tuple[int, int]]:
+    """The cells that a box touches; a little larger, as sums are rounded."""
+    wide, high = box.half_width + 1e-6, box.half_height + 1e-6
+    x0, x1 = (math.floor((box.x + side) / _CELL_M) for side in (-wide, wide))
+    y0, y1 = (math.floor((box.y + side) / _CELL_M) for side in (-high, high))
+    return product(range(x0, x1 + 1), range(y0, y1 + 1))
 
 
 def _candidates(label: LabelRequest, rings: Sequence[float]) -> Iterable[Extent]:

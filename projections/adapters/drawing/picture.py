@@ -10,8 +10,8 @@ from pathlib import Path
 from eventsrc.base.text import counted
 from projections.adapters import palette
 from projections.fold.deltas import PlacesMerged
-from projections.map.fold import FoldedEvent
 from projections.map.view import MapView
+from projections.store.records import Merge
 
 from .base_layers import (
     draw_drives,
@@ -129,16 +129,7 @@ def legend_lines(
     return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
 
 
-def fold_with_merges(events: Iterable[FoldedEvent], view: MapView) -> list[PlacesMerged]:
-    """Apply every event to ``view`` and return its merges, in offset order."""
-    merges: list[PlacesMerged] = []
-    for event in events:
-        view.apply_event(event.offset, event.deltas)
-        merges += (delta for delta in event.deltas if isinstance(delta, PlacesMerged))
-    return merges
-
-
-def bridges_of(view: MapView, merges: Iterable[PlacesMerged]) -> list[Bridge]:
+def bridges_of(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[Bridge]:
     """One mark for each merge, at the position of its bridging keyframe."""
     names = place_names(view)
     marks: list[Bridge] = []

@@ -12,6 +12,7 @@ to the last bit.
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -113,10 +114,7 @@ class ExactIndex:
 
     def __init__(self, view: MapView) -> None:
         self._view = view
-        rows = [o.ordinal for o in view.observations if o.embedding is not None]
-        self._ordinals = np.array(rows, dtype=np.intp)
-        vectors = [view.observations[ordinal].embedding for ordinal in rows]
-        self._matrix = np.array(vectors, dtype=np.float64)
+        self._ordinals = view.embedded()
         self.places = {
             place.ordinal: CandidatePlace(
                 place.place_id,
@@ -127,38 +125,48 @@ class ExactIndex:
             )
             for place in view.places.values()
         }
-        self.model = next(
-            (o.embedding_model for o in view.observations if o.embedding is not None), None
-        )
+        first = self._ordinals[:1]
+        self.model = view.observations[int(first[0])].embedding_model if len(first) else None
+        self._dimension = view.vectors(first).shape[1] if len(first) else 0
         self.constants = MapConstants.of(view.settings, self._different())
         maps = view.maps_in_force()
         self._walls = {floor: WallMap(given.map) for floor, given in maps.items()}
+
+    @cached_property
+    def _matrix(self) -> NDArray[np.float64]:
+        """The vectors of all observations that have one; questions by class alone need none."""
+        return self._view.vectors(self._ordinals).astype(np.float64)
 
     def _different(self) -> Cosines:
         """The statistics of cosines between different things in one picture, over a sample."""
         ordinals = self._ordinals
         sample = Sample.of(int(ordinals[-1]) + 1 if len(ordinals) else 0)
         rows = np.flatnonzero((ordinals < sample.limit) & ((ordinals + 1) % sample.stride == 0))
-        products = []
+        pairs = []
         for row in rows.tolist():
-            one = self._view.observations[ordinals[row]]
+            one = self._view.observations[int(ordinals[row])]
             for other in range(row + 1, min(row + 1 + FOLLOWERS, len(ordinals))):
-                second = self._view.observations[ordinals[other]]
+                second = self._view.observations[int(ordinals[other])]
                 if (
                     second.keyframe == one.keyframe
                     and second.ordinal <= one.ordinal + FOLLOWERS
                     and second.class_name != one.class_name
                 ):
-                    products.append(float(self._matrix[row] @ self._matrix[other]) / Q40)
-        if not products:
+                    pairs.append((row, other))
+        if not pairs:
             return Cosines()
+        used, at = np.unique(np.array(pairs), return_inverse=True)
+        vectors = self._view.vectors(ordinals[used]).astype(np.float64)
+        products = [
+            float(vectors[one] @ vectors[other]) / Q40 for one, other in at.reshape(-1, 2).tolist()
+        ]
         return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
     def check_spaces(self, crops: Sequence[Crop]) -> None:
         """Raise QuestionError when a crop is not of the map's embedding space."""
         if len(self._ordinals):
             for crop in crops:
-                check_space(crop, self._matrix.shape[1], self.model)
+                check_space(crop, self._dimension, self.model)
 
     def search(
         self,

@@ -16,10 +16,10 @@ from eventsrc.base.text import counted
 from eventsrc.log import LogReader
 from eventsrc.record.transport.config import is_loopback
 from projections.fold.corrections import map_fingerprint
-from projections.map.fold import fold_log_cached
 from projections.map.log_commands import read_corrections
 from projections.map.one_floor import view_of_floor
 from projections.map.scenes import RecordedFold
+from projections.store.history_recorder import map_after
 
 from .options import (
     KnownAtOption,
@@ -152,7 +152,7 @@ def export(
                 say(f"wrote {file}: {counted(end, 'event')}, {counted(scenes, 'scene')}")
         if not any(files.values()):
             return
-        _, view = fold_log_cached(reader, settings, end, note=say, corrections=corrections)
+        view = map_after(reader, settings, end, corrections=corrections, note=say)
     if floor is not None:
         view = view_of_floor(view, floor)
     texts: dict[Path, str] = {}

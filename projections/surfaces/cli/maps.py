@@ -9,16 +9,14 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
-from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import LogReader
-from projections.history.known import map_after
 from projections.map.advice import places_advice, space_advice
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
-from projections.map.fold import fold_events
 from projections.map.log_commands import read_corrections
-from projections.map.space_vectors import new_map
 from projections.map.view import MapView
+from projections.store.history_recorder import HistoryRecorder, map_after
+from projections.store.timeline_cache import TimelineCache
 
 from .options import (
     JsonOption,
@@ -122,7 +120,7 @@ def draw(
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.adapters.sim import build_house
     from projections.adapters.drawing import draw_map, floor_of
-    from projections.adapters.drawing.picture import bridges_of, fold_with_merges
+    from projections.adapters.drawing.picture import bridges_of
     from projections.map.one_floor import view_of_floor
 
     check_picture(out)
@@ -131,9 +129,10 @@ def draw(
         end = point(reader, at)
         corrections = read_corrections(reader, known_point(reader, known_at, end))
         settings = settings_from(settings_file, set_, corrections)
-        view = MapView(settings, keep_embeddings=False, corrections=corrections)
-        fold = new_map(reader, settings, corrections)
-        merged = fold_with_merges(fold_events(reader.read(FIRST_OFFSET, end), fold), view)
+        cache = TimelineCache(reader, settings, corrections, say)
+        recorder = HistoryRecorder(reader, settings, corrections, cache, None)
+        view: MapView = recorder.at(end)
+        merged = [m for m in recorder.history(end).merges if m.cause.offset < end]
     title = f"{log.resolve().name} after {counted(view.next_offset, 'event')}"
     if floor is not None:
         view, title = view_of_floor(view, floor), f"{title}, floor {visible(floor)}"

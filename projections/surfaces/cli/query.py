@@ -9,7 +9,6 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogReader
-from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
 from projections.postgres.connection import connect
 from projections.postgres.queries.map_queries import (
@@ -23,6 +22,7 @@ from projections.postgres.queries.map_queries import (
     where_is,
 )
 from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
+from projections.store.history_recorder import map_after
 
 from .options import (
     DbOption,
@@ -38,7 +38,7 @@ from .options import (
     question_from,
     say_defaults,
 )
-from .terminal import display, emit
+from .terminal import display, emit, say
 
 AtOption = Annotated[
     str | None,
@@ -154,7 +154,7 @@ def _map_source(
             end = point(reader, at or "end")
             corrections = read_corrections(reader, end)
             settings = past_settings(log, settings_file, assignments, corrections)
-            _, view = fold_log(reader, settings, end, corrections=corrections)
+            view = map_after(reader, settings, end, corrections=corrections, note=say)
         say_defaults(settings)
         yield FoldedMap(view)
         return

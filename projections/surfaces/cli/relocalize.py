@@ -35,8 +35,8 @@ from projections.localize.relocalize import (
     read_moved,
     read_question,
 )
-from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
+from projections.store.history_recorder import map_after
 
 from .options import (
     DbOption,
@@ -129,7 +129,9 @@ def relocalize(
                 end = point(reader, as_of or "end")
                 corrections = read_corrections(reader, end)
                 settings = past_settings(log, settings_file, set_, corrections)
-                _, view = fold_log(reader, settings, end, corrections=corrections)
+                view = map_after(
+                    reader, settings, end, corrections=corrections, note=say, embeddings=True
+                )
             search = ExactIndex(view).search
             say_defaults(settings)
         if track:

@@ -32,8 +32,8 @@ from projections.localize.relocalize import (
     rank,
 )
 from projections.localize.relocalize.floors import Hypotheses
-from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
+from projections.store.history_recorder import map_after
 
 from .log_map import LogMap
 from .log_prefix import PrefixReader
@@ -100,7 +100,14 @@ class Localizer:
             if self._kept is not None and self._kept[0] == key:
                 return end, self._kept[1]
             self._kept = None
-            view = fold_log(reader, settings, end, corrections=corrections)[1]
+            view = map_after(
+                reader,
+                settings,
+                end,
+                corrections=corrections,
+                cache=self._opened.cache and not assignments_of(query),
+                embeddings=True,
+            )
         index = ExactIndex(view)
         if len(view.observations) <= _KEPT_OBSERVATIONS:
             self._kept = key, index
