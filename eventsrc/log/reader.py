@@ -58,7 +58,7 @@ class LogReader:
         self.log_id = self._last.log_id
         """From its last segment; reading stops at a segment with another id."""
         if end is not None and end.log_id == self.log_id:
-            end.require(path, self.next_offset)
+            end.require(path, self._last.next_offset)
 
     @property
     def _last(self) -> OpenSegment:

@@ -1,5 +1,6 @@
 """`mapfold ui` on logs that are empty, damaged, of another version, replaced or gone."""
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,17 @@ def test_a_log_that_was_put_back_to_an_older_state(mapfold: Commands, tmp_path: 
         told = until(heard, lambda d: d["problems"])
         assert "has 20 events now, fewer than the 30" in " ".join(told["problems"])
         assert server.api("digest")["at"] == 30
+
+
+def test_a_log_that_is_truncated(mapfold: Commands, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", walk(20))
+    (segment,) = log.glob("*.mcap*")
+    with showing(mapfold, log) as server, server.live() as heard:
+        until(heard, lambda d: d["through"] == 20)
+        os.truncate(segment, segment.stat().st_size // 2)
+        told = until(heard, lambda d: d["problems"])
+        assert "the index at its end cannot be read" in told["problems"][0]
+        assert server.api("digest")["at"] == 20
 
 
 def test_no_log_is_an_error_of_the_command(mapfold: Commands, tmp_path: Path) -> None:

@@ -2,8 +2,9 @@
 keyboard and by reading aloud, its size, and that its bundle requests nothing from other hosts."""
 
 import gzip
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -31,7 +32,23 @@ HOSTILE = (
     "\U0001f9f8☕ emoji",
     "'\"`${1}{{}}",
     "\u200b\ufeff\u061c",
+    "</script><script>document.title='owned'</script>",
+    "{{constructor.constructor('document.title=1')()}}${document.title=1}",
 )
+
+
+def _delete(log: Path) -> None:
+    shutil.rmtree(log)
+
+
+def _replace(log: Path) -> None:
+    shutil.rmtree(log)
+    write_log(log, [envelope(k, x=0.2 * k, run_id=HOSTILE[0]) for k in range(20)])
+
+
+def _truncate(log: Path) -> None:
+    (segment,) = log.glob("*.mcap*")
+    os.truncate(segment, segment.stat().st_size // 2)
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +133,34 @@ def test_a_damaged_log_is_shown_as_far_as_it_goes(
         page = visit(server)
         expect(page.get_by_role("alert")).to_contain_text("445")
         expect(page.locator(".facts")).to_contain_text("445 keyframes")
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [(_delete, "is gone"), (_replace, "another log"), (_truncate, "cannot be read")],
+)
+def test_the_map_stays_when_the_log_is_damaged_beneath_it(
+    mapfold: Commands, visit: Visit, tmp_path: Path, damage: Callable[[Path], None], told: str
+) -> None:
+    runs = [name[:128] for name in HOSTILE]
+    seen = [detection(name, [1.0, 0.5]) for name in HOSTILE]
+    log = write_log(
+        tmp_path / "log",
+        [envelope(k, x=0.2 * k, run_id=runs[k % 9], detections=seen) for k in range(18)],
+    )
+    with showing(mapfold, log) as server:
+        page = visit(server)
+        expect(page.locator(".facts")).to_contain_text("18 keyframes")
+        damage(log)
+        expect(page.get_by_role("alert")).to_contain_text(told)
+        page.keyboard.press("ArrowLeft")
+        expect(page.locator(".facts")).to_contain_text("17 keyframes")
+        for panel in ("Compare", "Find", "Lost", "Correct", "Why"):
+            page.get_by_role("tab", name=panel).click()
+        page.get_by_label("Search places").fill("script")
+        expect(page.get_by_role("option").first).to_contain_text("<script>")
+        assert page.title() == "mapfold"
+        assert page.evaluate("() => document.querySelectorAll('img, body script').length") == 0
 
 
 def test_a_server_that_is_gone_is_told_and_the_map_stays(mapfold: Commands, visit: Visit) -> None:

@@ -64,7 +64,7 @@ class LogMap:
         self.log_id = self.reader.log_id
         self.packed: tuple[object, bytes] | None = None
         """The last whole history as an answer, and what it is of."""
-        self._files = _files(opened.log)
+        self._files, self._size = _files(opened.log)
         self._stopped: str | None = None
         self._lost: str | None = None
 
@@ -141,9 +141,11 @@ class LogMap:
         return resolve(self.reader, text, note=note)
 
     def _check_same(self) -> None:
-        """Raises LogError if there is no log any more where it was, or another one."""
-        path, files = self.reader.path, _files(self.reader.path)
-        if files == self._files:
+        """Raises LogError if there is no log any more where it was, another one, or a part."""
+        path = self.reader.path
+        files, size = _files(path)
+        if files == self._files and size >= self._size:
+            self._size = size
             return
         if not path.exists():
             raise LogNotFound(f"the log at {path} is gone; this page shows what was read before")
@@ -158,7 +160,7 @@ class LogMap:
                     f"the log at {path} has {counted(reader.next_offset, 'event')} now, fewer than"
                     f" the {self.through} that this page shows. Start mapfold ui again"
                 )
-        self._files = files
+        self._files, self._size = files, size
 
     def _fold(self) -> None:
         """Fold to the end, or to where that is not possible."""
@@ -183,10 +185,11 @@ class LogMap:
         self.timeline.refresh()
 
 
-def _files(path: Path) -> tuple[int, ...]:
-    """Identifies the folder and its last segment, to detect replaced ones."""
+def _files(path: Path) -> tuple[tuple[int, ...], int]:
+    """Identifies the folder and its last segment, to detect replaced ones; and the bytes of that
+    segment, to detect a truncated one."""
     try:
         status = [path.stat(), *(entry.path.stat() for entry in list_growing(path)[-1:])]
     except OSError:
-        return ()
-    return tuple(number for each in status for number in (each.st_dev, each.st_ino))
+        return (), 0
+    return tuple(n for each in status for n in (each.st_dev, each.st_ino)), status[-1].st_size
