@@ -1,6 +1,7 @@
 """Commands that a new one contradicts or repeats."""
 
-from collections.abc import Callable, Collection, Hashable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import TypeVar
 
 from eventsrc.base.advised import advised
@@ -17,6 +18,7 @@ from eventsrc.envelope.commands import (
 )
 from eventsrc.envelope.model import DetId, KeyframeId, RunId
 from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.fold.pair_groups import ApartPairs
 from projections.map.command_text import command_on
 
 from .current import CurrentMap
@@ -60,15 +62,13 @@ def check_apart(current: CurrentMap, anchors: Iterable[Keyframe]) -> None:
 def check_join(current: CurrentMap, first: Keyframe, second: Keyframe) -> None:
     """Raises EditRefused if the places, or what is joined to them, are kept apart."""
     corrections = current.corrections
-    places = {current.place_of(first), current.place_of(second)}
     groups = [_made_one(corrections.joined, anchor).keys() for anchor in (first, second)]
-    for pair in corrections.apart:
-        if _between(pair, *groups) or {current.place_of(k) for k in pair} == places:
-            found = command_on(corrections, *pair, joins=False)
-            _refuse("these places are kept apart", found, current)
+    for pair in _pairs_apart(corrections.apart, (first, second), groups, current.place_of):
+        found = command_on(corrections, *pair, joins=False)
+        _refuse("these places are kept apart", found, current)
 
 
-_T = TypeVar("_T", bound=Hashable)
+_T = TypeVar("_T", bound=tuple[object, ...] | str)
 
 
 def _made_one(pairs: Iterable[tuple[_T, _T]], start: _T) -> dict[_T, tuple[_T, _T] | None]:
@@ -89,9 +89,19 @@ def _made_one(pairs: Iterable[tuple[_T, _T]], start: _T) -> dict[_T, tuple[_T, _
     return reached
 
 
-def _between(pair: tuple[_T, _T], one: Collection[_T], other: Collection[_T]) -> bool:
-    a, b = pair
-    return (a in one and b in other) or (b in one and a in other)
+def _pairs_apart(
+    apart: ApartPairs[_T],
+    two: tuple[_T, _T],
+    groups: Sequence[Iterable[_T]],
+    of: Callable[[_T], object],
+) -> list[tuple[_T, _T]]:
+    """The pairs that are apart of what is one with each of two things by commands (``groups``), and
+    of what is in the place or object ``of`` each of them; ascending."""
+    inside: dict[object, list[_T]] = {}
+    for thing in apart.things:
+        inside.setdefault(of(thing), []).append(thing)
+    one, other = (inside.get(of(thing), []) for thing in two)
+    return sorted({*apart.between(*groups), *apart.between(one, other)})
 
 
 def _refuse(what: str, found: RecordedCommand | None, current: CurrentMap) -> None:
@@ -103,12 +113,11 @@ def check_same(current: CurrentMap, first: DetId, second: DetId) -> None:
     """Raises EditRefused if the objects of two observations, or what is one with them by commands,
     are kept apart."""
     corrections = current.corrections
-    objects = {_object(current, first), _object(current, second)}
     groups = [_made_one(corrections.same, det_id).keys() for det_id in (first, second)]
-    for pair in corrections.different:
-        if _between(pair, *groups) or {_object(current, d) for d in pair} == objects:
-            found = _objects_command(current, DifferentObjects, pair)
-            _refuse("these objects are kept apart", found, current)
+    object_of = partial(_object, current)
+    for pair in _pairs_apart(corrections.different, (first, second), groups, object_of):
+        found = _objects_command(current, DifferentObjects, pair)
+        _refuse("these objects are kept apart", found, current)
 
 
 def check_different(current: CurrentMap, first: DetId, second: DetId) -> None:

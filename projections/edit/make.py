@@ -92,7 +92,7 @@ def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> Name
 def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> KeepApart:
     """The command that keeps two places apart."""
     pair = _two_places(current, first, second)
-    if tuple(sorted(pair)) in current.corrections.apart:
+    if pair in current.corrections.apart:
         raise EditRefused(f"{first} and {second} are kept apart already")
     check_apart(current, pair)
     return build(KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
@@ -168,7 +168,7 @@ def different_objects(
             f"{first} and {second} are the same observation; name two objects, or two of the "
             f"det_ids of one (`{advised('state', '--json')}` has them)"
         )
-    if tuple(sorted((one.det_id, other.det_id))) in current.corrections.different:
+    if (one.det_id, other.det_id) in current.corrections.different:
         raise EditRefused(f"{first} and {second} are kept apart already")
     check_different(current, one.det_id, other.det_id)
     return build(DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))

@@ -16,7 +16,7 @@ had always been known, but only from the offset where it was recorded.
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from typing import NamedTuple
 
@@ -44,7 +44,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import DetId, Envelope, KeyframeId, Offset, RunId
 
-from .pair_groups import without_contradictions
+from .pair_groups import ApartPairs, without_contradictions
 from .pose_corrections import Pose, PoseCorrection, PoseCorrections
 from .settings import Settings
 
@@ -84,9 +84,9 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     forgotten_ranges: dict[RunId, tuple[tuple[KeyframeId, KeyframeId], ...]] = {}
     dropped: frozenset[DetId] = frozenset()
     poses: dict[RunId, PoseCorrections] = {}
-    apart: tuple[tuple[Keyframe, Keyframe], ...] = ()
+    apart: ApartPairs[Keyframe] = ApartPairs()
     joined: tuple[tuple[Keyframe, Keyframe], ...] = ()
-    different: tuple[tuple[DetId, DetId], ...] = ()
+    different: ApartPairs[DetId] = ApartPairs()
     same: tuple[tuple[DetId, DetId], ...] = ()
     names: tuple[PlaceName, ...] = ()
     settings: Settings | None = None
@@ -104,7 +104,14 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
         rows = self._canonical()
         if not any(rows):
             return ""
-        return hashlib.sha256(msgspec.json.encode(rows)).hexdigest()[:16]
+        sha, before = hashlib.sha256(), b"["
+        for row in rows:
+            sha.update(before)
+            for piece in _json_of(row):
+                sha.update(piece)
+            before = b","
+        sha.update(b"]")
+        return sha.hexdigest()[:16]
 
     def reembedded_for(self, settings: Settings) -> tuple[Reembed, ...]:
         """The commands whose vectors a map of these settings has. It must name its space: the first
@@ -192,9 +199,9 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
             sorted(self.forgotten_ranges.items()),
             sorted(self.dropped),
             [(run, each.normal_order) for run, each in sorted(self.poses.items())],
-            sorted(self.apart),
+            self.apart,
             sorted(self.joined),
-            sorted(self.different),
+            self.different,
             sorted(self.same),
             [(n.anchor, n.name) for n in self.names if newest[n.anchor] is n],
         ]
@@ -279,14 +286,30 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         forgotten_ranges={run: tuple(sorted(set(rs))) for run, rs in ranges.items()},
         dropped=frozenset(dropped),
         poses={run: PoseCorrections(each) for run, each in poses.items()},
-        apart=tuple(apart),
+        apart=apart,
         joined=tuple(joined),
-        different=tuple(different),
+        different=different,
         same=tuple(same),
         names=tuple(names),
         settings=settings,
         reembedded=tuple(reembedded),
     )
+
+
+def _json_of(row: object) -> Iterator[bytes]:
+    """The JSON of a row, in pieces. Pairs that are apart are written as a list of them, of which
+    one thing's are made at a time: there may be millions."""
+    if not isinstance(row, ApartPairs):
+        yield msgspec.json.encode(row)
+        return
+    written = [msgspec.json.encode(thing) for thing in row.things]
+    before = b"["
+    for number, greater in row.greater():
+        start = b"[" + written[number] + b","
+        pairs = (b"]," + start).join([written[other] for other in greater])
+        yield before + start + pairs + b"]"
+        before = b","
+    yield b"]" if row else b"[]"
 
 
 def check_settings(command: Command) -> None:

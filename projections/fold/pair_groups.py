@@ -4,40 +4,136 @@ This is transitive: if a and b are one and b and c are one, so are a and c; and 
 from a is kept apart from all of them.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from itertools import chain
 from typing import Generic, TypeVar
 
 _Thing = TypeVar("_Thing", bound=tuple[object, ...] | str)
 
 
-class PairGroups(Generic[_Thing]):
-    """Groups of the things named in two lists of pairs, numbered from 0.
+class ApartPairs(Generic[_Thing]):
+    """Pairs of things that are kept apart, given as sets of things that are divided into parts: two
+    in different parts of a set are apart. Memory grows with the things in the sets, not with pairs.
 
-    ``group_of`` has the number of each thing; ``against`` the groups that a group is kept apart
-    from, where there are any. Pairs that contradict each other must have been left out
-    (`without_contradictions`).
+    Iterated, it gives the pairs, the smaller thing first, ascending.
     """
 
-    def __init__(
-        self,
-        same: Iterable[tuple[_Thing, _Thing]],
-        apart: Iterable[tuple[_Thing, _Thing]],
-    ) -> None:
-        same, apart = list(same), list(apart)
+    def __init__(self, divided: Iterable[Iterable[Iterable[_Thing]]] = ()) -> None:
+        sets = [[list(part) for part in parts] for parts in divided]
+        sets = [parts for parts in sets if len(parts) > 1]
+        self.things = sorted({thing for parts in sets for part in parts for thing in part})
+        """All of them, ascending."""
+        self._rank = {thing: number for number, thing in enumerate(self.things)}
+        self.sets: list[list[_Thing]] = [list(chain.from_iterable(parts)) for parts in sets]
+        self._inside: list[list[tuple[frozenset[int], frozenset[int]]]] = [[] for _ in self.things]
+        """The sets that a thing is in, and its part of each, by rank."""
+        for parts in sets:
+            ranked = [frozenset(map(self._rank.__getitem__, part)) for part in parts]
+            every = frozenset[int]().union(*ranked)
+            for part in ranked:
+                for number in part:
+                    self._inside[number].append((every, part))
+
+    @classmethod
+    def of(cls, pairs: Iterable[tuple[_Thing, _Thing]]) -> "ApartPairs[_Thing]":
+        """These pairs."""
+        return cls([[a], [b]] for a, b in pairs)
+
+    def __bool__(self) -> bool:
+        return bool(self.things)
+
+    def __contains__(self, pair: tuple[_Thing, _Thing]) -> bool:
+        a, b = (self._rank.get(thing, -1) for thing in pair)
+        return a >= 0 and any(b in every and b not in part for every, part in self._inside[a])
+
+    def __iter__(self) -> Iterator[tuple[_Thing, _Thing]]:
+        for number, greater in self.greater():
+            for other in greater:
+                yield self.things[number], self.things[other]
+
+    def __eq__(self, other: object) -> bool:
+        """Whether these are the same pairs, however the sets are given."""
+        if not isinstance(other, ApartPairs):
+            return NotImplemented
+        return self.things == other.things and all(
+            self.against(number) == other.against(number) for number in range(len(self.things))
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def against(self, number: int) -> set[int]:
+        """The indices in `things` of those that one is kept apart from."""
+        return set[int]().union(*(every - part for every, part in self._inside[number]))
+
+    def greater(self) -> Iterator[tuple[int, list[int]]]:
+        """The index in `things` of each that is the smaller one of a pair, and those of the greater
+        ones, ascending."""
+        for number in range(len(self.things)):
+            if found := sorted(each for each in self.against(number) if each > number):
+                yield number, found
+
+    def between(
+        self, one: Iterable[_Thing], other: Iterable[_Thing]
+    ) -> list[tuple[_Thing, _Thing]]:
+        """The pairs of a thing of ``one`` and a thing of ``other``, ascending."""
+        ends = {self._rank[thing] for thing in other if thing in self._rank}
+        pairs = {
+            (min(start, end), max(start, end))
+            for start in (self._rank[thing] for thing in one if thing in self._rank)
+            for end in self.against(start) & ends
+        }
+        return [(self.things[a], self.things[b]) for a, b in sorted(pairs)]
+
+    def in_order_of_pairs(self) -> list[_Thing]:
+        """`things` in the order in which the pairs name them first."""
+        met: dict[int, None] = {}
+        unmet: dict[int, Collection[int]] = {}
+        for number, inside in enumerate(self._inside):
+            if number not in met:
+                found = sorted(each for each in self.against(number) if each > number)
+                met |= dict.fromkeys([number, *found] if found else [])
+                continue
+            rest = set[int]()
+            for every, part in inside:
+                left = {each for each in unmet.get(id(every), every) if each not in met}
+                unmet[id(every)] = left
+                rest |= {each for each in left if each > number} - part
+            met |= dict.fromkeys(sorted(rest))
+        return [self.things[number] for number in met]
+
+
+class PairGroups(Generic[_Thing]):
+    """Groups of the things named in pairs that are one and in pairs that are kept apart, numbered
+    from 0.
+
+    ``group_of`` has the number of each thing. Pairs that contradict each other must have been left
+    out (`without_contradictions`).
+    """
+
+    def __init__(self, same: Iterable[tuple[_Thing, _Thing]], apart: ApartPairs[_Thing]) -> None:
+        same = list(same)
         roots = _Roots[_Thing]()
         for a, b in same:
             roots.unite(a, b)
         numbers: dict[_Thing, int] = {}
         self.group_of: dict[_Thing, int] = {}
-        for thing in dict.fromkeys(thing for pair in (*same, *apart) for thing in pair):
+        for thing in dict.fromkeys(chain(*same, apart.in_order_of_pairs())):
             root = roots.find(thing)
             self.group_of[thing] = numbers.setdefault(root, len(numbers))
-        against: dict[int, set[int]] = {}
-        for a, b in apart:
-            one, other = self.group_of[a], self.group_of[b]
-            against.setdefault(one, set()).add(other)
-            against.setdefault(other, set()).add(one)
-        self.against = {group: frozenset(others) for group, others in against.items()}
+        sets = [frozenset(map(self.group_of.__getitem__, each)) for each in apart.sets]
+        sets_of: dict[int, set[frozenset[int]]] = {}
+        for each in sets:
+            for group in each:
+                sets_of.setdefault(group, set()).add(each)
+        # Groups of the same sets share one value.
+        joined: dict[frozenset[frozenset[int]], frozenset[int]] = {}
+        self._against: dict[int, frozenset[int]] = {}
+        """The groups of all sets that a group is in, its own too."""
+        for group, own in sets_of.items():
+            key = frozenset(own)
+            if key not in joined:
+                joined[key] = _NONE.union(*own)
+            self._against[group] = joined[key]
 
     def conflicts(self, groups: Collection[int], others: Collection[int]) -> list[tuple[int, int]]:
         """The pairs of a group of ``groups`` and one of ``others`` that are kept apart."""
@@ -46,16 +142,17 @@ class PairGroups(Generic[_Thing]):
         return [
             (group, other)
             for group in groups
-            for other in self.against.get(group, _NONE).intersection(others)
+            for other in self._against.get(group, _NONE).intersection(others)
+            if other != group
         ]
 
 
 def without_contradictions(
     statements: Iterable[tuple[tuple[_Thing, ...], bool]],
-) -> tuple[list[tuple[_Thing, _Thing]], list[tuple[_Thing, _Thing]]]:
-    """Pairs that are one, as they were given, and pairs that are apart, the smaller thing first;
-    both ascending. ``statements`` come in the order in which they were made; true makes a pair one,
-    false keeps every two of some things apart.
+) -> tuple[list[tuple[_Thing, _Thing]], ApartPairs[_Thing]]:
+    """Pairs that are one, as they were given, ascending, and pairs that are apart. ``statements``
+    come in the order in which they were made; true makes a pair one, false keeps every two of some
+    things apart.
 
     A pair of a statement that contradicts later statements, one or several together, is left out.
     """
@@ -84,31 +181,10 @@ def without_contradictions(
                 less, more = sorted((sets_of.pop(a, set()), sets_of.pop(b, set())), key=len)
                 more |= less
                 sets_of[a] = more
-    return sorted(same), _pairs_between(parts_of.values())
+    return sorted(same), ApartPairs(parts_of.values())
 
 
 _NONE: frozenset[int] = frozenset()
-
-
-def _pairs_between(divided: Collection[list[list[_Thing]]]) -> list[tuple[_Thing, _Thing]]:
-    """Every two things that are in two parts of a set of things, the smaller one first,
-    ascending."""
-    things = sorted({thing for parts in divided for part in parts for thing in part})
-    rank = {thing: number for number, thing in enumerate(things)}
-    greater: list[set[int]] = [set() for _ in things]
-    for parts in divided:
-        ranked = [[rank[thing] for thing in part] for part in parts]
-        every = {number for part in ranked for number in part}
-        for part in ranked:
-            others = every.difference(part)
-            for number in part:
-                greater[number] |= others
-    return [
-        (thing, things[number])
-        for at, thing in enumerate(things)
-        for number in sorted(greater[at])
-        if number > at
-    ]
 
 
 class _Roots(Generic[_Thing]):

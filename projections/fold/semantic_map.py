@@ -256,8 +256,8 @@ class SemanticMap:
         )
 
     def _all_anchors(self) -> frozenset[Keyframe]:
-        pairs = (*self.corrections.apart, *self.corrections.joined)
-        return frozenset(self.names.newest).union(*pairs)
+        apart, joined = self.corrections.apart, self.corrections.joined
+        return frozenset(self.names.newest).union(apart.things, *joined)
 
     def _add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe, floor: int | None) -> None:
         if anchor in self._anchors:

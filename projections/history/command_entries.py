@@ -124,7 +124,7 @@ def _apart_text(
     """The text of a command that keeps anchors apart; ``own`` are in the explained place."""
     if others:
         text = f"kept apart from {_named(history, others, end)}"
-        if not _some_pair(own, others, history.corrections.apart):
+        if not _are_apart(history, own, others):
             return f"{text} until a later join,"
         if all(_place_of(history, anchor, end) is None for anchor in others):
             return f"{text}, without effect here as that is in no place,"
@@ -132,7 +132,7 @@ def _apart_text(
     text = f"{_both(own)} kept apart"
     if len(set(own)) < 2:
         return f"{text}, without effect as they are one keyframe,"
-    if not _some_pair(own, own, history.corrections.apart):
+    if not _are_apart(history, own, own):
         return f"{text} until a later join,"
     return f"{text}, without effect here as no command divides a cell of core points,"
 
@@ -143,7 +143,7 @@ def _join_text(history: History, command: Join, end: Offset) -> str:
     text = f"joined {_both(command.places)}"
     if one == other:
         return f"{text}, without effect as they are one keyframe,"
-    if not _some_pair([one], [other], history.corrections.joined):
+    if tuple(sorted(map(_keyframe, command.places))) not in history.corrections.joined:
         return f"{text} until a later keep-apart,"
     places = {_place_of(history, anchor, end) for anchor in command.places}
     if None in places:
@@ -229,14 +229,10 @@ def _divided(
     return own, [anchor for anchor in anchors if anchor not in own]
 
 
-def _some_pair(
-    own: Sequence[Anchor],
-    others: Sequence[Anchor],
-    pairs: tuple[tuple[Keyframe, Keyframe], ...],
-) -> bool:
-    """Whether ``pairs``, those in force, have a pair of an own and another anchor."""
-    first, second = ({_keyframe(anchor) for anchor in anchors} for anchors in (own, others))
-    return any((a in first and b in second) or (b in first and a in second) for a, b in pairs)
+def _are_apart(history: History, own: Sequence[Anchor], others: Sequence[Anchor]) -> bool:
+    """Whether an own and another anchor are kept apart."""
+    first, second = (map(_keyframe, anchors) for anchors in (own, others))
+    return bool(history.corrections.apart.between(first, second))
 
 
 def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:

@@ -1,13 +1,21 @@
 """Many commands of a kind: what they cost grows with their number."""
 
 import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from eventsrc.envelope.commands import CorrectPoses, RigidTransform, UseSettings, encode_command
+from eventsrc.envelope.commands import (
+    Anchor,
+    CorrectPoses,
+    RigidTransform,
+    UndoMerge,
+    UseSettings,
+    encode_command,
+)
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
@@ -87,7 +95,32 @@ def test_twice_the_commands_are_about_twice_the_work(kind: Any, given: Any) -> N
 def test_undone_merges_of_all_keyframes_are_compiled_as_sets() -> None:
     """445 keyframes are 98,790 pairs; 20 commands of them are fewer calls than one has pairs."""
     events = [RecordedCommand(n, c) for n, c in enumerate(commands_of(large_undo_merge, 20))]
-    assert calls_of(lambda: compile_corrections(events)) < len(compile_corrections(events).apart)
+    assert calls_of(lambda: compile_corrections(events)) < 98_790
+
+
+def test_memory_of_undone_merges_grows_with_their_anchors() -> None:
+    """20 of 500 anchors each are 2,495,000 pairs."""
+    events = [
+        RecordedCommand(
+            Offset(n),
+            command(
+                UndoMerge,
+                merge_offset=Offset(0),
+                places=tuple(
+                    Anchor(run_id=RunId("a"), keyframe_id=KeyframeId(500 * n + k))
+                    for k in range(500)
+                ),
+            ),
+        )
+        for n in range(20)
+    ]
+    tracemalloc.start()
+    try:
+        SemanticMap(Settings(), compile_corrections(events))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 20_000_000
 
 
 def chains(n: int) -> list[RecordedCommand]:

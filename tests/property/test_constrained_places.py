@@ -12,7 +12,7 @@ from projections.fold.constrained_places import ConstrainedPlaces
 from projections.fold.core_index import CoreIndex, cell_side_um
 from projections.fold.corrections import Keyframe
 from projections.fold.deltas import MergeRefused, PlaceFormed, PlacesMerged
-from projections.fold.pair_groups import PairGroups, without_contradictions
+from projections.fold.pair_groups import ApartPairs, PairGroups, without_contradictions
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
 from tests.folds import near_matrix
@@ -72,7 +72,7 @@ def anchor(point: int) -> Keyframe:
 def constrained(index: CoreIndex, statements: Statements) -> ConstrainedPlaces:
     joined = [(anchor(a), anchor(b)) for (a, b), is_same in statements if is_same]
     apart = [(anchor(a), anchor(b)) for (a, b), is_same in statements if not is_same]
-    return ConstrainedPlaces(index, PairGroups(joined, apart))
+    return ConstrainedPlaces(index, PairGroups(joined, ApartPairs.of(apart)))
 
 
 def naive_of(

@@ -23,7 +23,7 @@ from projections.fold.deltas import (
 )
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
-from projections.fold.pair_groups import PairGroups
+from projections.fold.pair_groups import ApartPairs, PairGroups
 from projections.fold.thing_index import ThingIndex
 from tests.evidence_pictures import (
     DIM,
@@ -145,7 +145,7 @@ def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
         return
     named = st.sampled_from(det_ids)
     same = data.draw(st.lists(st.tuples(named, named), max_size=4))
-    same_groups = PairGroups[DetId](same, [])
+    same_groups = PairGroups[DetId](same, ApartPairs())
     apart = [
         (a, b)
         for a, b in data.draw(st.lists(st.tuples(named, named), max_size=4))
@@ -154,7 +154,7 @@ def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
             a not in same_groups.group_of or same_groups.group_of[a] != same_groups.group_of.get(b)
         )
     ]
-    of = _assignment(fold_all(pictures, PairGroups(same, apart)))
+    of = _assignment(fold_all(pictures, PairGroups(same, ApartPairs.of(apart))))
     for a, b in same:
         assert of[ObservationOrdinal(number[a])] == of[ObservationOrdinal(number[b])]
     for a, b in apart:

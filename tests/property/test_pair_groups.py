@@ -1,11 +1,11 @@
 """Which of contradicting statements count, and the groups they make, by brute force."""
 
-from itertools import product
+from itertools import chain, combinations, product
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.pair_groups import PairGroups, without_contradictions
+from projections.fold.pair_groups import ApartPairs, PairGroups, without_contradictions
 
 Statement = tuple[tuple[str, str], bool]
 NAMES = "abcde"
@@ -32,7 +32,7 @@ def test_a_statement_counts_unless_later_ones_that_count_contradict_it(
             kept.append(statement)
     same, apart = without_contradictions(statements)
     assert set(same) == {pair for pair, is_same in kept if is_same}
-    assert apart == sorted({(min(pair), max(pair)) for pair, is_same in kept if not is_same})
+    assert list(apart) == sorted({(min(pair), max(pair)) for pair, is_same in kept if not is_same})
 
 
 @given(statements=STATEMENTS)
@@ -49,3 +49,30 @@ def test_groups_are_what_must_be_one_and_conflicts_what_must_not(
             conflict = groups.conflicts([one], {other: None})
             assert bool(conflict) is not can_all_hold([*held, ((a, b), True)])
             assert conflict in ([], [(one, other)])
+
+
+SETS = st.lists(st.lists(st.sets(st.sampled_from(NAMES), min_size=1), min_size=1), max_size=4)
+
+
+@given(sets=SETS)
+def test_pairs_kept_as_divided_sets_are_those_of_two_parts(sets: list[list[set[str]]]) -> None:
+    divided = [
+        [part.difference(*parts[:number]) for number, part in enumerate(parts)] for parts in sets
+    ]
+    divided = [[part for part in parts if part] for parts in divided]
+    pairs = sorted(
+        {
+            (min(a, b), max(a, b))
+            for parts in divided
+            for one, other in combinations(parts, 2)
+            for a, b in product(one, other)
+        }
+    )
+    apart = ApartPairs(divided)
+    assert list(apart) == pairs
+    assert apart == ApartPairs.of(pairs)
+    assert apart.in_order_of_pairs() == [*dict.fromkeys(chain(*pairs))]
+    for a, b in product(NAMES, NAMES):
+        assert ((a, b) in apart) is ((min(a, b), max(a, b)) in pairs)
+    some = NAMES[:3]
+    assert apart.between(some, NAMES) == [p for p in pairs if not set(some).isdisjoint(p)]

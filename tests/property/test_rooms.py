@@ -15,7 +15,7 @@ from projections.fold.deltas import (
     PlaceFormed,
     PlacesMerged,
 )
-from projections.fold.pair_groups import PairGroups, without_contradictions
+from projections.fold.pair_groups import ApartPairs, PairGroups, without_contradictions
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.rooms import Rooms
 from tests.naive_rooms import NaiveRooms
@@ -80,7 +80,9 @@ def rooms_of(statements: Statements, way=None) -> Rooms:
         [(Keyframe("r", a), Keyframe("r", b)) for (a, b), is_same in statements if is_same is want]
         for want in (True, False)
     )
-    return Rooms(CELL_UM, DRIVE_UM, PairGroups(joined, apart), way and (lambda _: way))
+    return Rooms(
+        CELL_UM, DRIVE_UM, PairGroups(joined, ApartPairs.of(apart)), way and (lambda _: way)
+    )
 
 
 def fold_one(rooms: Rooms, n: int, at: At) -> list:
