@@ -17,6 +17,7 @@ from projections.fold.corrections import (
     compile_corrections,
     map_fingerprint,
 )
+from projections.fold.pair_groups import ApartPairs
 from projections.fold.settings import Settings
 from projections.map.log_commands import read_command, read_commands
 
@@ -52,7 +53,7 @@ class MapInputs:
     def of(cls, settings: Settings, corrections: Corrections, known_at: Offset) -> Self:
         """The inputs with both fingerprints computed."""
         of_observations = msgspec.structs.replace(
-            corrections, apart=(), joined=(), different=(), same=(), names=()
+            corrections, apart=ApartPairs(), joined=(), different=ApartPairs(), same=(), names=()
         )
         return cls(
             settings,
