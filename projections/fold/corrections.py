@@ -16,7 +16,7 @@ had always been known, but only from the offset where it was recorded.
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -129,6 +129,18 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     @cached_property
     def _nameless(self) -> "Corrections":
         return msgspec.structs.replace(self, names=())
+
+    def with_more_names(self, commands: Sequence[RecordedCommand]) -> "Corrections":
+        """The corrections of later commands too, which must be ``name-place``, each with a
+        command_id that no earlier command has."""
+        names = [
+            PlaceName(_keyframe(command.place), command.name, offset)
+            for offset, command in commands
+            if isinstance(command, NamePlace)
+        ]
+        return msgspec.structs.replace(
+            self, in_force=(*self.in_force, *commands), names=(*self.names, *names)
+        )
 
     def differs_in_names_only(self, other: "Corrections") -> bool:
         """Whether the two fold a log to the same map but for names of places."""

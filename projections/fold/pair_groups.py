@@ -55,8 +55,9 @@ class ApartPairs(Generic[_Thing]):
         """Whether these are the same pairs, however the sets are given."""
         if not isinstance(other, ApartPairs):
             return NotImplemented
-        return self.things == other.things and all(
-            self.against(number) == other.against(number) for number in range(len(self.things))
+        return self is other or (
+            self.things == other.things
+            and all(self.against(n) == other.against(n) for n in range(len(self.things)))
         )
 
     __hash__ = None  # type: ignore[assignment]

@@ -24,6 +24,15 @@ class PlaceNames:
         self.given: dict[PlaceOrdinal, int] = {}
         self._anchors: dict[KeyframeOrdinal, int] = {}
 
+    def followed_by(self, names: Sequence[PlaceName]) -> "PlaceNames":
+        """These names and more, which come after them; `add_anchor` and `give` are still to be
+        called for the new ones."""
+        more = PlaceNames(())
+        more.names, more.given, more._anchors = names, {**self.given}, {**self._anchors}
+        new = enumerate(names[len(self.names) :], len(self.names))
+        more.newest = self.newest | {name.anchor: index for index, name in new}
+        return more
+
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
         """Register a keyframe as an anchor, if it is one."""
         index = self.newest.get(anchor)

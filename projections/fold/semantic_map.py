@@ -210,10 +210,14 @@ class SemanticMap:
         if not corrections.differs_in_names_only(self.corrections):
             raise ValueError("these corrections differ in more than names; fold the log again")
         self.corrections = corrections  # first: see `LiveFold`
-        older, self.names = self.names, PlaceNames(corrections.names)
+        older, names = self.names, corrections.names
+        if names[: len(older.names)] == older.names:  # time for the new ones only
+            self.names, new = older.followed_by(names), names[len(older.names) :]
+        else:
+            self.names, new = PlaceNames(names), names
         self._anchors = self._all_anchors()
         self._is_corrected = self.event_edits.any or bool(self._anchors)
-        for anchor in self.names.newest:
+        for anchor in {name.anchor for name in new}:
             keyframe = self.folded_ids.find(*anchor)
             if keyframe is not None:
                 self.names.add_anchor(keyframe, anchor)

@@ -7,7 +7,7 @@ from typing import Final, Self, TypeAlias
 
 import msgspec
 
-from eventsrc.envelope.commands import Reembed
+from eventsrc.envelope.commands import NamePlace, Reembed
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader
@@ -96,6 +96,10 @@ class LogInputs:
     settings_of: SettingsOf
     end: Offset
     _made: dict[int, MapInputs] = field(default_factory=dict)
+    _index_of: dict[str, int] = field(default_factory=dict)
+    """The first command with an id."""
+    _first: list[bool] = field(default_factory=list)
+    """Whether a command is that."""
 
     @classmethod
     def read(
@@ -109,14 +113,32 @@ class LogInputs:
 
     def at(self, known_at: Offset) -> MapInputs:
         """The inputs under the commands before ``known_at``."""
-        known = [command for command in self.commands if command.offset < known_at]
-        if len(known) not in self._made:
-            corrections = compile_corrections(known)
+        count = self._count_before(known_at)
+        if count not in self._made:
+            corrections = self._corrections(count)
             settings = self.settings_of(corrections)
             for oldest in list(self._made)[: 1 - _MOST_MADE]:
                 del self._made[oldest]
-            self._made[len(known)] = MapInputs.of(settings, corrections, known_at)
-        return self._made[len(known)].known_to(known_at)
+            self._made[count] = MapInputs.of(settings, corrections, known_at)
+        return self._made[count].known_to(known_at)
+
+    def _corrections(self, count: int) -> Corrections:
+        """The corrections of the first ``count`` commands. If those after the last ones that were
+        compiled only give names, these are added, which takes no time for each older command."""
+        for index in range(len(self._first), len(self.commands)):
+            self._first.append(self._index_of.setdefault(self._id(index), index) == index)
+        before = max((made for made in self._made if made < count), default=0)
+        added = self.commands[before:count]
+        are_names = all(isinstance(each.command, NamePlace) for each in added)
+        if before and are_names and all(self._first[before:count]):
+            return self._made[before].corrections.with_more_names(added)
+        return compile_corrections(self.commands[:count])
+
+    def _id(self, index: int) -> str:
+        return self.commands[index].command.command_id
+
+    def _count_before(self, offset: Offset) -> int:
+        return bisect_left(self.commands, offset, key=lambda command: command.offset)
 
     @property
     def latest(self) -> MapInputs:
@@ -125,7 +147,7 @@ class LogInputs:
 
     def has_between(self, start: Offset, end: Offset) -> bool:
         """Whether there is a command from ``start`` to before ``end``."""
-        at = bisect_left(self.commands, start, key=lambda command: command.offset)
+        at = self._count_before(start)
         return at < len(self.commands) and self.commands[at].offset < end
 
     def since(self, known_at: Offset) -> Sequence[RecordedCommand]:

@@ -1,5 +1,6 @@
 """Many commands of a kind: what they cost grows with their number."""
 
+import random
 import sys
 import tracemalloc
 from collections.abc import Callable
@@ -34,12 +35,15 @@ from projections.map.log_commands import read_corrections
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 from projections.postgres.connection import Targets
+from projections.postgres.inputs import LogInputs
+from projections.postgres.live_fold import LiveFold
 from projections.postgres.rebuild import rebuild
 from tests.bench.commands import (
     KINDS,
     commands_of,
     large_undo_merge,
     mixed,
+    name_place,
     undone,
     write_log,
 )
@@ -217,3 +221,56 @@ def test_few_compiled_corrections_are_kept(tmp_path: Path) -> None:
             found = timeline.corrections(Offset(known_at))
             assert len(found.in_force) == known_at - 445
         assert len(timeline._compiled) <= 16
+
+
+def test_a_name_that_comes_live_costs_no_more_for_those_before_it() -> None:
+    given = [
+        RecordedCommand(Offset(445 + n), c) for n, c in enumerate(commands_of(name_place, 600))
+    ]
+    with LogReader(SAMPLE) as reader:
+        inputs = LogInputs.read(reader, Settings())
+        fold = LiveFold(Settings(), reader=reader)
+        assert not any(fold.feed(list(reader.read())))
+
+    def name(commands: list[RecordedCommand]) -> None:
+        for recorded in commands:
+            before = inputs.latest
+            fold.skip(recorded.offset)
+            inputs.extend([recorded], Offset(recorded.offset + 1))
+            assert before.differs_only_in_names(inputs.latest)
+            fold.use_names(recorded.offset, inputs.latest.corrections)
+
+    name(given[:50])
+    first = calls_of(lambda: name(given[50:100]))
+    name(given[100:550])
+    assert calls_of(lambda: name(given[550:])) < 1.5 * first
+    again = LiveFold(Settings(), corrections=compile_corrections(given))
+    with LogReader(SAMPLE) as reader:
+        assert not any(again.feed(list(reader.read())))
+    assert [p.name for p in fold.view.all_places] == [p.name for p in again.view.all_places]
+    assert map_digest(fold.view) == map_digest(again.view)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_inputs_that_grow_by_a_command_are_those_of_all_commands(seed: int) -> None:
+    """With ids that come twice, undos before their commands and of them, and names between."""
+    chance = random.Random(seed)
+    given: list[RecordedCommand] = []
+    for number in range(40):
+        kind = chance.choice(["name-place", "name-place", "keep-apart", "undo-of-nothing"])
+        made = KINDS[kind](chance, number).model_copy(
+            update={"command_id": f"c{chance.randrange(60)}"}
+        )
+        if kind == "undo-of-nothing":
+            made = made.model_copy(update={"undone": f"c{chance.randrange(60)}"})
+        given.append(RecordedCommand(Offset(number), made))
+    inputs = LogInputs([], lambda _: Settings(), Offset(0))
+    at = 0
+    while at < len(given):
+        end = min(at + chance.randrange(1, 4), len(given))
+        inputs.extend(given[at:end], Offset(end))
+        at, found = end, inputs.latest.corrections
+        expected = compile_corrections(given[:end])
+        assert found.in_force == expected.in_force
+        assert found.names == expected.names
+        assert found.fingerprint() == expected.fingerprint()
