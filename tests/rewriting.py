@@ -12,7 +12,6 @@ def rewrite(
     path: Path,
     *,
     metadata: Iterable[str] = ("mapfold.segment", "mapfold.seal"),
-    old_names: bool = False,
     in_log_time: bool = True,
     keep: Callable[[str, int], bool] = lambda *_: True,
     compression: CompressionType = CompressionType.ZSTD,
@@ -23,8 +22,6 @@ def rewrite(
 ) -> None:
     """As `mcap sort` (the default), `mcap filter` and `mcap compress` of the Go tool do: a header
     with another library, metadata, then messages with the sequence numbers they had.
-
-    With ``old_names``, metadata has the names that earlier versions gave it.
     """
     with path.open("rb") as file:
         reader = SeekingReader(file)
@@ -34,8 +31,7 @@ def rewrite(
         writer = Writer(file, chunk_size=chunk_size, compression=compression, use_chunking=chunked)
         writer.start(profile, "mcap go v1.7.2; mapfold")
         for record in records:
-            name = record.name.split(":")[0] if old_names else record.name
-            writer.add_metadata(name, record.metadata)
+            writer.add_metadata(record.name, record.metadata)
         ids: dict[int, int] = {}
         for schema, channel, message in messages:
             assert schema is not None

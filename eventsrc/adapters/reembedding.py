@@ -21,10 +21,10 @@ from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.envelope.commands import InvalidCommand, Reembed, encode_command, parse_command
 from eventsrc.envelope.crops import CROP_SCHEMA, Crop, InvalidCrop, decode_crop
 from eventsrc.envelope.embeddings import InvalidEmbeddings, NewVectors, decode_embeddings, is_usable
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAX_REEMBEDDED
-from eventsrc.envelope.upcast import read_envelope
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 
 DEFAULT_TOPIC: Final = "tb/crops"

@@ -39,9 +39,7 @@ KeyframeId = NewType("KeyframeId", int)
 DetId = NewType("DetId", str)
 
 ENVELOPE_VERSION = 5
-"""The version of the models below; `eventsrc.envelope.upcast` converts older ones to it."""
-FIRST_ENVELOPE_VERSION = 2
-"""Since this version payloads are envelopes, with a run, a keyframe id and a time."""
+"""The version of the models below; 1 is the bare list of `eventsrc.envelope.forms`."""
 
 MAX_ID_LENGTH = 256
 MAX_POSITION_M = 1e7
@@ -294,7 +292,7 @@ def has_floor(envelope: Envelope) -> bool:
 
 def has_keyframe_id(version: int) -> bool:
     """Whether payloads of this envelope version name their keyframe."""
-    return FIRST_ENVELOPE_VERSION <= version <= ENVELOPE_VERSION
+    return version == ENVELOPE_VERSION
 
 
 def default_det_id(run_id: RunId, keyframe_id: KeyframeId, index: int) -> DetId:

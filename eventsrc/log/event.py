@@ -23,7 +23,7 @@ class Event:
     ``offset`` is its index in the log, which alone orders events. ``logged_ns`` is when it was
     written, ``stamp_ns`` when the robot says it happened, both int nanoseconds since the Unix
     epoch; either may run backwards. ``payload`` is the message verbatim, in the envelope form of
-    ``version`` (see `eventsrc.envelope.upcast`).
+    ``version`` (see `eventsrc.envelope.forms`).
     """
 
     offset: Offset

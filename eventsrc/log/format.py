@@ -53,7 +53,7 @@ SEGMENT_METADATA = "mapfold.segment"
 """First part of the name of a segment's head: see `metadata_name`."""
 BEGUN = "begun_ns"
 """In the head of a segment: the clock of the machine that wrote it, when it was begun. Events that
-are imported have the time of the drive. Segments of earlier versions have none."""
+are imported have the time of the drive. None after a recovery that could not read it."""
 IMPORTED = "imported"
 """In the head of a segment that an import wrote: the time of its first event may lie before the
 events before it."""
@@ -61,27 +61,26 @@ PREVIOUS = "previous_sha256"
 """In the head of a sealed segment, and of no active one: the hash of the segment before."""
 FOLLOWING = "following"
 """In the head of a sealed segment: the offset after its last event, so that a file that was cut
-tells what is missing. Segments of earlier versions have none."""
+tells what is missing."""
 MARK_SEED = "mark_seed"
-"""In the head of an active segment, in hex: see `mcap_records.encode_mark`. Segments of earlier
-versions have none, which is seed 0."""
+"""In the head of an active segment, in hex: see `mcap_records.encode_mark`."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")
 _BASE = re.compile(r"\d{1,20}", re.ASCII)
 _NUMBER = re.compile(r"[0-9]{1,19}")
+_HEADER = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
 HEAD_BYTES = 4096
 """More than any head takes."""
 
 
 def metadata_name(kind: str, log_id: str, base: Offset) -> str:
     """The name of a segment's metadata record of this kind, which no other segment of any log has:
-    `mcap merge` refuses files with metadata of the same name. Earlier versions wrote the kind
-    alone."""
+    `mcap merge` refuses files with metadata of the same name."""
     return f"{kind}:{log_id}:{base}"
 
 
 def is_metadata_of(kind: str, name: str) -> bool:
-    """Whether ``name`` is a `metadata_name` of this kind, of any segment and version."""
-    return name == kind or name.startswith(f"{kind}:")
+    """Whether ``name`` is a `metadata_name` of this kind, of any segment."""
+    return name.startswith(f"{kind}:")
 
 
 def head_metadata(log_id: str, base: Offset, extra: dict[str, str] | None = None) -> Metadata:
@@ -110,17 +109,21 @@ def origin_notes(head: dict[str, str]) -> dict[str, str]:
 
 def file_head(metadata: Metadata) -> bytes:
     """Magic, header and ``metadata``."""
-    header = Header(profile=_mcap.PROFILE, library=_mcap.LIBRARY)
-    return _mcap.MAGIC + _mcap.encode_all([header, metadata])
+    return _mcap.MAGIC + _mcap.encode_all([_HEADER, metadata])
 
 
 def mark_seed(head: dict[str, str]) -> int:
     """The mark seed in the head of an active segment."""
-    return int(head.get(MARK_SEED, "0"), 16)
+    return int(head[MARK_SEED], 16)
 
 
 class WrongPlace(LogDamaged):
     """A segment under the name of another one. Inside ``eventsrc.log`` only."""
+
+
+class ForeignSegment(NotALog):
+    """An MCAP file of another program, or a segment of a version that was never released. Inside
+    ``eventsrc.log`` only."""
 
 
 def head_of(path: Path, base: Offset) -> dict[str, str]:
@@ -138,7 +141,8 @@ def head_at_any_base(path: Path) -> dict[str, str]:
 
 def read_head(path: Path, data: bytes, base: Offset) -> tuple[dict[str, str], int]:
     """Metadata at the head of a segment, and the position after it. Raises WrongPlace if it is not
-    the segment at offset ``base``, LogDamaged if it is unreadable, NotALog if it is no segment."""
+    the segment at offset ``base``, LogDamaged if it is unreadable, NotALog if it is no segment:
+    ForeignSegment if it is an MCAP file."""
     values, end = _read_head(path, data)
     if values["base"] != str(base):
         raise WrongPlace(
@@ -155,43 +159,49 @@ def _read_head(path: Path, data: bytes) -> tuple[dict[str, str], int]:
             f"`{advised('log', 'recover', path.parent)}`"
         )
     try:
-        head = _find_head(data)
+        return _find_head(data)
     except BadRecord as error:
         raise LogDamaged(
             f"{path}: damaged head: {error}; run `{advised('log', 'recover', path.parent)}`"
         ) from None
-    if head is None:
-        raise NotALog(
-            f"{path} is an MCAP file but no segment of a log; "
-            f"`{advised('import', 'LOG', path)}` reads it"
-        )
-    return head
+    except _Foreign as error:
+        raise ForeignSegment(
+            f"{path} is {error}, no segment of a log; `{advised('import', 'LOG', path)}` reads it"
+        ) from None
 
 
-def _find_head(data: bytes) -> tuple[dict[str, str], int] | None:
-    """Metadata and end of a head; None for another program's MCAP head."""
+class _Foreign(Exception):
+    """What a file is that has no head of ours."""
+
+
+def _find_head(data: bytes) -> tuple[dict[str, str], int]:
+    """Metadata and end of a head."""
     at = len(_mcap.MAGIC)
-    ours = True
-    try:
-        for opcode, content in _mcap.records(data[at:]):
-            at += _mcap.FRAME.size + len(content)
-            if opcode == Opcode.HEADER:
-                header = _mcap.decode_as(Header, content)
-                ours = (header.profile, header.library) == (_mcap.PROFILE, _mcap.LIBRARY)
-            elif opcode == Opcode.METADATA:
-                metadata = _mcap.decode_as(Metadata, content)
-                if is_metadata_of(SEGMENT_METADATA, metadata.name):
-                    return _checked_head(metadata), at
-    except BadRecord:
-        if ours:
-            raise
-    if ours:
-        raise BadRecord("it ends before the segment's metadata")
-    return None
+    for opcode, content in _mcap.records(data[at:]):
+        at += _mcap.FRAME.size + len(content)
+        if opcode == Opcode.HEADER and not _is_own_header(content):
+            raise _Foreign("an MCAP file of another program, as `mcap sort` makes of a segment")
+        if opcode == Opcode.METADATA:
+            metadata = _mcap.decode_as(Metadata, content)
+            if metadata.name == SEGMENT_METADATA:
+                raise _Foreign("an MCAP file of a version of mapfold that was never released")
+            if is_metadata_of(SEGMENT_METADATA, metadata.name):
+                return _checked_head(metadata), at
+    raise BadRecord("it ends before the segment's metadata")
+
+
+def _is_own_header(content: bytes) -> bool:
+    """Whether an MCAP header is that of a segment, also where bits of its texts are flipped."""
+    header = _mcap.decode_as(Header, content)
+    if (header.profile, header.library) == (_mcap.PROFILE, _mcap.LIBRARY):
+        return True
+    return len(content) == len(_mcap.encode(_HEADER)) - _mcap.FRAME.size
 
 
 def _checked_head(metadata: Metadata) -> dict[str, str]:
     values = _mcap.checked_metadata(metadata)
+    if (FOLLOWING if PREVIOUS in values else MARK_SEED) not in values:
+        raise _Foreign("an MCAP file of a version of mapfold that was never released")
     if not _BASE.fullmatch(values.get("base", "")) or "log_id" not in values:
         raise BadRecord("the segment's metadata has no log id or no base")
     if not _SEED.fullmatch(values.get(MARK_SEED, "0")):

@@ -102,7 +102,7 @@ def same_but_sealed(before: Sequence[str], now: Sequence[str]) -> bool:
 def _is_same_but_sealed(old: str, new: str) -> bool:
     was, _, was_begun = old.partition(_BEGUN)
     now, _, now_begun = new.partition(_BEGUN)
-    if was_begun and was_begun != now_begun:  # signatures of earlier versions lack it
+    if was_begun != now_begun:
         return False
     return now == was or (_SEALED not in was and now.startswith(was + _SEALED))
 

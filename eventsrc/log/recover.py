@@ -95,7 +95,7 @@ class RecoveryReport:
 def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryReport:
     """Recover a log.
 
-    Raises LogNotFound, NotALog or LogBusy; LogDamaged when a segment was made by another program;
+    Raises LogNotFound, NotALog or LogBusy; LogDamaged when another program made a segment;
     TooManyLosses when more than ``max_losses`` events would be added that the damaged bytes cannot
     have held; LogError when the disk fails.
     """
@@ -178,7 +178,7 @@ class _Recovery:
         if segment.sealed:
             unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
             scan = _scan(segment, reach)
-            good = not (scan.gaps or scan.rewritten or scan.index_fault)
+            good = not (scan.gaps or scan.index_fault)
             if good and check_sealed(segment.path).fault is None:
                 self._next_offset = scan.next_offset
                 self._previous = segment
@@ -277,7 +277,7 @@ class _Recovery:
         return SegmentPath(segment_path(self._log, base, SEALED), base, True)
 
     def _keep_copy(self, segment: SegmentPath | None, scan: Scan) -> str | None:
-        if segment is None or not (segment.sealed or scan.gaps or scan.rewritten):
+        if segment is None or not (segment.sealed or scan.gaps):
             return None
         number = 1
         while True:
@@ -296,7 +296,7 @@ def _scan(segment: SegmentPath, reach: Offset | None) -> Scan:
     """Scan a segment, which ends at ``reach`` if that is known."""
     if segment.sealed:
         return scan_sealed(segment.path, segment.base, reach)
-    scan = scan_active(segment.path, segment.base, reach)
+    scan = scan_active(segment.path, segment.base)
     scan.add_gap_until(reach or segment.base)
     return scan
 

@@ -29,7 +29,6 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.base.text import visible
 from eventsrc.envelope.model import Offset
 
-from . import mcap_records as _mcap
 from .durable_files import sync_directory
 from .format import (
     ACTIVE,
@@ -39,6 +38,7 @@ from .format import (
     MISNAMED,
     PREVIOUS,
     SEALED,
+    ForeignSegment,
     SegmentPath,
     free_name,
     half_renamed,
@@ -165,32 +165,19 @@ def _inspect(path: Path, named: SegmentPath) -> _SegmentFile:
         claims = head_at_any_base(path)
     except LogDamaged:
         return _SegmentFile(path, named, None)
+    except ForeignSegment as error:
+        raise LogDamaged(_foreign_message(path, error)) from None
     except NotALog:
-        damaged = _SegmentFile(path, named, None)
-        if _is_mcap(path) and not _is_own_active(damaged):
-            raise LogDamaged(_other_program_message(path)) from None
-        return damaged
+        return _SegmentFile(path, named, None)
     base, sealed = Offset(int(claims["base"])), PREVIOUS in claims
     where = segment_path(path.parent, base, SEALED if sealed else ACTIVE)
     return _SegmentFile(path, SegmentPath(where, base, sealed), claims["log_id"])
 
 
-def _is_own_active(file: _SegmentFile) -> bool:
-    """Whether a file with a damaged head is an active segment of ours: it has such chunks, and no
-    other program names a file ``.mcap.active``."""
-    return not file.target.sealed and bool(_scan(file).chunks)
-
-
-def _is_mcap(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(_mcap.MAGIC)) == _mcap.MAGIC
-
-
-def _other_program_message(path: Path) -> str:
+def _foreign_message(path: Path, error: ForeignSegment) -> str:
     log = path.parent
     return (
-        f"{path} was written by another program and does not say which offsets it holds; nothing "
-        f"was changed. Put the original back, or move the file out of {log}, run "
+        f"{error}; nothing was changed. Put the original back, or move the file out of {log}, run "
         f"`{advised('log', 'recover', log)}` if other segments are there, and append what it holds "
         f"by `{advised('import', log, 'FILE')}`"
     )

@@ -29,6 +29,7 @@ from .active_file import ActiveFile
 from .durable_files import sync_directory, sync_file, unlink_quietly, write_all
 from .format import (
     ACTIVE,
+    ForeignSegment,
     SegmentPath,
     half_renamed,
     head_of,
@@ -153,14 +154,10 @@ def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
     finished = None if reach is None else _finished(segment, reach)
     if finished is not None:
         return finished
+    _refuse_foreign(segment)
     scan = scan_active(segment.path, segment.base)
     scan.add_gap_until(reach or segment.base)
     _refuse_damage(segment.path, scan)
-    if scan.rewritten:
-        raise LogDamaged(
-            f"{segment.path}: another program has rewritten it; "
-            f"run `{advised('log', 'recover', segment.path.parent)}`"
-        )
     if not scan.chunks:
         return _Leftover(segment, scan, 0, 0)
     file = ActiveFile(segment.path, segment.base)
@@ -181,6 +178,16 @@ def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
         return None
     scan = Scan(segment.base, file.log_id, chunks=file.chunks, next_offset=reach)
     return _Leftover(segment, scan, len(file.chunks), file.position)
+
+
+def _refuse_foreign(segment: SegmentPath) -> None:
+    """Raise ForeignSegment for a file that another program has put in place of a segment."""
+    try:
+        head_of(segment.path, segment.base)
+    except ForeignSegment:
+        raise
+    except (LogDamaged, NotALog):
+        return  # a torn head: the scan reads what is there
 
 
 def _refuse_damage(path: Path, scan: Scan) -> None:

@@ -24,7 +24,6 @@ from .file_bytes import FileBytes
 from .format import HEAD_BYTES, WrongPlace, envelope_version, mark_seed, read_head
 from .mcap_records import BadRecord
 from .resync import DamagedBytes, skip_damaged
-from .rewritten import add_messages, is_rewritten
 from .segment import ChunkRef, Scan, formats_of, verbatim_event
 
 _CHUNK_OPCODES = (_mcap.Opcode.SCHEMA, _mcap.Opcode.CHANNEL, _mcap.Opcode.MESSAGE)
@@ -54,15 +53,10 @@ def check_chunk(data: FileBytes, at: int, scan: Scan) -> tuple[int, Offset, Offs
     return head.length, Offset(scan.base + first), Offset(scan.base + following)
 
 
-def scan_active(path: Path, base: Offset, following: Offset | None = None) -> Scan:
-    """Scan every byte of an active segment; ``following`` is the base of the next one, if there is
-    one. Raises WrongPlace for a segment of another base."""
+def scan_active(path: Path, base: Offset) -> Scan:
+    """Scan every byte of an active segment. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
-        scan = _Scanner(path, base, data).run()
-        scan.rewritten = is_rewritten(data[:HEAD_BYTES])
-    if scan.rewritten:
-        add_messages(path, scan, following)
-    return scan
+        return _Scanner(path, base, data).run()
 
 
 class _Row(NamedTuple):

@@ -13,7 +13,6 @@ from . import mcap_records as _mcap
 from .file_bytes import FileBytes
 from .format import HEAD_BYTES, WrongPlace, end_in, read_head
 from .mcap_records import BadRecord, Metadata
-from .rewritten import add_messages, is_rewritten
 from .scan import check_chunk
 from .sealed_segment import SEAL_METADATA, SealedFile, sealed_edges
 from .segment import ChunkRef, Scan
@@ -24,16 +23,12 @@ def scan_sealed(path: Path, base: Offset, following: Offset | None) -> Scan:
     one ends if its index is damaged. A segment that was cut, and where nothing says how many events
     it had, lacks at least one. Raises WrongPlace for a segment of another base."""
     with FileBytes.of(path) as data:
-        scan = _scan(path, data, base, following)
-    if scan.rewritten:
-        add_messages(path, scan, following)
-    return scan
+        return _scan(path, data, base, following)
 
 
 def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -> Scan:
     head = _head(path, base, data)
     scan = Scan(base, head.get("log_id"), next_offset=base)
-    scan.rewritten = is_rewritten(data[:HEAD_BYTES])
     edges: set[tuple[Offset, Offset]] | None = None
     try:
         index = SealedFile(path, base)
@@ -59,8 +54,8 @@ def _scan(path: Path, data: FileBytes, base: Offset, following: Offset | None) -
             end = at + length
     recorded_end = max(recorded_end, end_in(head, base), following or base)
     scan.add_gap_until(recorded_end)
-    if recorded_end == base and not scan.rewritten and not _ends_in_magic(data):
-        # It was cut, and has the head of an earlier version, which does not name its end.
+    if recorded_end == base and not _ends_in_magic(data):
+        # It was cut, and its head, which names its end, is damaged too.
         scan.add_gap_until(Offset(scan.next_offset + 1))
     scan.lost_bytes = _count_lost_bytes(len(data), scan)
     return scan

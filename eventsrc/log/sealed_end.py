@@ -4,9 +4,9 @@ The head of a sealed segment names its end, and the next segment begins there. W
 is deleted, or cut to less than its head, nothing in the segments says what is missing: this file
 does. It names the log id, base and end of the last sealed segment, with a CRC as MCAP metadata has.
 
-It says what the log has at least. It may be missing (logs of earlier versions, copies of the
-segments alone) or older than the segments (a crash between the two); one that is damaged, or of
-another log, is ignored, reported by `log verify` and replaced by `log recover`.
+It says what the log has at least. It may be missing (in copies of the segments alone) or older than
+the segments (a crash between the two); one that is damaged, or of another log, is ignored, reported
+by `log verify` and replaced by `log recover`.
 """
 
 import contextlib

@@ -53,8 +53,6 @@ class Scan:
     torn_events: int = 0
     """Events in the torn end; none of them was synced."""
     next_offset: Offset = FIRST_OFFSET
-    rewritten: bool = False
-    """Whether another program has rewritten the file."""
     channels: dict[int, Channel] = field(default_factory=dict)
     """The channels in the segment's index; chunks define theirs as well."""
     schemas: dict[int, Schema] = field(default_factory=dict)

@@ -123,7 +123,7 @@ class _Verifier:
             scan = scan_sealed(segment.path, segment.base, reach)
             self._check_file(segment, scan, head)
         else:
-            scan = scan_active(segment.path, segment.base, reach)
+            scan = scan_active(segment.path, segment.base)
             if reach is not None:
                 scan.add_gap_until(reach)
             self._check_end(name, scan)
@@ -189,12 +189,8 @@ class _Verifier:
         if check.fault is not None:
             known = "" if scan.gaps else "; no event is affected"
             self._add("crc", f"{check.fault}{known}", name)
-        elif scan.index_fault is not None and not scan.rewritten:
+        elif scan.index_fault is not None:
             self._add("crc", scan.index_fault, name)
-        if scan.rewritten:
-            repair = advised("log", "recover", self._log)
-            text = f"another program has rewritten it; `{repair}` repairs it"
-            self._add("crc", text, name)
         previous = head.get(PREVIOUS, NO_PREVIOUS)
         if head and self._expected_hashes and previous not in self._expected_hashes:
             self._add("chain", "was not written after the segment before it", name)

@@ -30,6 +30,7 @@ from pydantic import BaseModel, ValidationError
 from eventsrc.base.text import visible
 from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
 from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.gaps import Gap, GapLedger, gap_of
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import KeyframeId, Offset, RunId, has_keyframe_id
@@ -44,7 +45,6 @@ from eventsrc.envelope.system_events import (
     Loss,
     RejectedPayload,
 )
-from eventsrc.envelope.upcast import read_envelope
 from eventsrc.ros.derivation import read_recording
 
 from .event import Event
@@ -305,7 +305,7 @@ class EventFindings:
             return
         seen.add(keyframe_id)
         self._stamps.add(run_id, keyframe_id, event.stamp_ns, event.offset)
-        if has_keyframe_id(event.version):  # older ones count no keyframes
+        if has_keyframe_id(event.version):  # a bare list names none
             self._gaps.add_keyframe(run_id, keyframe_id)
 
     def _add(self, kind: Kind, about: str, offset: Offset, message: str, count: int = 1) -> None:

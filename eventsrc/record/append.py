@@ -1,7 +1,7 @@
 """Validate a payload from outside and append it to a log, or its rejection.
 
 An accepted payload is appended verbatim under its own key, stamped with the robot's time; the
-channel has its version if it is of an older form (`eventsrc.envelope.upcast`). A refused one is
+channel says if it is a bare list of detections (`eventsrc.envelope.forms`). A refused one is
 appended under ``mapfold/rejected``, with its key, its bytes and the reason, so nothing is dropped
 silently.
 
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import msgspec
 
 from eventsrc.envelope.cdr import is_cdr
+from eventsrc.envelope.forms import PendingEvent, check_envelopes, detect_version
 from eventsrc.envelope.grid_messages import (
     NO_GRID,
     is_grid_message,
@@ -30,7 +31,6 @@ from eventsrc.envelope.ingest import (
 from eventsrc.envelope.model import Offset, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
-from eventsrc.envelope.upcast import PendingEvent, check_envelopes, detect_version
 from eventsrc.log import LogWriter, NewEvent
 
 from .transport.config import key_fault
@@ -108,7 +108,7 @@ def check_payloads(
     decoded vectors then fit the processor's cache.
 
     ``first`` and ``logged_ns`` stand in for the keyframe id and the time of a bare list
-    (`eventsrc.envelope.upcast`), which has neither. For validation any offset and any time will do,
+    (`eventsrc.envelope.forms`), which has neither. For validation any offset and any time will do,
     so both may be earlier than those that the events get. ``version`` is the envelope version that
     another log has recorded them in; by default it is detected. With ``are_grids`` messages in
     CDR are occupancy grids whatever their keys.

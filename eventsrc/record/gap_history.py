@@ -1,7 +1,7 @@
 """The gap ledger of a log: keyframes its runs lack, folded from its events and saved beside it.
 
 Of an envelope only run and keyframe id are needed, and reading these two is several times quicker
-than a full validation. Envelopes of older versions do not count their keyframes and are skipped.
+than a full validation. Bare lists of detections name no keyframe and are skipped.
 
 The saved ledger, ``.ledger.json``, is a cache that is safe to delete; with it only the first
 reading is of the whole log. It is used only if its checksum holds, its content is consistent, it is

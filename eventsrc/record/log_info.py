@@ -35,8 +35,8 @@ from .gap_history import ledger_of
 class SegmentInfo:
     """One segment: the number of its durable ``events`` and the ``size_bytes`` of its file.
 
-    ``begun_ns`` is when it was begun, by the clock of the machine that wrote it; None for segments
-    of earlier versions. In an ``imported`` one the log times are those of the drive.
+    ``begun_ns`` is when it was begun, by the clock of the machine that wrote it; None after a
+    recovery that could not read it. In an ``imported`` one the log times are those of the drive.
     """
 
     name: str

@@ -10,11 +10,11 @@ from itertools import islice
 from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.forms import read_fields
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.envelope.system_events import MAP_KEY
-from eventsrc.envelope.upcast import read_fields
 from eventsrc.log import Event
 from projections.fold.exact import Units, unit_vectors
 
@@ -36,7 +36,7 @@ class ParsedEvent(NamedTuple):
 
 def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
     """Validate events; for sixteen or so together this is quicker than one by one. The envelopes
-    are those of `eventsrc.envelope.upcast.read_fields`."""
+    are those of `eventsrc.envelope.forms.read_fields`."""
     enveloped = [event for event in events if event.is_envelope]
     # No size limit: it applied when the event was recorded.
     outcomes = read_fields(enveloped, max_bytes=sys.maxsize)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from eventsrc.base.advised import advised
 from eventsrc.envelope.commands import Reembed
 from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import DetId
 from eventsrc.envelope.system_events import EMBEDDINGS_KEY
-from eventsrc.envelope.upcast import read_envelope
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.embedding_space import Reembedded

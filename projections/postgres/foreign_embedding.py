@@ -3,9 +3,9 @@
 import sys
 from dataclasses import dataclass
 
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import Offset
-from eventsrc.envelope.upcast import read_envelope
 from eventsrc.log import LogReader
 
 from .live_fold import LiveFold

@@ -9,9 +9,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Rejected
 from eventsrc.envelope.model import Offset
-from eventsrc.envelope.upcast import read_envelope
 from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 

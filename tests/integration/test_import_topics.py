@@ -193,16 +193,16 @@ def test_what_log_cat_shows_is_imported_as_it_was(run: Commands) -> None:
     assert [e.payload for e in read_log(run.folder / "N")] == lines[1:3]
 
 
-def test_an_older_envelope_keeps_its_version_and_verbatim_messages_are_passed_over(
+def test_a_bare_list_keeps_its_version_and_verbatim_messages_are_passed_over(
     run: Commands,
 ) -> None:
-    odd = payload({**envelope(1), "camera": "an unknown field then", "floor": {}})
+    bare = payload([{"class_name": "cup", "confidence": 0.5, "bbox": [0.0, 0.0, 4.0, 4.0]}])
     with LogWriter(run.folder / "L") as writer:
-        writer.append("tb/detections", odd, logged_ns=5, stamp_ns=7, version=2)
+        writer.append("tb/detections", bare, logged_ns=5, stamp_ns=5, version=1)
         writer.append_all([mixed_event(0), mixed_event(2)])
     said = shown_again(run, "L", "M")
     (event,) = read_log(run.folder / "M")
-    assert (event.version, event.logged_ns, json.loads(event.payload)) == (2, 5, json.loads(odd))
+    assert (event.version, event.logged_ns, json.loads(event.payload)) == (1, 5, json.loads(bare))
     assert "passed over: /tf: 1 message, cdr tf2_msgs/msg/TFMessage, without the schema's" in said
 
 

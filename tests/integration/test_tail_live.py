@@ -9,7 +9,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from eventsrc.envelope.upcast import read_envelope
+from eventsrc.envelope.forms import read_envelope
 from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.record.append import append_payload
 from projections.fold.errors import ProjectionBusy, ProjectionMismatch

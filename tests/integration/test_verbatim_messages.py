@@ -32,7 +32,6 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from tests.commands import Commands
 from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
-from tests.rewriting import rewrite
 from tests.thorough import rounds
 from tests.verbatim import BOXES, JPEG, TF, mixed_event, mixed_events
 
@@ -230,17 +229,6 @@ def test_without_its_index_a_segment_keeps_its_formats(mixed: Path) -> None:
     first.path.write_bytes(data[:-200])
     recover_log(mixed)
     assert read_log(mixed) == mixed_events(COUNT)
-
-
-def test_a_segment_that_mcap_sort_rewrote_keeps_its_formats(log_path: Path) -> None:
-    events = [e for e in map(mixed_event, range(40)) if e.format != JPEG]  # it needs schemas
-    with LogWriter(log_path) as writer:
-        writer.append_all(events)
-    before = read_log(log_path)
-    (sealed,) = list_segments(log_path)
-    rewrite(sealed.path)
-    recover_log(log_path)
-    assert read_log(log_path) == before
 
 
 def test_import_takes_messages_over_from_a_log_and_from_a_segment(

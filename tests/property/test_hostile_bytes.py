@@ -2,7 +2,6 @@
 lost of what was not synced, exactly the synced events come back and nothing is made up."""
 
 import itertools
-import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eventsrc.base.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
@@ -228,26 +227,12 @@ def test_a_head_with_a_seed_that_is_no_number_is_damaged(folder: Path, seed: str
     assert read_log(folder) == []
 
 
-def test_marks_of_segments_without_a_seed_are_read(folder: Path) -> None:
-    """As versions before wrote them."""
-    path = folder / "log"
-    with LogWriter(path, fsync=BY_HAND) as writer:
-        for number in range(3):
-            writer.append(KEY, b"%d" % number)
-            writer.sync()
-        (file,) = path.glob("*.active")
-        content = file.read_bytes()
-    shutil.rmtree(path)
-    head, at = read_head(file, content[:HEAD_BYTES], 0)
-    assert MARK_SEED in head
-    old = content[at:]
-    for number in range(3):
-        mark = _mcap.encode_mark(number, number + 1, mark_seed(head))
-        assert mark in old
-        old = old.replace(mark, _mcap.encode_mark(number, number + 1, 0))
-    path.mkdir()
-    file.write_bytes(file_head(head_metadata(head["log_id"], 0)) + old)
-    assert [e.payload for e in read_log(path)] == [b"0", b"1", b"2"]
-    with LogWriter(path) as writer:
-        assert writer.next_offset == 3
-    assert [e.payload for e in read_log(path)] == [b"0", b"1", b"2"]
+def test_a_head_without_a_seed_is_of_no_released_version(folder: Path) -> None:
+    path = folder / f"{0:020d}.mcap.active"
+    path.write_bytes(file_head(head_metadata("log", 0)))
+    for use in (read_log, LogWriter):
+        with pytest.raises(NotALog, match=r"never released.*mapfold import LOG"):
+            use(folder)
+    with pytest.raises(LogDamaged, match=r"never released.*nothing was changed"):
+        recover_log(folder)
+    assert path.exists()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, file_head, head_metadata, segment_path
@@ -45,7 +46,7 @@ def leave_active(path: Path, base: int) -> Path:
     active = ActiveSegment(path, log_id, base, ALWAYS)
     active.create()
     for number, payload in enumerate(events, start=base):
-        active.add([NewEvent(KEY, payload, 1000 + number, number, 2)], 0)
+        active.add([NewEvent(KEY, payload, 1000 + number, number)], 0)
         active.commit()
     active.close()
     return segment_path(path, base, ACTIVE)
@@ -205,12 +206,12 @@ def by_hand(log_id: str, base: int, messages: list[tuple[int, bytes]]) -> bytes:
     from eventsrc.log.format import key_channel
     from eventsrc.log.mcap_records import encode
 
-    body = encode(key_channel(1, 0, KEY, 2))
+    body = encode(key_channel(1, 0, KEY, ENVELOPE_VERSION))
     body += b"".join(encode_message_head(1, s, 5, 5, len(p)) + p for s, p in messages)
     crc = zlib.crc32(body)
     first, last = messages[0][0], messages[-1][0]
     chunk = encode_plain_chunk_head(len(body), crc, 5, 5) + body
-    head = file_head(head_metadata(log_id, base))
+    head = file_head(head_metadata(log_id, base, {"mark_seed": "0"}))
     return head + chunk + encode_mark(base + first, base + last + 1, 0)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from eventsrc.envelope.forms import PendingEvent, read_envelope
 from eventsrc.envelope.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
 from eventsrc.envelope.model import MAX_DETECTIONS
-from eventsrc.envelope.upcast import PendingEvent, read_envelope
 from tests.envelopes import detection, envelope, payload
 from tests.thorough import mostly_slow
 

@@ -37,12 +37,12 @@ def record(opcode: int, content: bytes) -> bytes:
 
 
 def head() -> bytes:
-    values = {"base": "500", "format": "1", "log_id": "hand"}
+    values = {"base": "500", "format": "1", "log_id": "hand", "mark_seed": "0"}
     # docs/log-format.md: CRC-32 of each key and value with its length before it, by key
     canonical = "".join(f"{len(k)}:{k}{len(v)}:{v}" for k, v in sorted(values.items()))
     values["crc32"] = f"{zlib.crc32(canonical.encode()):08x}"
     header = record(0x01, text("mapfold") + text("mapfold"))
-    return MAGIC + header + record(0x0C, text("mapfold.segment") + mapping(values))
+    return MAGIC + header + record(0x0C, text("mapfold.segment:hand:500") + mapping(values))
 
 
 def message(sequence: int, log_ns: int, publish_ns: int, payload: bytes) -> bytes:

@@ -46,18 +46,6 @@ def test_sealing_and_growing_change_nothing(tmp_path: Path) -> None:
     assert not same_but_sealed(before, segment_signatures(log, Offset(25)))
 
 
-def test_signatures_of_earlier_versions_fit_as_they_did(tmp_path: Path) -> None:
-    """They do not say when a segment was begun."""
-    log = write_log(tmp_path / "log", documents(0, 12, 0.5))
-    with begun(log, 20, 0.5):
-        now = segment_signatures(log, Offset(20))
-        older = [each.partition(" begun ")[0] for each in now]
-        assert older[1] == "12"
-        assert same_but_sealed(older, now)
-    assert same_but_sealed(older, segment_signatures(log, Offset(20)))
-    assert not same_but_sealed(["0", "13"], now)
-
-
 def test_a_segment_of_an_unreadable_head_is_not_the_one_it_was(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", documents(0, 12, 0.5))
     before = segment_signatures(log, Offset(12))

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.forms import BARE_LIST_VERSION
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.envelope.model import Offset, RunId, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.envelope.system_events import EMBEDDINGS_KEY, LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY
-from eventsrc.envelope.upcast import UPCASTERS
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.log.format import list_segments
 from eventsrc.record.append import Checked, NewMap, check_payloads, checked_event, rejected_event
@@ -281,7 +281,7 @@ class _Import:
             first=self._writer.next_offset,
             logged_ns=self._writer.now_ns() if message.logged_ns is None else message.logged_ns,
             max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
-            version=message.version if message.version in UPCASTERS else None,
+            version=BARE_LIST_VERSION if message.version == BARE_LIST_VERSION else None,
             are_grids=message.is_grid,
         )
         is_rejected = isinstance(checked.result, Rejected)

@@ -16,9 +16,9 @@ import pybase64
 from starlette.datastructures import QueryParams
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.forms import read_envelopes
 from eventsrc.envelope.ingest import Rejected
 from eventsrc.envelope.model import Offset
-from eventsrc.envelope.upcast import read_envelopes
 from eventsrc.log import Event
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import map_fingerprint

@@ -13,7 +13,6 @@ from tests.attack.arena import Arena
 from tests.attack.corruption import corrupt_log
 from tests.attack.forgery import mark, mark_as_text, seed_of
 from tests.attack.oracle import Oracle
-from tests.attack.rewrite import rewrite
 from tests.envelopes import envelope
 from tests.fixtures_log import BY_HAND
 
@@ -63,13 +62,6 @@ def sealed_cut_or_deleted(arena: Arena, log: Path, _: Oracle) -> int:
     return sealed_to
 
 
-def rewritten(_: Arena, log: Path, __: Oracle) -> int:
-    """Another tool rewrote a segment, as `mcap sort` and `mcap filter` do."""
-    segment = sorted(log.glob("*.mcap"))[1]
-    rewrite(segment, segment)
-    return EVENTS
-
-
 def forged_mark_in_key(arena: Arena, log: Path, oracle: Oracle) -> int:
     """A key holds a commit mark of an offset far away, and the writer died over that chunk."""
     _write(log, "forged", oracle, key=f"tb/{mark_as_text(10**6)}")
@@ -109,7 +101,6 @@ CASES: tuple[Damage, ...] = (
     foreign_over_active,
     exchanged_names,
     sealed_cut_or_deleted,
-    rewritten,
     forged_mark_in_key,
     forged_mark_at_end,
     one_digit_of_ledger,
