@@ -65,6 +65,15 @@ def test_another_server_is_an_error_that_says_how_to_start_a_scheduler(
     assert capfd.readouterr() == ("", "")
 
 
+def test_no_logger_of_dask_writes_to_stderr() -> None:
+    """Not even a client that has given up an ended scheduler."""
+    with answering(bytes(64)) as address, pytest.raises(ClusterError):
+        DaskCluster(address)
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    assert "distributed.client" in names
+    assert not [each for each in names if logging.getLogger(each).isEnabledFor(logging.CRITICAL)]
+
+
 def test_a_server_that_says_nothing_is_an_error_after_a_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

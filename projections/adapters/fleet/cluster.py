@@ -24,6 +24,10 @@ _POLL_S: Final = 0.25
 _GONE_S: Final = 20.0
 """Longest time without a connection to the scheduler; it has no results meanwhile."""
 
+_LOGGERS: Final = ("distributed", "distributed.client", "distributed.gc", "tornado.application")
+"""Those that the import of ``distributed`` gives a level; a client's prints a traceback when it
+stops looking for its scheduler."""
+
 
 class ClusterError(MapfoldError):
     """The cluster cannot be used, or its scheduler has ended."""
@@ -40,7 +44,8 @@ class DaskCluster:
             raise MisuseError(
                 "--engine dask:// needs the package distributed: pip install 'mapfold[cluster]'"
             ) from None
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # errors are raised
+        for name in _LOGGERS:  # errors are raised
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         self.address = address
         client: Any = distributed.Client
         try:
