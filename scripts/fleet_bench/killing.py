@@ -110,7 +110,12 @@ class _Killer:
 
 
 def _workers_under(parent: int) -> list[int]:
-    """Processes that multiprocessing has spawned, of this process or of Dask's worker programs."""
+    """Those that multiprocessing has spawned, of this process or of Dask's worker programs."""
+    return [pid for pid, args in processes_under(parent).items() if "spawn_main" in args]
+
+
+def processes_under(parent: int) -> dict[int, str]:
+    """The command lines of a process's children, their children and so on, by process id."""
     listed = subprocess.run(
         ["ps", "-wweo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     )
@@ -121,7 +126,7 @@ def _workers_under(parent: int) -> list[int]:
         if more == under:
             break
         under = more
-    return [int(pid) for pid, _, args in rows if int(pid) in under and "spawn_main" in args]
+    return {int(pid): args for pid, _, args in rows if int(pid) in under - {parent}}
 
 
 def _judge(requests: Sequence[ReplayRequest]) -> int:

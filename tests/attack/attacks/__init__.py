@@ -16,6 +16,8 @@ from . import (
     publishers,
     questions,
     requests,
+    swaps,
+    workers,
 )
 
 ATTACKS: dict[str, Attack] = {
@@ -30,7 +32,9 @@ ATTACKS: dict[str, Attack] = {
     "questions": questions.attack,
     "connections": connections.attack,
     "requests": requests.attack,
+    "swaps": swaps.attack,
     "projections": projections.attack,
     "exposure": exposure.attack,
+    "workers": workers.attack,
 }
 """In the order in which they are played."""
