@@ -19,9 +19,13 @@ class Certificate:
 @pytest.fixture(scope="session")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
     """A certificate of this test session's own, with its key."""
+    return make_certificate(tmp_path_factory.mktemp("tls"))
+
+
+def make_certificate(folder: Path) -> Certificate:
+    """A new certificate, with its key, in ``folder``."""
     openssl = shutil.which("openssl")
     assert openssl, "these tests need the program openssl"
-    folder = tmp_path_factory.mktemp("tls")
     made = Certificate(folder / "cert.pem", folder / "key.pem")
     subprocess.run(
         [

@@ -92,7 +92,8 @@ class Arena:
             said = " / ".join(attacked.lines[-2:])
             self.complain(f"{attacked.command} had ended by itself: {said}")
         elif attacked.end(signal.SIGINT) not in codes:
-            self.complain(f"{attacked.command} ended with {attacked.process.returncode}")
+            said = " / ".join(attacked.lines[-2:])
+            self.complain(f"{attacked.command} ended with {attacked.process.returncode}: {said}")
 
     def judge(self, oracle: Oracle, log: Path) -> None:
         """Count the acknowledged events that ``log`` lacks, and the invented ones in it."""

@@ -1,6 +1,7 @@
 """A served map: the log of a walk, replayed into a database, and `mapfold serve` in front of it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from tests.attack.arena import Arena
 from tests.attack.attacked_command import AttackedCommand
@@ -22,11 +23,11 @@ def replayed(arena: Arena) -> str:
     return arena.database()
 
 
-def serve(arena: Arena, endpoint: str | None = None) -> Service:
-    """Replay and serve, over Zenoh too when there is an ``endpoint``."""
+def serve(arena: Arena, endpoint: str | None = None, *options: str | Path) -> Service:
+    """Replay and serve with ``options``, over Zenoh too when there is an ``endpoint``."""
     url = replayed(arena)
     zenoh = ["--no-zenoh"] if endpoint is None else ["--connect", endpoint]
-    server = arena.start("server", "serve", "--http", "127.0.0.1:0", "--db", url, *zenoh)
-    said = server.wait_for("answering http://")
+    server = arena.start("server", "serve", "--http", "127.0.0.1:0", "--db", url, *zenoh, *options)
+    said = server.wait_for("answering http")
     server.wait_for("Ctrl-C")
     return Service(server, said.split()[1].rstrip(","))

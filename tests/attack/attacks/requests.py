@@ -1,20 +1,30 @@
 """HTTP requests that no honest client sends, whole and damaged, beside honest questions; then two
-signals at once."""
+signals at once. The same to ports that speak TLS, with half handshakes, and to those of metrics."""
 
 import random
 import re
 import signal
 import socket
+import ssl
 import time
-from collections.abc import Iterator
+import urllib.request
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import partial
 from urllib.parse import urlsplit
 
 from tests.attack.arena import Arena
 from tests.attack.honest_client import HonestClient, question
 from tests.attack.service import serve
+from tests.fixtures_tls import make_certificate
+from tests.logs import walk, write_log
 
 SECONDS = 4.0
 PATIENCE_S = 10.0
+HANDSHAKES = 30
+BUSY = (b"503",)
+UNSPOKEN = (b"501", b"503", b"505")
+"""Of a small server also methods and versions that it does not speak."""
 _HOST = b"Host: localhost\r\n"
 _END = b"Connection: close\r\n\r\n"
 _PIECES = (b"\r\n", b"\0", b"\xff" * 9, b"%00", b"9" * 30, b'"', b"[", b"{")
@@ -56,18 +66,81 @@ def cases() -> Iterator[bytes]:
 
 def attack(arena: Arena) -> None:
     """Round 0: the cases; later such that are damaged at random, for some seconds."""
+    for case in (plain, secured, metrics):
+        arena.attempt(case.__name__, partial(case, arena))
+
+
+def plain(arena: Arena) -> None:
+    """HTTP."""
     service = serve(arena)
-    netloc = urlsplit(service.url)
-    address = (netloc.hostname or "", netloc.port or 0)
     with HonestClient(service.url, arena.tally):
-        for sent in cases() if arena.round == 0 else _damaged(arena.rng):
-            for status in re.findall(rb"HTTP/1\.1 (5\d\d)", _answer(address, sent)):
-                if status != b"503":  # too many wait
-                    arena.complain(f"{status.decode()} for {sent[:200]!r}")
+        _send_all(arena, service.url)
     for number in (signal.SIGTERM, signal.SIGHUP):
         service.server.process.send_signal(number)
     if (code := service.server.wait()) != 0:
         arena.complain(f"{service.server.command} ended with {code} after two signals")
+
+
+def secured(arena: Arena) -> None:
+    """HTTPS: HTTP instead of TLS, and handshakes that end anywhere and stay open."""
+    made = make_certificate(arena.folder)
+    service = serve(arena, None, "--tls-cert", made.cert, "--tls-key", made.key)
+    context = ssl.create_default_context(cafile=made.cert)
+    hello, held = _hello(context), []
+    for _ in range(HANDSHAKES):
+        held.append(socket.create_connection(_address(service.url), timeout=PATIENCE_S))
+        held[-1].sendall(hello[: arena.rng.randrange(len(hello))])
+    _send_all(arena, service.url)
+    with urllib.request.urlopen(
+        f"{service.url}/health", context=context, timeout=PATIENCE_S
+    ) as got:
+        if got.status != 200:
+            arena.complain(f"/health over TLS: {got.status}")
+    for connection in held:
+        connection.close()
+    arena.finish(service.server, codes=(0,))
+
+
+def metrics(arena: Arena) -> None:
+    """The numbers of a recorder and of a tail, beside readers that read nothing."""
+    log, address = arena.folder / "recorded", ("--metrics", "127.0.0.1:0")
+    recorder = arena.start("recorder", "record", log, "--connect", arena.router(), *address)
+    recorder.wait_for("recording ")
+    walked = write_log(arena.folder / "followed", walk(20))
+    arena.run("reader", "replay", walked, "--db", arena.database(), codes=(0,))
+    tail = arena.start("reader", "tail", walked, "--db", arena.database(), *address)
+    for served in (recorder, tail):
+        url = served.wait_for("metrics on http").split()[-1].removesuffix("/metrics")
+        slow = [socket.create_connection(_address(url)) for _ in range(HANDSHAKES)]
+        for connection in slow:
+            connection.sendall(b"GET /metrics HTTP/1.1\r\n" + _HOST + b"\r\n")
+        _send_all(arena, url, UNSPOKEN)
+        with urllib.request.urlopen(f"{url}/metrics", timeout=PATIENCE_S) as got:
+            if b"mapfold_" not in got.read():
+                arena.complain(f"{served.command}: no metrics")
+        for connection in slow:
+            connection.close()
+        arena.finish(served)
+
+
+def _send_all(arena: Arena, url: str, allowed: Sequence[bytes] = BUSY) -> None:
+    for sent in cases() if arena.round == 0 else _damaged(arena.rng):
+        for status in re.findall(rb"HTTP/1\.[01] (5\d\d)", _answer(_address(url), sent)):
+            if status not in allowed:
+                arena.complain(f"{status.decode()} for {sent[:200]!r}")
+
+
+def _address(url: str) -> tuple[str, int]:
+    netloc = urlsplit(url)
+    return netloc.hostname or "", netloc.port or 0
+
+
+def _hello(context: ssl.SSLContext) -> bytes:
+    """What a client of TLS sends first."""
+    sent = ssl.MemoryBIO()
+    with suppress(ssl.SSLWantReadError):
+        context.wrap_bio(ssl.MemoryBIO(), sent, server_hostname="127.0.0.1").do_handshake()
+    return sent.read()
 
 
 def _damaged(rng: random.Random) -> Iterator[bytes]:
@@ -86,7 +159,8 @@ def _answer(address: tuple[str, int], sent: bytes) -> bytes:
     with socket.create_connection(address, timeout=PATIENCE_S) as connection:
         try:
             connection.sendall(sent)
-            connection.shutdown(socket.SHUT_WR)
+            with suppress(OSError):  # closed already
+                connection.shutdown(socket.SHUT_WR)
             while part := connection.recv(65_536):
                 parts.append(part)
         except ConnectionError:  # closed while this end was still sending
