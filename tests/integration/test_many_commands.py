@@ -12,7 +12,9 @@ import pytest
 from eventsrc.envelope.commands import (
     Anchor,
     CorrectPoses,
+    ForgetRun,
     RigidTransform,
+    Undo,
     UndoMerge,
     UseSettings,
     encode_command,
@@ -38,6 +40,7 @@ from projections.postgres.connection import Targets
 from projections.postgres.inputs import LogInputs
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.rebuild import rebuild
+from projections.postgres.tail import tail
 from tests.bench.commands import (
     KINDS,
     commands_of,
@@ -221,6 +224,26 @@ def test_few_compiled_corrections_are_kept(tmp_path: Path) -> None:
             found = timeline.corrections(Offset(known_at))
             assert len(found.in_force) == known_at - 445
         assert len(timeline._compiled) <= 16
+
+
+@pytest.mark.seconds
+def test_undos_of_undos_of_any_depth_are_followed(tmp_path: Path, one_database: Targets) -> None:
+    log = write_rooms(tmp_path / "log")
+    with LogWriter(log, fsync=NEVER) as writer:
+        own = {"issued_by": "ann"}
+        forgotten = ForgetRun(**own, command_id="c0", run_id=RunId("run-a"))
+        writer.append(COMMAND_KEY, encode_command(forgotten))
+        for number in range(1, 5_001):
+            undo = Undo(**own, command_id=f"c{number}", undone=f"c{number - 1}")
+            writer.append(COMMAND_KEY, encode_command(undo))
+    with LogReader(log) as reader:
+        digests = []
+        for known in (reader.next_offset, Offset(reader.next_offset - 1)):
+            corrections = read_corrections(reader, known)
+            digests.append(map_digest(fold_log(reader, Settings(), corrections=corrections)[1]))
+    assert digests[0] != digests[1]
+    assert rebuild(log, one_database, Settings()).digest == digests[0]
+    assert tail(log, one_database, Settings(), once=True).next_offset == reader.next_offset
 
 
 def test_a_name_that_comes_live_costs_no_more_for_those_before_it() -> None:
