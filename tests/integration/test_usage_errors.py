@@ -7,7 +7,9 @@ import pytest
 
 from tests.commands import Commands
 from tests.fixtures_timetravel import write_log
+from tests.hostile_options import hostile_lines, prepared
 from tests.logs import walk
+from tests.thorough import rounds
 
 
 @pytest.fixture
@@ -59,6 +61,16 @@ def test_an_empty_path_is_refused(mapfold: Commands, args: tuple[str, ...], name
     assert name in said
     assert "empty" in said
     assert {*mapfold.folder.iterdir()} == before
+
+
+def test_hostile_values_of_any_option_end_without_a_traceback(mapfold: Commands) -> None:
+    """A sample of what `tests.attack` tries."""
+    lines = [*hostile_lines()]
+    with prepared(mapfold.folder):
+        for line in lines[:: rounds(31, 997)]:
+            said = mapfold(*line, code=None)
+            assert said.code in (0, 1, 2, 3), line
+            assert "Traceback" not in said.err, line
 
 
 def test_a_value_that_is_not_offered(mapfold: Commands) -> None:

@@ -254,7 +254,7 @@ def foxglove(
             )
         try:
             playback = Playback(maps, log.resolve().name, host, port)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a host that is no text
             raise MisuseError(
                 f"cannot listen on {host}:{port}: {error}; give another --host or --port"
             ) from None

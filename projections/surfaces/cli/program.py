@@ -140,12 +140,17 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
 
 
 class _GivenPath(type(Path())):  # type: ignore[misc]
-    """Makes the Path of an option or argument that is not empty: ``Path("")`` would be the working
-    folder, so ``--out=$UNSET`` would name that."""
+    """Makes the Path of an option or argument, neither empty (``Path("")`` would be the working
+    folder, so ``--out=$UNSET`` would name that) nor longer than the system takes."""
 
     def __new__(cls, text: str | Path) -> Path:  # type: ignore[misc]
         if text == "":
             raise typer.BadParameter("the path is empty")
+        try:
+            os.lstat(text)
+        except OSError as error:
+            if error.errno == errno.ENAMETOOLONG:
+                raise typer.BadParameter(f"{str(text)[:_MAX_NAME]}…: {error.strerror}") from None
         return Path(text)
 
     @classmethod
