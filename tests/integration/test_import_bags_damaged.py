@@ -1,5 +1,6 @@
 """Bags of ROS 2 that are cut off, damaged, no bags, or hold what is none of its type."""
 
+import contextlib
 import hashlib
 import json
 import shutil
@@ -122,6 +123,19 @@ def test_messages_that_were_not_written_into_the_database_are_not_passed_over(
     (bag / "drive.db3-wal").write_bytes(b"x")
     with pytest.raises(MisuseError, match="wal_checkpoint"):
         imported(tmp_path / "log", bag)
+
+
+def test_a_database_in_the_middle_of_a_transaction_is_not_read(
+    drives: dict[str, Path], tmp_path: Path
+) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(drives["sqlite"], bag)
+    with contextlib.closing(sqlite3.connect(bag / "drive.db3", isolation_level=None)) as recorder:
+        recorder.executescript("PRAGMA cache_size = 2; BEGIN EXCLUSIVE")
+        recorder.execute("UPDATE messages SET data = zeroblob(9000)")
+        with pytest.raises(MisuseError, match="a transaction of the bag's recorder has not ended"):
+            imported(tmp_path / "log", bag)
+    assert imported(tmp_path / "log", bag).accepted == DRIVE.pictures, "it was taken back"
 
 
 def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Path) -> None:

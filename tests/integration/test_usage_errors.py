@@ -63,6 +63,13 @@ def test_an_empty_path_is_refused(mapfold: Commands, args: tuple[str, ...], name
     assert {*mapfold.folder.iterdir()} == before
 
 
+def test_a_recording_for_foxglove_goes_into_no_pipe(mapfold: Commands) -> None:
+    with prepared(mapfold.folder):
+        (line,) = mapfold("export", "log", "--foxglove=fifo", code=2).err.splitlines()
+    assert line == "mapfold: fifo: an MCAP recording goes to a file, not a pipe; choose one"
+
+
+@pytest.mark.seconds
 def test_hostile_values_of_any_option_end_without_a_traceback(mapfold: Commands) -> None:
     """A sample of what `tests.attack` tries."""
     lines = [*hostile_lines()]

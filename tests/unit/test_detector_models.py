@@ -268,6 +268,12 @@ def test_a_wrong_preparation_is_one_line(tmp_path: Path, change: Any, reason: st
     assert "\n" not in message
 
 
+def test_a_batch_that_no_memory_holds_is_refused(folder: Path) -> None:
+    model = mean_colour_encoder(folder / "batch.onnx", batch=10_000_000)
+    with pytest.raises(ModelError, match="takes 10,000,000 crops of 1,024 pixels at once"):
+        Encoder(OnnxModel(model), read_preparation(model))
+
+
 def test_a_size_that_the_model_does_not_have(folder: Path) -> None:
     model = mean_colour_encoder(folder / "sized.onnx", size=16)
     model.with_suffix(".json").write_text(json.dumps(GOOD))
@@ -293,6 +299,17 @@ def test_labels(tmp_path: Path, folder: Path) -> None:
         file.write_text(text)
         with pytest.raises(MisuseError, match=reason):
             read_labels(str(file))
+    g = Graph()
+    metadata = {"names": "{[]: 1}"}
+    unreadable = g.save(
+        folder / "names.onnx",
+        {"images": (1, 3, 64, 64)},
+        {"output0": (1, 3, 64, 64)},
+        {"output0": "images"},
+        metadata=metadata,
+    )
+    with pytest.raises(MisuseError, match="the classes in its metadata: no list of classes"):
+        Finder(OnnxModel(unreadable), None, FinderOptions())
     with pytest.raises(MisuseError, match="give a file, or coco"):
         read_labels(str(tmp_path / "none"))
     unnamed = fixed_answer(folder / "unnamed.onnx", np.zeros((1, 5, 1), np.float32))

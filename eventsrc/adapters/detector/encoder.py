@@ -24,6 +24,8 @@ from .picture import Pixels
 from .vision import Fit, Scaling, fitted, planes
 
 BATCH: Final = 32
+_MAX_PIXELS: Final = 64_000_000
+"""Of the crops of a batch: they take 12 bytes each."""
 """Crops in one batch, for a model that takes any number."""
 _Side = Annotated[int, Field(ge=1, le=2048)]
 _Channel = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -93,6 +95,13 @@ class Encoder:
                 f"{model.path}: its input is {model.input.text}, and the size in"
                 f" {model.path.with_suffix('.json').name} is {self._size[0]} × {self._size[1]}"
             )
+        pixels = self._size[0] * self._size[1]
+        self._batch = model.batch or max(1, min(BATCH, _MAX_PIXELS // pixels))
+        if self._batch * pixels > max(pixels, _MAX_PIXELS):
+            raise ModelError(
+                f"{model.path}: it takes {self._batch:,} crops of {pixels:,} pixels at once, more"
+                f" than {_MAX_PIXELS:,} pixels; export it for fewer"
+            )
         self._scaling = Scaling.of(
             rgb=True, scale=1 / 255, mean=preparation.mean, std=preparation.std
         )
@@ -108,7 +117,7 @@ class Encoder:
 
         Raises ModelError.
         """
-        step = self._model.batch or BATCH
+        step = self._batch
         vectors: list[NDArray[np.float32] | None] = []
         for start in range(0, len(crops), step):
             rows = self._run(crops[start : start + step])

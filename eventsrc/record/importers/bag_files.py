@@ -29,6 +29,8 @@ _ROS2_PROFILE: Final = b"\x04\0\0\0ros2"
 _PROFILE_AT: Final = len(MCAP_MAGIC) + 9
 METADATA: Final = "metadata.yaml"
 _SQLITE_SUFFIX: Final = ".db3"
+_HOT_JOURNAL: Final = bytes.fromhex("d9d505f920a163d7")
+"""The start of a rollback journal whose transaction has not ended."""
 _FILE_OF_A_BAG: Final = re.compile(r".*\.(db3|mcap)(\.zstd)?", re.DOTALL)
 _SEGMENT_OF_A_LOG: Final = re.compile(r"\d{20}\.mcap")
 
@@ -311,7 +313,8 @@ class _SqlitePart:
 
 
 def _refuse_unwritten(path: Path) -> None:
-    """Raise MisuseError if the file's write-ahead log has messages that are not in the file."""
+    """Raise MisuseError if the file's write-ahead log has messages that are not in the file, or its
+    rollback journal a transaction that has not ended."""
     journal = path.with_name(path.name + "-wal")
     if journal.exists() and journal.stat().st_size:
         raise MisuseError(
@@ -319,6 +322,16 @@ def _refuse_unwritten(path: Path) -> None:
             f"recording was cut off; `sqlite3 {visible(str(path))} 'PRAGMA wal_checkpoint'` writes "
             "them there"
         )
+    journal = path.with_name(path.name + "-journal")
+    if journal.exists():
+        with journal.open("rb") as file:
+            hot = file.read(len(_HOT_JOURNAL)) == _HOT_JOURNAL
+        if hot:
+            raise MisuseError(
+                f"{visible(str(journal))}: a transaction of the bag's recorder has not ended; end"
+                " the recording, or if it was cut off, take the transaction back: `sqlite3"
+                f" {visible(str(path))} 'PRAGMA integrity_check'`"
+            )
 
 
 def _open_part(path: Path, files: ExitStack) -> _Part:

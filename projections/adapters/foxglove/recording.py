@@ -7,7 +7,7 @@ from typing import Any
 
 from foxglove import Context, open_mcap
 
-from eventsrc.base.errors import MapfoldError
+from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.output_files import OutputFile, written_whole
 from projections.fold.deltas import KeyframeAdded, MapGiven
 from projections.map.change_lines import change_lines
@@ -24,6 +24,8 @@ def write_recording(fold: RecordedFold, path: Path) -> int:
     """
     context, scenes = Context(), 0
     with written_whole(path) as file:
+        if not file.seekable():
+            raise MisuseError(f"{path}: an MCAP recording goes to a file, not a pipe; choose one")
         sink = _Sink(file)
         with open_mcap(sink, context=context):
             topics = MapTopics(context)
