@@ -328,6 +328,24 @@ def test_pixels_are_scaled_channel_by_channel(rgb: bool) -> None:
         assert out[n, c, y, x] == pytest.approx((value - mean[c]) / std[c], abs=1e-5)
 
 
+class _Interrupted:
+    """Imports as pybind11 does where Ctrl-C comes meanwhile."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "onnxruntime":
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+
+
+def test_ctrl_c_while_onnxruntime_is_imported_is_no_missing_library(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = mean_colour_encoder(folder / "interrupted.onnx")
+    monkeypatch.delitem(sys.modules, "onnxruntime", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [_Interrupted(), *sys.meta_path])
+    with pytest.raises(KeyboardInterrupt):
+        OnnxModel(model)
+
+
 def test_a_missing_library_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = mean_colour_encoder(folder / "extra.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)

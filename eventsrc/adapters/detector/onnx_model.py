@@ -144,7 +144,9 @@ def _onnxruntime() -> tuple[Any, tuple[type[Exception], ...]]:
     try:
         import onnxruntime
         from onnxruntime.capi import onnxruntime_pybind11_state as state
-    except ImportError:
+    except ImportError as error:
+        if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None  # in the import, where pybind11 hides it
         raise MisuseError(
             "ONNX models need onnxruntime; install mapfold with the extra detector: "
             "pip install 'mapfold[detector]'"
