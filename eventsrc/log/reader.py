@@ -2,7 +2,8 @@
 
 A reader yields durable events only: of the growing segment, the chunks with a commit mark. It takes
 no lock and can read while a writer writes, rotates and seals. At damage it yields every event
-before it and raises LogDamaged; with ``on_gap`` it reports what is missing and continues.
+before it and raises LogDamaged; with ``on_gap`` it reports what is missing and continues. A log
+whose last segment cannot be opened is read up to there, and raises when its end is asked for.
 """
 
 import contextlib
@@ -23,7 +24,7 @@ from .active_file import ActiveFile
 from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from .log_identity import mixed_logs_message
-from .sealed_end import sealed_end, sealed_end_of
+from .sealed_end import SealedEnd, sealed_end, sealed_end_of
 from .sealed_segment import SealedFile
 from .segment import Unreadable, chunk_events
 
@@ -36,14 +37,22 @@ OnGap = Callable[[Unreadable], None]
 
 
 class _Found(NamedTuple):
-    """The segments of a log, and the last of them, open."""
+    """The segments of a log up to the last that can be opened, and that one, open."""
 
     segments: tuple[SegmentPath, ...]
     last: OpenSegment
 
 
+class _UnreadableEnd(NamedTuple):
+    """Why the end of a log cannot be read, and the last offset that it is known to have."""
+
+    error: LogError
+    last: Offset
+
+
 class LogReader:
-    """A context manager over an existing log. Raises LogNotFound, NotALog or LogDamaged.
+    """A context manager over an existing log. Raises LogNotFound, NotALog, and LogDamaged if none
+    of its segments can be opened.
 
     Several threads may use it at once, each with iterators of its own.
     """
@@ -53,12 +62,9 @@ class LogReader:
         self._lock = threading.RLock()
         self._open: OrderedDict[int, OpenSegment] = OrderedDict()
         end = sealed_end(path)  # before the folder is listed: a writer may be active
-        segments = tuple(segments_of(path))
-        self._found = _Found(segments, _open_segment(path, segments[-1]))
+        self._found, self._unreadable_end = _open_last(path, segments_of(path), end)
         self.log_id = self._last.log_id
         """From its last segment; reading stops at a segment with another id."""
-        if end is not None and end.log_id == self.log_id:
-            end.require(path, self._last.next_offset)
 
     @property
     def _last(self) -> OpenSegment:
@@ -66,20 +72,40 @@ class LogReader:
 
     @property
     def next_offset(self) -> Offset:
-        """The number of durable events as of opening or the last `refresh`."""
+        """The number of durable events as of opening or the last `refresh`. Raises LogDamaged or
+        NotALog if the last segment cannot be read, or is not there."""
+        self._require_end()
+        return self.readable_end
+
+    @property
+    def readable_end(self) -> Offset:
+        """`next_offset`; where that raises, the offset from which on nothing can be read."""
         return self._last.next_offset
+
+    def end_for(self, until: Offset | None) -> Offset:
+        """``until``, but at most `next_offset`, which it is for None. Raises as `next_offset` if
+        that is behind `readable_end`."""
+        if until is not None and until <= self.readable_end:
+            return until
+        return self.next_offset
+
+    def _require_end(self) -> None:
+        if self._unreadable_end is not None:
+            raise self._unreadable_end.error
 
     @property
     def segments(self) -> tuple[SegmentPath, ...]:
-        """The segments as of opening or the last `refresh`, in offset order."""
+        """The segments before `readable_end` as of opening or the last `refresh`, in offset
+        order."""
         return self._found.segments
 
     def refresh(self) -> Offset:
-        """Find the commits since the last call; return the new `next_offset`."""
+        """Find the commits since the last call; return the new `next_offset`, or raise as that."""
         with self._lock:
             return self._refresh()
 
     def _refresh(self) -> Offset:
+        self._require_end()
         while True:
             if isinstance(self._last, ActiveFile):
                 self._last.refresh()
@@ -94,7 +120,7 @@ class LogReader:
                 return self.next_offset
 
     def check_end(self) -> None:
-        """Raise LogDamaged if recorded events behind `next_offset` cannot be read, and LogNotFound
+        """Raise LogDamaged if recorded events behind `readable_end` cannot be read, and LogNotFound
         if the log was deleted."""
         if not self.path.exists():
             raise LogNotFound(f"the log at {self.path} is gone; check the path")
@@ -136,12 +162,12 @@ class LogReader:
         keys: Collection[str] | None = None,
         on_gap: OnGap | None = None,
     ) -> Iterator[Event]:
-        """Events from offset ``start`` to before ``end`` (default: `next_offset` as of now).
+        """Events from offset ``start`` to before ``end`` (default: all, as of now).
 
         Raises LogDamaged where events cannot be read; with ``on_gap`` calls that instead and
         continues behind the gap.
         """
-        known = self.next_offset
+        known = self.readable_end
         stop = known if end is None else min(end, known)
         report = on_gap or _raise_at_gap(self.path)
         at = max(start, FIRST_OFFSET)
@@ -162,10 +188,20 @@ class LogReader:
         finally:
             report_progress(_READING, max(stop, 1), max(stop, 1))
         if end is None or end > known:
+            if on_gap is None:
+                self._require_end()
             self._report_damaged_end(start, report)
 
     def _report_damaged_end(self, start: Offset, report: OnGap) -> None:
-        """Report recorded events at the end of the growing segment that cannot be read any more."""
+        """Report recorded events at the end of the log that cannot be read any more."""
+        if self._unreadable_end is not None:
+            first = max(start, self.readable_end)
+            report(
+                Unreadable(
+                    first, max(first, self._unreadable_end.last), str(self._unreadable_end.error)
+                )
+            )
+            return
         with self._lock:  # it reads commits that were added meanwhile
             gap = self._last.damaged_end() if isinstance(self._last, ActiveFile) else None
         if gap is not None and gap.last >= start:
@@ -230,7 +266,7 @@ class LogReader:
                 continue
             if chunk.first >= end:
                 break
-            report_progress(_READING, chunk.first, self.next_offset)
+            report_progress(_READING, chunk.first, self.readable_end)
             if wanted is None or chunk.channels is None or not wanted.isdisjoint(chunk.channels):
                 try:
                     yield from chunk_events(segment, chunk, at, end, keys)
@@ -307,6 +343,28 @@ def _segments_of(path: Path) -> list[SegmentPath]:
             end.require(path, FIRST_OFFSET)
         raise NotALog(f"{path} holds no log segment (….mcap); check the path")
     return segments
+
+
+def _open_last(
+    log: Path, segments: list[SegmentPath], sealed: SealedEnd | None
+) -> tuple[_Found, _UnreadableEnd | None]:
+    """The last segment that can be opened, and what is wrong behind it. Raises if none can be."""
+    errors: list[LogError] = []
+    for number in range(len(segments), 0, -1):
+        try:
+            last = _open_segment(log, segments[number - 1])
+        except (LogDamaged, NotALog) as error:
+            errors.append(error)
+            continue
+        known = segments[-1].base + 1
+        if sealed is not None and sealed.log_id == last.log_id:
+            known = max(known, sealed.following)
+            missing = sealed.missing(log, last.next_offset)
+            if missing is not None:
+                errors.append(LogDamaged(missing))
+        found = _Found(tuple(segments[:number]), last)
+        return found, _UnreadableEnd(errors[0], Offset(known - 1)) if errors else None
+    raise errors[0]
 
 
 def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:

@@ -14,8 +14,8 @@ mapfold's own events are stamped when they were written, verbatim messages by cl
 and the stamps of unreadable events are unknown. All of them count as stamped like the robots' event
 before them, and at the start of the log as earlier than all. A range that ends at a time includes a
 damaged stretch if it includes the event before it or any event after it. Reading the range then
-raises LogDamaged. Only damage at the end of a growing segment, with no readable event after it, is
-reported here.
+raises LogDamaged. Only damage at the end of a log, with no readable event after it, is reported
+here.
 """
 
 import re
@@ -56,7 +56,7 @@ def resolve(
 
     ``note`` gets a line if events stamped later than a given time are included. Raises LogDamaged,
     or calls ``on_gap``, for damage before the keyframe that is looked for, and for damage at the
-    end of a growing segment if the range reaches it.
+    end of the log if the range reaches it.
     """
     if text == "end":
         return _at_end(reader, on_gap)
@@ -112,14 +112,14 @@ def resolve_start(reader: LogReader, text: str, *, on_gap: OnGap | None = None) 
     if time_ns is not None:
         events = (e for e in reader.read(on_gap=on_gap) if e.is_envelope)
         later = (e.offset for e in events if e.stamp_ns >= time_ns)
-        return next(later, reader.next_offset)
+        return next(later, reader.readable_end)
     count = resolve(reader, text, on_gap=on_gap)
     return count if text == "end" or text.isdecimal() else Offset(count - 1)
 
 
 def _checked_offset(reader: LogReader, text: str) -> Offset:
     offset = Offset(whole_number(text))
-    if offset > reader.next_offset:
+    if offset > reader.end_for(offset):
         raise MisuseError(
             f"{_shown(text)} is beyond the end of {reader.path}, which holds "
             f"{counted(reader.next_offset, 'event')}; use end"
@@ -157,15 +157,15 @@ def _at_time(reader: LogReader, time_ns: int, on_gap: OnGap | None) -> tuple[Off
             later += not in_time
         if in_time:
             included, later_included = event.offset + 1, later
-    if included > reader.next_offset:
+    if included > reader.readable_end:
         return _at_end(reader, on_gap), later_included
     return Offset(included), later_included
 
 
 def _at_end(reader: LogReader, on_gap: OnGap | None) -> Offset:
-    """The end of the log; reading from there reports events that the growing segment has lost."""
-    list(reader.read(reader.next_offset, on_gap=on_gap))
-    return reader.next_offset
+    """The end of the log; reading from there reports events that its last segment has lost."""
+    list(reader.read(reader.readable_end, on_gap=on_gap))
+    return reader.readable_end
 
 
 def _at_keyframe(

@@ -47,7 +47,7 @@ def checked_end(reader: LogReader, end: Offset | None) -> Offset:
     """``end``, the end of the log for None. Raises LogPointError for one beyond the log."""
     if end is None:
         return reader.next_offset
-    if not 0 <= end <= reader.next_offset:
+    if not 0 <= end <= reader.end_for(end):
         raise LogPointError(
             f"{end} is no point in {reader.path}, which holds "
             f"{counted(reader.next_offset, 'event')}; give 0 to {reader.next_offset}"
@@ -106,7 +106,7 @@ class KnownHistory:
         """The history of all that can be read and folded, for a question about the map after
         ``end`` events. Raises FoldError, LogDamaged for an event before ``end`` only."""
         try:
-            return self.history
+            return self._history_of(self.reader.readable_end)
         except (FoldError, LogDamaged):
             if not self._recorder.has(end):
                 raise

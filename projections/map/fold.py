@@ -136,7 +136,7 @@ def fold_log_cached(
     Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is
     called with a message for each snapshot that could not be used or kept; the result is the same.
     """
-    end = reader.next_offset if until is None else min(until, reader.next_offset)
+    end = reader.end_for(until)
     cache = SnapshotCache(reader.path, reader.log_id, settings, note, corrections=corrections)
     semantic_map, view = cache.latest(end) or (
         SemanticMap(settings, corrections),

@@ -138,7 +138,7 @@ def refuse_other_events(
     found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, advice: str
 ) -> None:
     """Raise ProjectionMismatch unless the log still has the events of a checkpoint."""
-    if found.next_offset > reader.next_offset:
+    if found.next_offset > reader.end_for(found.next_offset):
         raise ProjectionMismatch(
             f"{where}: {found.next_offset:,} events are in the {sink} there, but {log} has only"
             f" {reader.next_offset:,}; {advice}"

@@ -93,7 +93,7 @@ def rebuild(
     if workers is None:
         workers = default_workers()
     with gc_paused(), LogReader(log) as reader:
-        total = reader.next_offset if until is None else min(until, reader.next_offset)
+        total = reader.end_for(until)
         inputs = LogInputs.read(reader, settings, total if known_at is None else known_at).latest
         fold = LiveFold(inputs.settings, corrections=inputs.corrections, reader=reader)
         folded_at = started

@@ -99,7 +99,7 @@ class HistoryRecorder:
 
     def _opened(self) -> _Folded:
         if self._folded is None:
-            found = self._cache.stripes(self._reader.next_offset) if self._cache else []
+            found = self._cache.stripes(self._reader.readable_end) if self._cache else []
             self._folded = self._of(found)
         return self._folded
 
@@ -153,7 +153,7 @@ class HistoryRecorder:
         # With a reader of its own: a map may be looked at after its timeline was closed.
         with LogReader(self._reader.path) as reader:
             again = HistoryRecorder(reader, self._settings, self._corrections, None, self._progress)
-            if reader.log_id != self._reader.log_id or reader.next_offset < end:
+            if reader.log_id != self._reader.log_id or reader.end_for(end) < end:
                 raise LogError(
                     f"{damage}, and the log at {reader.path} is another one now or has lost events;"
                     " open it again"

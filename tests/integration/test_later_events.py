@@ -5,16 +5,19 @@ import json
 import os
 import re
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.commands import Reembed, UseSettings
 from eventsrc.envelope.model import DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
-from eventsrc.log import NEVER, LogReader, LogWriter
+from eventsrc.log import NEVER, LogReader, LogWriter, Unreadable
+from eventsrc.log.tail import follow
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
@@ -94,6 +97,55 @@ def _lost(log: Path) -> None:
     sorted(log.glob("*.mcap"))[-2].unlink()
 
 
+def _last_sealed(log: Path) -> Path:
+    """A segment with events behind those that the log had."""
+    write_log(log, [envelope(number, 0.5) for number in range(60, 70)])
+    return _newest(log, ".mcap")
+
+
+def _cut(log: Path) -> None:
+    last = _last_sealed(log)
+    os.truncate(last, last.stat().st_size * 2 // 3)
+
+
+def _emptied(log: Path) -> None:
+    os.truncate(_last_sealed(log), 0)
+
+
+def _garbage(log: Path) -> None:
+    last = _last_sealed(log)
+    last.write_bytes(os.urandom(last.stat().st_size))
+
+
+def _index_rotten(log: Path) -> None:
+    last = _last_sealed(log)
+    content = bytearray(last.read_bytes())
+    content[-60] ^= 0xFF
+    last.write_bytes(content)
+
+
+def _last_lost(log: Path) -> None:
+    """`.sealed.json` says that there was another segment behind."""
+    _last_sealed(log).unlink()
+
+
+def _two_cut(log: Path) -> None:
+    for first in (60, 70):
+        write_log(log, [envelope(number, 0.5) for number in range(first, first + 10)])
+    for segment in sorted(log.glob("*.mcap"))[-2:]:
+        os.truncate(segment, segment.stat().st_size * 2 // 3)
+
+
+UNREADABLE_ENDS: dict[str, Callable[[Path], None]] = {
+    "cut": _cut,
+    "last lost": _last_lost,
+    "emptied": _emptied,
+    "garbage": _garbage,
+    "index rotten": _index_rotten,
+    "two cut": _two_cut,
+}
+"""What makes the end of a log unreadable: the last segment that was sealed."""
+
 HINDRANCES: dict[str, tuple[Callable[[Path], None], bool]] = {
     "unfoldable": (lambda log: append_raw(log, b'{"run_id": "broken"}'), True),
     "torn": (_torn, True),
@@ -105,6 +157,7 @@ HINDRANCES: dict[str, tuple[Callable[[Path], None], bool]] = {
     "no command": (lambda log: append_raw(log, b'{"kind": "later"}', key=COMMAND_KEY), False),
     "correction": (_correction, False),
     "false vectors": (_false_vectors, False),
+    **{name: (spoil, False) for name, spoil in UNREADABLE_ENDS.items()},
 }
 """What comes after W, and whether the commands behind it can be read."""
 
@@ -172,7 +225,7 @@ def test_an_answer_does_not_depend_on_later_events(
     shutil.copytree(before, tmp_path, dirs_exist_ok=True)
     hinder(tmp_path / "log")
     with LogReader(tmp_path / "log") as reader:
-        last = reader.next_offset
+        last = reader.readable_end
     assert last >= EVENTS
     differing = []
     for name in QUESTIONS:
@@ -188,7 +241,9 @@ def test_an_answer_does_not_depend_on_later_events(
     assert not differing
 
 
-@pytest.mark.parametrize("hindrance", mostly_slow(["no command", "unfoldable", "rotten"]))
+@pytest.mark.parametrize(
+    "hindrance", mostly_slow(["no command", "unfoldable", "rotten", "cut", "last lost"])
+)
 def test_a_replay_to_w_does_not_depend_on_later_events(
     before: Path, tmp_path: Path, hindrance: str, one_database: Targets
 ) -> None:
@@ -196,3 +251,37 @@ def test_a_replay_to_w_does_not_depend_on_later_events(
     expected = rebuild(log, one_database, Settings(), until=Offset(W), workers=0).digest
     HINDRANCES[hindrance][0](log)
     assert rebuild(log, one_database, Settings(), until=Offset(W), workers=0).digest == expected
+
+
+@pytest.mark.parametrize("spoil", mostly_slow(UNREADABLE_ENDS.values()))
+def test_the_end_of_a_log_that_cannot_be_read_is_refused(
+    before: Path, tmp_path: Path, spoil: Callable[[Path], None]
+) -> None:
+    log = shutil.copytree(before / "log", tmp_path / "log")
+    spoil(log)
+    with LogReader(log) as reader:
+        assert reader.readable_end == reader.end_for(Offset(EVENTS)) == EVENTS
+        gaps: list[Unreadable] = []
+        assert len(list(reader.read(on_gap=gaps.append))) == EVENTS
+        assert [gap.first for gap in gaps] == [EVENTS]
+        assert gaps[0].last == EVENTS + (19 if spoil is _two_cut else 9)
+        for ask in (
+            lambda: reader.next_offset,
+            lambda: reader.end_for(None),
+            lambda: reader.end_for(Offset(EVENTS + 1)),
+            lambda: list(reader.read()),
+            lambda: list(reader.read(end=Offset(EVENTS + 1))),
+            reader.refresh,
+            reader.check_end,
+            lambda: next(follow(log, Offset(EVENTS), stop=threading.Event())),
+            lambda: LogWriter(log, fsync=NEVER),
+        ):
+            with pytest.raises((LogDamaged, NotALog)):
+                ask()
+    run = Commands.in_folder(tmp_path)
+    for name in ("state", "merges"):
+        assert _said(tmp_path, name) == _said(before, name)
+    for command_line in ("state log", "merges log", "diff log 9 end", "log info log"):
+        said = run(*command_line.split(), code=None)
+        assert said.code in (1, 2)
+        assert (said.out, "log recover" in said.err) == ("", True)

@@ -46,7 +46,7 @@ def check_lost(log: Path, before: list[Event]) -> int:
     """All commands say that events are missing; recovery marks just these. How many."""
     gaps = [f for f in verify_log(log).findings if f.kind == "gap"]
     lost = {n for f in gaps for n in range(f.first_offset or 0, (f.last_offset or 0) + 1)}
-    for use in (LogReader, LogWriter, log_info):
+    for use in (read_log, LogWriter, log_info):
         with pytest.raises(LogDamaged, match="mapfold log recover"):
             use(log)
     report = recover_log(log)

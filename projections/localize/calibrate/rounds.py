@@ -146,7 +146,7 @@ def calibrate(
     """Calibrate the map of a log's first ``until`` events, all of them for None; folded by
     evidence whatever rule the settings name. ``progress`` is called with the number of events
     folded and the number to fold, both over all rounds. Raises FoldError, LogDamaged."""
-    end = reader.next_offset if until is None else min(until, reader.next_offset)
+    end = reader.end_for(until)
     before = 0
 
     def fold(used: Settings) -> tuple[MapView, Cameras]:

@@ -187,7 +187,7 @@ def cat(
         on_gap = note if skip_damage else None
         start = resolve_start(reader, from_, on_gap=on_gap)
         end = _end(reader, to, start, on_gap)
-        last = reader.next_offset if end is None else end
+        last = reader.readable_end if end is None else end
         if start > last:
             raise MisuseError(f"--from {from_} (offset {start}) is after --to {to} (offset {last})")
         notes = RangeNotes(from_, to, key or ())

@@ -28,12 +28,18 @@ class PrefixReader(LogReader):
     @property
     def next_offset(self) -> Offset:
         """The number of events up to the limit."""
-        return min(super().next_offset, self.limit)
+        return self.limit if self.is_limited else super().next_offset
+
+    @property
+    def readable_end(self) -> Offset:
+        """The number of events up to the limit and before those that cannot be read."""
+        return min(super().readable_end, self.limit)
 
     @property
     def is_limited(self) -> bool:
         """Whether the log has events beyond the limit."""
-        return self._last.next_offset > self.limit
+        end = super().readable_end
+        return self.limit < end or (self.limit == end and self._unreadable_end is not None)
 
     def refresh(self) -> Offset:
         """Find what was committed since; the new `next_offset`."""
