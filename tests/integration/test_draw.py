@@ -1,6 +1,7 @@
 """`mapfold draw` on a log of a simulated run."""
 
 import os
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from eventsrc.log import LogWriter
 from eventsrc.record.append import append_payload
 from tests.commands import Commands, Said
+from tests.envelopes import envelope
+from tests.logs import write_log
 from tests.simulated import simulated
 from tests.thorough import mostly_slow
 
@@ -74,3 +77,14 @@ def test_misuse_is_one_line_and_exit_2(log: Path, arguments: tuple[str, ...], sa
     assert done.code == 2
     assert says in done.err
     assert "Traceback" not in done.err
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("kind", ["svg", "pdf"])
+def test_names_that_a_format_cannot_hold_are_drawn(tmp_path: Path, kind: str) -> None:
+    frames = [envelope(k, 0.1 * k) for k in range(4)]
+    log, out = write_log(tmp_path / "log\ufeff\ufffe", frames), tmp_path / f"map.{kind}"
+    done = _draw(str(log), "--out", str(out))
+    assert done.code == 0, done.err
+    if kind == "svg":
+        assert "log\ufffd\ufffd" in "".join(ET.parse(out).getroot().itertext())

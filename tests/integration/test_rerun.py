@@ -224,3 +224,17 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
     monkeypatch.delattr("projections.adapters.rerun.recording", raising=False)
     with pytest.raises(MisuseError, match=r"--rerun needs rerun.*pip install 'mapfold\[rerun\]'"):
         _recorder("rerun", "")
+
+
+def test_an_interrupted_recording_ends_and_leaves_no_file(tmp_path: Path) -> None:
+    from projections.adapters.rerun.recording import write_recording
+
+    def interrupt(offset: int, _: int) -> None:
+        if offset == 300:
+            raise KeyboardInterrupt
+
+    with LogReader(SAMPLE) as reader:
+        fold = RecordedFold(reader, SETTINGS, reader.next_offset, progress=interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            write_recording(fold, tmp_path / "map.rrd", "test")
+    assert [*tmp_path.iterdir()] == []

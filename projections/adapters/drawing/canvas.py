@@ -3,12 +3,14 @@
 Each place has a colour of its own; the rest of the picture is grey.
 """
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import Final
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -87,6 +89,11 @@ class Canvas:
     def _take_texts_literally(self) -> None:
         for text in self.figure.findobj(Text):
             text.set_parse_math(False)  # a class may be called "$5 bill$"
+            text.set_text(_UNDRAWABLE.sub("\ufffd", text.get_text()))
+
+
+_UNDRAWABLE: Final = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufeff\ufffe\uffff]")
+"""What SVG, being XML, cannot hold, and the byte order mark, on which matplotlib's PDF fails."""
 
 
 @contextmanager

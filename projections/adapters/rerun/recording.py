@@ -72,9 +72,11 @@ def write_recording(fold: RecordedFold, path: File, recording_id: str) -> int:
         recording.set_log_tick_enabled(False)
         with written_whole(path) as file, _copied_to(file) as pipe:
             recording.save(pipe, default_blueprint=_blueprint())
-            scenes = _record(fold, recording)
-            recording.flush()
-            recording.disconnect()
+            try:
+                scenes = _record(fold, recording)
+                recording.flush()
+            finally:
+                recording.disconnect()  # closes the pipe, for whose end `_copied_to` waits
     finally:
         rerun.set_strict_mode(was_strict)
     return scenes

@@ -6,6 +6,7 @@ from . import (
     bombs,
     connections,
     damage,
+    exports,
     exposure,
     files,
     inputs,
@@ -38,5 +39,6 @@ ATTACKS: dict[str, Attack] = {
     "projections": projections.attack,
     "exposure": exposure.attack,
     "workers": workers.attack,
+    "exports": exports.attack,
 }
 """In the order in which they are played."""
