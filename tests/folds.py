@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,6 +15,7 @@ from projections.fold.deltas import Delta
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.view import MapView
+from projections.store.state_file import pack, unpack
 
 from .envelopes import payload
 
@@ -57,6 +59,19 @@ class Folded:
     def all(self, kind: type) -> list[Any]:
         """All deltas of a type, in order."""
         return [delta for deltas in self.deltas for delta in deltas if type(delta) is kind]
+
+
+def state_bytes(folded: Folded) -> bytes:
+    """The state of a fold as a kept history has it."""
+    return pack(folded.map.dump())
+
+
+def resumed(folded: Folded) -> Folded:
+    """The fold out of its `state_bytes`, with a copy of the view and no deltas yet."""
+    again = SemanticMap(folded.map.settings, folded.map.corrections)
+    again.load(unpack(state_bytes(folded)))
+    again.use_names(again.next_offset, again.corrections)
+    return Folded(again, deepcopy(folded.view), [])
 
 
 def fold(documents: Iterable[dict[str, Any]], **settings: Any) -> Folded:

@@ -1,6 +1,6 @@
-"""The folders of caches beside a log: ``<log>.history`` and ``<log>.snapshots``.
+"""The folder of caches beside a log: ``<log>.history``.
 
-They are not part of the log and safe to delete at any time. They hold the log's data, so their
+It is not part of the log and safe to delete at any time. It holds the log's data, so its
 permissions are at most those of the log.
 """
 
@@ -9,29 +9,27 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, Final, Literal, get_args
+from typing import BinaryIO, Final
 
 from eventsrc.base.clock import system_clock
 
-CacheKind = Literal["history", "snapshots"]
-_KINDS: Final[tuple[CacheKind, ...]] = get_args(CacheKind)
 _OWNER: Final = 0o700
 _OTHERS: Final = 0o077
 _UNFINISHED: Final = ".new"
 _LEFT_OVER_S: Final = 3_600.0
 
 
-def cache_folder(log: Path, kind: CacheKind) -> Path:
-    """The path of a cache folder, which may not exist. For a log given as ``.`` or ``..`` it is
+def cache_folder(log: Path) -> Path:
+    """The path of the folder, which may not exist. For a log given as ``.`` or ``..`` it is
     beside the folder that these name."""
     named = log.resolve() if log.name in ("", "..") else log
-    return named.parent / f"{named.name}.{kind}"
+    return named.parent / f"{named.name}.history"
 
 
-def make_cache_folder(log: Path, kind: CacheKind) -> Path:
+def make_cache_folder(log: Path) -> Path:
     """Create `cache_folder` if it does not exist, with no more permissions for group and others
     than the log has; return its path. Raises OSError."""
-    folder = cache_folder(log, kind)
+    folder = cache_folder(log)
     folder.mkdir(mode=_OWNER | (log.stat().st_mode & _OTHERS), exist_ok=True)
     return folder
 
@@ -62,13 +60,11 @@ def delete_left_over_files(folder: Path) -> None:
 
 
 def cache_sizes(log: Path) -> list[tuple[Path, int]]:
-    """Each cache folder that exists and can be read, with the total size of its files in bytes."""
-    sizes = []
-    for kind in _KINDS:
-        folder = cache_folder(log, kind)
-        with contextlib.suppress(OSError):
-            sizes.append((folder, sum(map(_size, folder.iterdir()))))
-    return sizes
+    """The folder with the total size of its files in bytes, if it exists and can be read."""
+    folder = cache_folder(log)
+    with contextlib.suppress(OSError):
+        return [(folder, sum(map(_size, folder.iterdir())))]
+    return []
 
 
 def _size(path: Path) -> int:

@@ -17,7 +17,7 @@ from projections.history import NoSuchThing
 from projections.map.log_commands import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
-from projections.store.history_recorder import HistoryRecorder
+from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.records import Merge
 from projections.store.timeline_cache import TimelineCache
 
@@ -69,17 +69,7 @@ class CurrentMap:
 
     def fold(self, corrections: Corrections, settings: Settings) -> MapView:
         """The map under other corrections or settings."""
-        if corrections is self.corrections and settings == self.settings:
-            return self._own.at(self.end)
-        return self._recorder(corrections, settings).at(self.end)
-
-    @cached_property
-    def _own(self) -> HistoryRecorder:
-        return self._recorder(self.corrections, self.settings)
-
-    def _recorder(self, corrections: Corrections, settings: Settings) -> HistoryRecorder:
-        cache = TimelineCache(self.reader, settings, corrections, self.note)
-        return HistoryRecorder(self.reader, settings, corrections, cache, None)
+        return map_after(self.reader, settings, self.end, corrections=corrections, note=self.note)
 
     @property
     def view(self) -> MapView:
@@ -95,7 +85,9 @@ class CurrentMap:
     @cached_property
     def merges(self) -> list[Merge]:
         """Every merge of places, in order."""
-        merges = self._own.history(self.end).merges
+        cache = TimelineCache(self.reader, self.settings, self.corrections, self.note)
+        recorder = HistoryRecorder(self.reader, self.settings, self.corrections, cache, None)
+        merges = recorder.history(self.end).merges
         return [merge for merge in merges if merge.cause.offset < self.end]
 
     @cached_property

@@ -125,7 +125,7 @@ def _differing(first: dict[Any, Any], second: dict[Any, Any]) -> set[Any]:
 
 
 class EffectCache:
-    """A cache of effects: ``<log>.snapshots/effects.json``, safe to delete. Its keys are those of
+    """A cache of effects: ``<log>.history/effects.json``, safe to delete. Its keys are those of
     `effect_keys`."""
 
     def __init__(self, current: CurrentMap) -> None:
@@ -133,7 +133,7 @@ class EffectCache:
         log = current.reader.path
         self._log_id = current.reader.log_id
         self._log = log
-        self._path = cache_folder(log, "snapshots") / _CACHE
+        self._path = cache_folder(log) / _CACHE
         self._effects = self._read()
 
     def get(self, key: str) -> Effect | None:
@@ -146,7 +146,7 @@ class EffectCache:
         document = {"version": _VERSION, "log_id": self._log_id, "effects": self._effects}
         data = json.dumps(document).encode()
         try:
-            make_cache_folder(self._log, "snapshots")
+            make_cache_folder(self._log)
             write_cache_file(self._path, lambda file: file.write(data))
         except OSError as error:
             self._note(f"{self._path}: no effect was kept: {error.strerror}")

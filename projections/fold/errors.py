@@ -58,7 +58,7 @@ class FoldInterrupted(MapfoldError):
     def __init__(self, next_offset: Offset) -> None:
         super().__init__(
             f"this fold was interrupted at the event at offset {next_offset - 1}; fold the log"
-            " again from its start or from a snapshot"
+            " again from its start or from a kept fold"
         )
 
 

@@ -108,7 +108,7 @@ class KnownHistory:
         try:
             return self._history_of(self.reader.readable_end)
         except (FoldError, LogDamaged):
-            if not self._recorder.has(end):
+            if self._recorder.end < end:
                 raise
         return self._history_of(end)
 
@@ -123,16 +123,18 @@ class KnownHistory:
         history, unless one was kept; from then on it is a look-up.
         """
         wanted = self._checked(end)
-        if not self._recorder.has(wanted):
+        if self._recorder.end < wanted:
             self.covering(wanted)  # folds the whole log, not only up to ``wanted``
         return self._recorder.at(wanted)
 
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None
     ) -> Iterator[FoldedEvent]:
-        """The deltas of each event from ``start`` to before ``end``, by a separate fold."""
-        semantic_map = new_map(self.reader, self.settings, self.corrections)
-        events = self.reader.read(FIRST_OFFSET, self._checked(end))
+        """The deltas of each event from ``start`` to before ``end``, by a separate fold from the
+        nearest kept one."""
+        kept = self._recorder.fold_before(self._checked(start))
+        semantic_map = kept or new_map(self.reader, self.settings, self.corrections)
+        events = self.reader.read(semantic_map.next_offset, self._checked(end))
         folded = fold_events(events, semantic_map, ahead=READ_AHEAD)
         return (event for event in folded if event.offset >= start)
 

@@ -1,1 +1,1 @@
-"""The map as data: the view, its digest, snapshots, the fold of a log, exports."""
+"""The map as data: the view, its digest, the fold of a log, exports."""

@@ -1,6 +1,6 @@
 """Folding a log: reads and validates events, and passes them to the pure fold."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged
@@ -19,14 +19,11 @@ from .parsing import READ_AHEAD as READ_AHEAD
 from .parsing import ParsedEvent as ParsedEvent
 from .parsing import parse_events as parse_events
 from .parsing import parsed_stretches
-from .snapshot_cache import SnapshotCache
-from .space_vectors import new_map, with_vectors
+from .space_vectors import new_map
 from .view import MapView
 
 _MOST_AHEAD = 1024
 """Events read ahead where poses are corrected together; they take 20 MB."""
-SNAPSHOT_MIN_EVENTS = 5_000
-"""Events; folding fewer takes about as long as reading a snapshot of them."""
 
 
 class FoldedEvent(NamedTuple):
@@ -119,40 +116,14 @@ def fold_log(
     """Fold the first ``until`` events of a log, all of them for None."""
     semantic_map = new_map(reader, settings, corrections)
     view = MapView(settings, keep_embeddings=keep_embeddings, corrections=corrections)
-    _fold_into(reader, semantic_map, view, until)
+    fold_into(reader, semantic_map, view, until)
     return semantic_map, view
 
 
-def fold_log_cached(
-    reader: LogReader,
-    settings: Settings,
-    until: Offset | None = None,
-    *,
-    note: Callable[[str], None] = lambda _: None,
-    corrections: Corrections = NO_CORRECTIONS,
-) -> tuple[SemanticMap, MapView]:
-    """`fold_log` without embeddings, from the nearest snapshot beside the log.
-
-    Keeps a snapshot of the result if it had to fold `SNAPSHOT_MIN_EVENTS` or more. ``note`` is
-    called with a message for each snapshot that could not be used or kept; the result is the same.
-    """
-    end = reader.end_for(until)
-    cache = SnapshotCache(reader.path, reader.log_id, settings, note, corrections=corrections)
-    semantic_map, view = cache.latest(end) or (
-        SemanticMap(settings, corrections),
-        MapView(settings, keep_embeddings=False, corrections=corrections),
-    )
-    with_vectors(semantic_map, reader)
-    start = semantic_map.next_offset
-    _fold_into(reader, semantic_map, view, end)
-    if end - start >= SNAPSHOT_MIN_EVENTS:
-        cache.keep(semantic_map, view)
-    return semantic_map, view
-
-
-def _fold_into(
+def fold_into(
     reader: LogReader, semantic_map: SemanticMap, view: MapView, until: Offset | None
 ) -> None:
+    """Fold on up to ``until`` events of a log, all of them for None."""
     events = reader.read(semantic_map.next_offset, until)
     with gc_paused():
         for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):

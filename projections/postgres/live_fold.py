@@ -13,6 +13,7 @@ from projections.map.fold import fold_events, fold_parsed
 from projections.map.parsing import READ_AHEAD, ParsedEvent
 from projections.map.space_vectors import with_vectors
 from projections.map.view import MapView
+from projections.store.column_rows import TableWriter
 
 
 class LiveFold:
@@ -29,8 +30,10 @@ class LiveFold:
         *,
         corrections: Corrections = NO_CORRECTIONS,
         reader: LogReader | None = None,
+        writer: TableWriter | None = None,
     ) -> None:
-        """``start`` is the fold and view of a snapshot; by default nothing is folded yet.
+        """``start`` is a fold that was kept and its view; by default nothing is folded yet.
+        ``writer`` is given the deltas of events that are fed, none skipped, from its end on.
         ``reader`` reads the log that is folded, which may have vectors of the map's space beside
         those in envelopes. Raises FoldError, LogDamaged."""
         self.map, self.view = start or (
@@ -40,6 +43,7 @@ class LiveFold:
         if reader is not None:
             with_vectors(self.map, reader)
         self.tracker = ChangeTracker(self.view)
+        self.writer = writer
 
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:
         """Fold events in order, a step for each: None, or why it failed.
@@ -55,6 +59,8 @@ class LiveFold:
                 for folded in fold_events(events[start:], self.map, ahead=READ_AHEAD):
                     event = next(waiting)
                     self.tracker.apply_event(event.offset, folded.deltas, event.logged_ns)
+                    if self.writer is not None and event.offset >= self.writer.end:
+                        self.writer.add(event.offset, folded.deltas)
                     start += 1
                     yield None
             except FoldError as error:
@@ -72,12 +78,14 @@ class LiveFold:
         """Apply the names of ``corrections``; the event at ``offset`` changed nothing else in them.
         The event must have been fed or skipped. Raises ValueError."""
         self._check_whole()
+        self.writer = None  # what follows is of other corrections
         self.tracker.apply_names(self.map.use_names(offset, corrections))
         self.view.corrections = corrections
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that is left out."""
         self._check_whole()
+        self.writer = None
         self.map.skip(offset)
         self.view.advance(Offset(offset + 1))
 

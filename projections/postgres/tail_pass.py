@@ -14,9 +14,10 @@ from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader, event_hash, follow
 from projections.fold.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.fold.settings import Settings
-from projections.map.fold import SNAPSHOT_MIN_EVENTS
 from projections.map.log_commands import read_command
-from projections.map.snapshot_cache import SnapshotCache
+from projections.store.column_rows import TableWriter
+from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
+from projections.store.timeline_cache import TimelineCache
 
 from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter
@@ -62,7 +63,8 @@ class TailPass:
     """From the checkpoints to the end of the log, or for as long as it grows.
 
     Call `run`. ``current`` are the inputs of the map. ``parked`` has all dead letters by offset,
-    ``letters`` those that are to be written with the next batch.
+    ``letters`` those that are to be written with the next batch. ``recorder`` keeps what is
+    folded.
     """
 
     plan: TailPlan
@@ -74,6 +76,7 @@ class TailPass:
     parked: dict[Offset, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
     began: bool = False
+    recorder: HistoryRecorder | None = None
 
     def run(self, reader: LogReader) -> None:
         """Follow the log, and refold when commands make it necessary.
@@ -160,16 +163,8 @@ class TailPass:
 
         ``folded`` is the fold that the databases were made with just now.
         """
-        plan, current = self.plan, self.current
-        cache = SnapshotCache(
-            plan.log, reader.log_id, current.settings, plan.note, corrections=current.corrections
-        )
-        fold = folded or LiveFold(
-            current.settings,
-            cache.latest(self._snapshot_limit()),
-            corrections=current.corrections,
-            reader=reader,
-        )
+        plan = self.plan
+        fold = folded or self._resumed(reader)
         start = fold.map.next_offset
         writers = self._writers()
         last_beat = time.monotonic()
@@ -189,9 +184,26 @@ class TailPass:
                     writer.write_heartbeat()
             if plan.once and plan.stop.is_set():
                 break
-        if fold.map.next_offset - start >= SNAPSHOT_MIN_EVENTS and not self.parked:
-            cache.keep(fold.map, fold.view)
+        self._keep(fold)
         return True
+
+    def _resumed(self, reader: LogReader) -> LiveFold:
+        """The fold to go on with, from the latest one that was kept below the checkpoints."""
+        current, note = self.current, self.plan.note
+        settings, corrections = current.settings, current.corrections
+        cache = TimelineCache(reader, settings, corrections, note)
+        self.recorder = HistoryRecorder(reader, settings, corrections, cache, None)
+        found = resumed_under_other_names(reader, settings, corrections, self._fold_limit(), note)
+        writer: TableWriter | None = self.recorder.writer()
+        if found is not None and found[0].next_offset > self.recorder.end:  # of other names
+            writer = None
+        return LiveFold(settings, found, corrections=corrections, reader=reader, writer=writer)
+
+    def _keep(self, fold: LiveFold) -> None:
+        """Keep the history that was folded, to go on from the next time."""
+        if self.recorder is not None and fold.writer is not None:
+            self.recorder.keep(fold.writer, fold.map)
+            fold.writer = None
 
     def _knows(self, batch: Sequence[Event]) -> bool:
         """Record the commands of a batch; False when they change more than names."""
@@ -228,9 +240,9 @@ class TailPass:
         """Batches end there, so that a sink gets a batch as a whole or not at all."""
         return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
 
-    def _snapshot_limit(self) -> Offset:
-        """The highest offset a snapshot to start from may have: the lowest checkpoint or parked
-        event. A later snapshot, kept by another command, may have folded the parked event."""
+    def _fold_limit(self) -> Offset:
+        """The highest offset a fold to start from may have: the lowest checkpoint or parked event.
+        A later one, kept by another command, may have folded the parked event."""
         return min([c.next_offset for c in self.checkpoints.values()] + list(self.parked))
 
     def _begin(self, reader: LogReader) -> bool:
@@ -360,4 +372,5 @@ class TailPass:
         known = self.inputs.at(known_at)
         if self.current.differs_only_in_names(known):
             self.current = known
+            self._keep(fold)
             fold.use_names(offset, known.corrections)

@@ -38,6 +38,8 @@ from .columns import STRIPE_EVENTS, Stripe, stripe_of
 from .records import EdgeChange, Merge, ObjectMerge, Refusal, cause_of
 from .tables import Tables, last_rows
 
+SHORT_STRIPE_EVENTS: Final = 4_096
+"""Events of a stripe that is joined with others before it is written."""
 Row = Sequence[Any]
 Pair = tuple[PlaceOrdinal, PlaceOrdinal]
 
@@ -90,14 +92,16 @@ _ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
 
 
 class TableWriter:
-    """Makes the rows of the events after those of ``tables``, in stripes of `STRIPE_EVENTS`.
+    """Makes the rows of the events after those of ``tables``, in stripes of `STRIPE_EVENTS`; in
+    ``short`` ones they take less memory until they are written.
 
     ``end`` is the number of events whose rows are complete; an exception in the midst of an event
     leaves it before that event.
     """
 
-    def __init__(self, tables: Tables) -> None:
+    def __init__(self, tables: Tables, *, short: bool = False) -> None:
         self.end = self._start = tables.end
+        self._stripe_events = SHORT_STRIPE_EVENTS if short else STRIPE_EVENTS
         self._stripes: list[Stripe] = []
         moved = tables.column("moved", "object")
         last = last_rows(moved, tables.count("found"))
@@ -135,7 +139,7 @@ class TableWriter:
         for merge in merges:
             self._places_merged(offset, deltas, merge, moves, links)
         end = Offset(offset + 1)
-        if end - self._start == STRIPE_EVENTS:
+        if end - self._start == self._stripe_events:
             self._end_stripe(end)
         self.end = end
 

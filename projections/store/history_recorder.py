@@ -9,20 +9,21 @@ any moment. A fold raises its ``next_offset`` before an event changes it, and a 
 then are fold and tables kept, both by one assignment. Until then there are the tables from before.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final, NamedTuple, TypeAlias
 
 from eventsrc.base.errors import LogError
 from eventsrc.base.garbage import gc_paused
+from eventsrc.envelope.commands import NamePlace
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
-from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
 from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, fold_log, parse_events
+from projections.map.fold import READ_AHEAD, fold_events, fold_into, fold_log, parse_events
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 
@@ -85,14 +86,30 @@ class HistoryRecorder:
         with gc_paused():
             return StoredView(history, end, self._cache, vectors)
 
-    def has(self, end: Offset) -> bool:
-        """Whether ``end`` events are folded, or in the cache."""
-        return end <= self._opened().tables.end
+    def resumed(self, limit: Offset) -> tuple[SemanticMap, StoredView] | None:
+        """The latest cached fold of at most ``limit`` events, and its map; None if there is none.
+        Both are the caller's to fold on, with a `writer` to keep the history of what follows."""
+        found = self.fold_before(Offset(min(limit, self._opened().tables.end)))
+        return None if found is None else (found, self.at(found.next_offset))
+
+    def writer(self) -> TableWriter:
+        """A writer of the rows that are missing, of which `keep` makes a part of the cache."""
+        return TableWriter(self._opened().tables, short=True)
+
+    def keep(self, writer: TableWriter, semantic_map: SemanticMap) -> None:
+        """Cache the rows of a `writer` whose last event is that of the fold, if there are many."""
+        self._add(self._opened(), writer, semantic_map)
+        self._keep()
+
+    @property
+    def end(self) -> Offset:
+        """The number of events that are folded, or in the cache."""
+        return self._opened().tables.end
 
     def up_to(self, end: Offset) -> Tables:
         """The tables of at least the first ``end`` events; folds those that are missing. Raises
         FoldError at a bad event; what was folded before it stays."""
-        if self._opened().tables.end < end:
+        if self.end < end:
             self._fold_on(end)
             self._keep()
         return self._opened().tables
@@ -109,9 +126,7 @@ class HistoryRecorder:
 
     def _fold_on(self, end: Offset) -> None:
         before = self._opened()
-        semantic_map = before.map
-        if semantic_map is None and self._cache is not None and before.tables.end > FIRST_OFFSET:
-            semantic_map = self._cache.fold_at(before.tables.end)
+        semantic_map = before.map or self.fold_before(before.tables.end)
         if semantic_map is None:
             before = self._of([])
             semantic_map = new_map(self._reader, self._settings, self._corrections)
@@ -120,17 +135,25 @@ class HistoryRecorder:
         try:
             self._fold(semantic_map, writer, end)
         finally:
-            if semantic_map.next_offset == writer.end:  # else it ended in the midst of an event
-                found = [*before.tables.stripes, *writer.finish()]
-                tables = Tables(_with_short_joined(found, before.read), self._folded_again)
-                self._folded = before._replace(tables=tables, map=semantic_map)
+            self._add(before, writer, semantic_map)
+
+    def _add(self, before: _Folded, writer: TableWriter, semantic_map: SemanticMap) -> None:
+        if semantic_map.next_offset == writer.end:  # else it ended in the midst of an event
+            found = [*before.tables.stripes, *writer.finish()]
+            tables = Tables(_with_short_joined(found, before.read), self._folded_again)
+            self._folded = before._replace(tables=tables, map=semantic_map)
+
+    def fold_before(self, limit: Offset) -> SemanticMap | None:
+        """The latest cached fold of at most ``limit`` events; None if there is none."""
+        return self._cache.fold_before(limit) if self._cache is not None else None
 
     def _fold(self, semantic_map: SemanticMap, writer: TableWriter, end: Offset) -> None:
         """Fold up to ``end`` and add the rows."""
         events = self._reader.read(semantic_map.next_offset, end)
         with gc_paused():
             for folded in fold_events(events, semantic_map, ahead=READ_AHEAD):
-                writer.add(folded.offset, folded.deltas)
+                if folded.offset >= writer.end:  # else the fold is behind the tables
+                    writer.add(folded.offset, folded.deltas)
                 if self._progress and folded.offset % _PROGRESS_EVERY == 0:
                     self._progress(folded.offset, end)
         if self._progress:
@@ -194,15 +217,47 @@ def map_after(
     ``note`` is called with a line about each part of the history that could not be used or kept.
     Without ``cache`` the log is folded and nothing kept. Raises FoldError, LogDamaged.
     """
-    last = reader.next_offset if end is None else end
+    last = reader.end_for(end)
     if not cache:
         return fold_log(
             reader, settings, last, keep_embeddings=embeddings, corrections=corrections
         )[1]
+    if corrections.names and not embeddings:
+        found = resumed_under_other_names(reader, settings, corrections, last, note)
+        if found is not None:
+            fold_into(reader, *found, last)
+            return found[1]
     kept = TimelineCache(reader, settings, corrections, note)
-    return HistoryRecorder(reader, settings, corrections, kept, None).at(
-        last, embeddings=embeddings
-    )
+    recorder = HistoryRecorder(reader, settings, corrections, kept, None)
+    return recorder.at(last, embeddings=embeddings)
+
+
+def resumed_under_other_names(
+    reader: LogReader,
+    settings: Settings,
+    corrections: Corrections,
+    limit: Offset,
+    note: Callable[[str], None],
+) -> tuple[SemanticMap, MapView] | None:
+    """`HistoryRecorder.resumed`, from a history that knows fewer names of places if need be."""
+    for known in _fewer_names(corrections):
+        cache = TimelineCache(reader, settings, known, note)
+        found = HistoryRecorder(reader, settings, known, cache, None).resumed(limit)
+        if found is not None:
+            semantic_map, view = found
+            for delta in semantic_map.use_names(semantic_map.next_offset, corrections):
+                view.apply(delta)
+            view.corrections = corrections
+            return found
+    return None
+
+
+def _fewer_names(corrections: Corrections) -> Iterator[Corrections]:
+    """The corrections, and those before each of the last commands if these gave names only."""
+    yield corrections
+    known = list(corrections.in_force)
+    while known and isinstance(known.pop().command, NamePlace):
+        yield compile_corrections(known)
 
 
 def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:

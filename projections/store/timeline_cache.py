@@ -1,7 +1,7 @@
 """The cache of histories beside a log: ``<log>.history``.
 
 For each choice of settings and commands in force there are parts, ``KEY-START-END.npz``, of which
-each has the history of the events from START to before END, and the fold at the last END,
+each has the history of the events from START to before END, and the folds at the last ENDs,
 ``KEY-END.fold``, from which it is folded on. ``KEY-END.VERSION.digest`` has the digest of the map
 after END events, for the ENDs used last. Files are written under another name and renamed, and
 never changed, so any number of processes may read and write: the same log gives the same files.
@@ -43,19 +43,24 @@ from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.digest import VERSION
-from projections.map.snapshot import FOLD_VERSION, MalformedSnapshot, pack, unpack
 from projections.map.space_vectors import with_vectors
 
 from .columns import Stripe, joined_short
 from .part_file import FORMAT, Part, Unwritable, write_part
+from .state_file import MalformedState, pack, unpack
 from .tables import DamagedPart
 
+FOLD_VERSION: Final = 5
+"""To be raised with every change of the reducers that changes the map of some log."""
 MIN_EVENTS: Final = 2_000
 """Events; folding fewer takes about as long as starting Python."""
 MOST_KEPT: Final = 4
 """The most histories of a log that are kept: those used last."""
 MOST_BYTES: Final = 1024 * 1024 * 1024
 """While all together take more, those unused for longest are deleted, except the one used last."""
+MOST_FOLDS: Final = 3
+"""The most folds of a history that are kept: the latest. A tail whose database is behind the last
+one goes on from one before it."""
 MOST_DIGESTS: Final = 16
 """The most digests of a history that are kept: those made last."""
 _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
@@ -66,6 +71,9 @@ _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODE
 """Errors of opening something other than a regular file."""
 _TRIES: Final = 3
 """The most attempts to read a folder in which other processes replace files."""
+
+MISFITS: Final = (LookupError, TypeError, AttributeError, ValueError, OverflowError)
+"""Errors of a content that does not fit together."""
 
 _T = TypeVar("_T")
 Note = Callable[[str], None]
@@ -85,7 +93,7 @@ class TimelineCache:
         self, reader: LogReader, settings: Settings, corrections: Corrections, note: Note
     ) -> None:
         log = reader.path
-        self.folder = cache_folder(log, "history")
+        self.folder = cache_folder(log)
         self._reader = reader
         self._settings, self._corrections = settings, corrections
         self._note = note
@@ -115,6 +123,15 @@ class TimelineCache:
         if found:
             self._touch(files)
         return found
+
+    def fold_before(self, limit: Offset) -> SemanticMap | None:
+        """The latest cached fold of at most ``limit`` events; None if there is none."""
+        found = (self.fold_at(end) for end in reversed(self._fold_ends()) if end <= limit)
+        return next((fold for fold in found if fold is not None), None)
+
+    def _fold_ends(self) -> list[Offset]:
+        names = [_FOLD.fullmatch(path.name) for path in self._paths() if self._is_own(_FOLD, path)]
+        return sorted(Offset(int(name[2])) for name in names if name is not None)
 
     def fold_at(self, end: Offset) -> SemanticMap | None:
         """The fold after ``end`` events; None if it is not cached."""
@@ -157,9 +174,9 @@ class TimelineCache:
             return load(state)
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, LogError, DamagedPart, MalformedSnapshot, zlib.error) as error:
+        except (OSError, LogError, DamagedPart, MalformedState, zlib.error) as error:
             self._say(f"{path} is not used: {error}")
-        except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        except MISFITS as error:
             self._say(f"{path} is not used: its content does not fit together: {error!r}")
         return None
 
@@ -173,7 +190,7 @@ class TimelineCache:
         """Cache the history of all events that ``semantic_map`` has folded."""
         end = semantic_map.next_offset
         try:
-            make_cache_folder(self._reader.path, "history")
+            make_cache_folder(self._reader.path)
             self._keep_fold(semantic_map)
             self._keep_part(stripes, end)
             self._tidy(end)
@@ -314,10 +331,8 @@ class TimelineCache:
         for file in files:
             if file.path not in needed and file.end <= end:
                 file.path.unlink(missing_ok=True)
-        for path in self._paths():
-            fold = _FOLD.fullmatch(path.name)
-            if fold is not None and fold[1] == self._key and int(fold[2]) < end:
-                path.unlink(missing_ok=True)
+        for older in [each for each in self._fold_ends() if each <= end][:-MOST_FOLDS]:
+            self._fold_path(older).unlink(missing_ok=True)
         delete_left_over_files(self.folder)
         self._limit()
 

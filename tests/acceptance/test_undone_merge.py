@@ -63,7 +63,7 @@ def test_an_undone_merge_is_two_places_after_every_rebuild_and_one_again_after_u
 
     shutil.rmtree(mapfold.home)
     furnish(mapfold.home)
-    shutil.rmtree(tmp_path / "log.snapshots", ignore_errors=True)
+    shutil.rmtree(tmp_path / "log.history", ignore_errors=True)
     other = mapfold("replay", log, "--json").json["digest"]
     assert other != digest
     assert places_in_age(mapfold) == two

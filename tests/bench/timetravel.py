@@ -26,7 +26,6 @@ from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.whatif import what_if
 from projections.map.fold import fold_log
-from projections.map.snapshot_cache import SnapshotCache
 
 ROOMS = [(4.0 * column, 3.5 * row) for row in range(4) for column in range(5)]
 CLASSES = ["chair", "cup", "lamp", "desk", "picture", "tv", "couch", "plant"]
@@ -85,12 +84,10 @@ def make_log(path: Path, keyframes: int, detections: int, dim: int) -> None:
             writer.append("tb/detections", payload, stamp_ns=stamp_ns)
 
 
-def plain_fold(log: Path, *, keep: bool = False) -> None:
-    """One fold as `mapfold state` does it; ``keep`` leaves a snapshot at the end."""
+def plain_fold(log: Path) -> None:
+    """One fold as `mapfold state --no-cache` does it."""
     with LogReader(log) as reader:
-        semantic_map, view = fold_log(reader, RULES, keep_embeddings=False)
-        if keep:
-            SnapshotCache(log, reader.log_id, RULES, print).keep(semantic_map, view)
+        fold_log(reader, RULES, keep_embeddings=False)
 
 
 def say(what: str, value: str) -> None:
@@ -103,7 +100,6 @@ def bench(log: Path, asks: int) -> None:
     one_fold, _ = timed(lambda: plain_fold(log))
     fold_cpu = cpu_seconds() - used
     say("one plain fold", f"{one_fold:.2f} s, {fold_cpu:.2f} s of CPU")
-    plain_fold(log, keep=True)
     with Timeline(log, RULES) as timeline:
         say("events", f"{timeline.end:,}")
         bench_timeline(timeline, one_fold, asks)
@@ -112,7 +108,7 @@ def bench(log: Path, asks: int) -> None:
 
 def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
     first, _ = timed(lambda: timeline.at(timeline.end))
-    say("first at(end) of a process, from a snapshot", f"{first:.2f} s")
+    say("first at(end) of a process", f"{first:.2f} s")
     folding, history = timed(lambda: timeline.history)
     say("folding the history, once per process", f"{folding:.2f} s, {folding / one_fold:.2f} folds")
     bench_at(timeline, asks, "at(random offset)")

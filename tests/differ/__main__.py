@@ -14,12 +14,13 @@ from pathlib import Path
 
 from projections.fold.settings import Settings
 from projections.postgres.embedded import EmbeddedServer
+from tests.property.test_timeline_cache import kept_early
 from tests.servers import server_to_kill
 
 from .databases import DatabaseWays
 from .growing_log import GrowingLog
 from .outcomes import CHOICES, Chosen, Tally
-from .timelines import TimelineWays, caches_of_short_logs
+from .timelines import TimelineWays
 
 _SIZES = (5, 10, 20, 40, 80)
 """Events of a log; a failing one is tried again with fewer."""
@@ -95,7 +96,7 @@ def _fault_of(
             else DatabaseWays(log, settings, rng, tally, server).opened()
         )
         with (
-            caches_of_short_logs(),
+            kept_early(),
             TimelineWays(log, settings, rng, tally, without) as timelines,
             databases as followed,
         ):

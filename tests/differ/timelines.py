@@ -1,28 +1,24 @@
 """Ways to the map at W that need no database: timelines new, kept, grown, shared by threads and
-interrupted; snapshots, caches, the map for one question, what-ifs and the map of `mapfold edit`."""
+interrupted; caches, the map for one question, what-ifs and the map of `mapfold edit`."""
 
 import random
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
-from unittest.mock import patch
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.edit.current import CurrentMap
 from projections.history import Timeline
 from projections.history.parallel import Rules, fold_all
-from projections.map.fold import fold_log_cached
 from projections.map.log_commands import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
 from tests.history_answers import whole
-from tests.property.test_timeline_cache import kept_early
 
 from .outcomes import Chosen, Tally, folded, outcome, stories
 
@@ -31,17 +27,6 @@ _THREADS = 3
 
 class Interrupted(BaseException):
     """What Ctrl-C would raise."""
-
-
-@contextmanager
-def caches_of_short_logs() -> Iterator[None]:
-    """Keep histories and snapshots of logs of any length."""
-    with (
-        kept_early(),
-        patch("projections.map.fold.SNAPSHOT_MIN_EVENTS", 4),
-        patch("projections.postgres.tail_pass.SNAPSHOT_MIN_EVENTS", 4),
-    ):
-        yield
 
 
 class TimelineWays:
@@ -112,11 +97,6 @@ class TimelineWays:
             for way, cache in (("one question", True), ("one question, no cache", False)):
                 ask = partial(map_after, reader, settings, end, cache=cache, **given)
                 self._compare(way, lambda: whole(ask()), point)  # noqa: B023  # called at once
-            self._compare(
-                "snapshots",
-                lambda: whole(fold_log_cached(reader, settings, end, **given)[1]),
-                point,
-            )
             if end == known_at:
                 edited = CurrentMap(reader, self._settings, until=end)
                 self._compare("edit", lambda: whole(edited.view), point)

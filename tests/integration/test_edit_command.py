@@ -342,7 +342,7 @@ def test_effects_that_are_not_known_are_worked_out_when_asked(mapfold: Commands)
     for args in (("forget-run", "run-b"), ("name-place", LEFT, "hall"), ("undo-merge", "20")):
         mapfold("edit", "log", *args, *WHY)
     known = mapfold("edits", "log", "--json").json
-    cache = mapfold.folder / "log.snapshots" / "effects.json"
+    cache = mapfold.folder / "log.history" / "effects.json"
     damages = [None, b"", b"{", b'{"version":1}', b"[]", os.urandom(100), b"[" * 9_999]
     for damage in damages[:: stride(3)]:
         cache.unlink() if damage is None else cache.write_bytes(damage)
@@ -369,7 +369,7 @@ def test_the_effect_is_that_of_two_whole_folds(mapfold: Commands, kind: tuple[st
 
 
 def test_a_cache_that_cannot_be_written_is_noted_and_fails_nothing(mapfold: Commands) -> None:
-    (mapfold.folder / "log.snapshots").write_text("a file where a folder should be")
+    (mapfold.folder / "log.history").write_text("a file where a folder should be")
     done = mapfold("edit", "log", "forget-run", "run-b", *WHY)
     assert "effects.json: no effect was kept: File exists" in done.err
     assert mapfold("edits", "log", "--json").json[0]["effect"] is None
@@ -377,7 +377,7 @@ def test_a_cache_that_cannot_be_written_is_noted_and_fails_nothing(mapfold: Comm
 
 def test_effects_of_another_log_are_not_taken(mapfold: Commands) -> None:
     mapfold("edit", "log", "forget-run", "run-b", *WHY)
-    path = mapfold.folder / "log.snapshots" / "effects.json"
+    path = mapfold.folder / "log.history" / "effects.json"
     document = json.loads(path.read_text())
     path.write_text(json.dumps({**document, "log_id": "another"}))
     assert mapfold("edits", "log", "--json").json[0]["effect"] is None

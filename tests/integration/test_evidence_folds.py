@@ -15,7 +15,6 @@ from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_log
 from projections.map.log_commands import read_corrections
-from projections.map.snapshot_cache import SnapshotCache
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
@@ -23,11 +22,13 @@ from projections.postgres.connection import Targets
 from projections.postgres.graph_render import expected_rows
 from projections.postgres.labels import LABELS
 from projections.postgres.loader import LoaderName
+from projections.store.history_recorder import map_after
 from tests.commands_in_logs import append_command, command, forget_keyframes, undo
 from tests.flickering_house import flickering_house
 from tests.integration.test_projections import parsed
 from tests.live_rows import followed_and_rebuilt
 from tests.logs import write_log
+from tests.property.test_timeline_cache import kept_early
 from tests.rows import all_rows, expected_graph, graph_rows
 from tests.thorough import mostly_slow, rounds
 
@@ -120,13 +121,14 @@ def test_a_check_names_an_estimate_that_was_changed(
     assert "'est_x': 'float 0.25'" in str(difference.found)
 
 
-def test_a_tail_starts_from_a_snapshot(log: Path, one_database: Targets) -> None:
-    with LogReader(log) as reader:
-        cache = SnapshotCache(log, reader.log_id, EVIDENCE, lambda _: None)
-        cache.keep(*fold_log(reader, EVIDENCE, Offset(100), keep_embeddings=False))
-    rebuild(log, one_database, EVIDENCE, until=Offset(120))
-    folded: list[int] = []
-    tail(log, one_database, EVIDENCE, once=True, on_fold=folded.append)
+def test_a_tail_starts_from_a_kept_fold(log: Path, one_database: Targets) -> None:
+    with kept_early():
+        with LogReader(log) as reader:
+            map_after(reader, EVIDENCE, Offset(100))
+        rebuild(log, one_database, EVIDENCE, until=Offset(120))
+        folded: list[int] = []
+        tail(log, one_database, EVIDENCE, once=True, on_fold=folded.append)
+    assert folded[0] == 100
     assert parsed(graph_rows(one_database.graph_url)) == expected_graph(view_of(log))
 
 

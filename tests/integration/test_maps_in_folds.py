@@ -1,4 +1,4 @@
-"""Occupancy maps in the fold: the view, the digest, snapshots, time travel, state and pictures."""
+"""Occupancy maps in the fold: the view, the digest, kept folds, time travel, state and pictures."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -17,11 +17,11 @@ from projections.history import Timeline
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
 from projections.map.one_floor import view_of_floor
-from projections.map.snapshot import restore, snapshot
 from projections.map.view import MapView
 from tests.commands import Commands
 from tests.envelopes import envelope, payload
 from tests.fixtures_log import KEY
+from tests.folds import Folded, resumed
 from tests.maps import drawn_map
 from tests.thorough import mostly_slow
 
@@ -139,31 +139,25 @@ def test_a_map_holds_for_what_comes_after_it_only(tmp_path: Path) -> None:
     assert len(set(_places(lifted))) == 1
 
 
-def test_a_fold_goes_on_from_a_snapshot_with_the_same_walls(tmp_path: Path) -> None:
+def test_a_fold_goes_on_from_a_kept_state_with_the_same_walls(tmp_path: Path) -> None:
     items = [*DRIVE[:3], ROOMS, *DRIVE[3:], *(envelope(k, 0.3 * k, 0.5) for k in range(20, 34))]
     log = _write(tmp_path / "L", *items)
     with LogReader(log) as reader:
         _, whole = fold_log(reader, ROOM_RULE)
         for until in range(2, len(items), 3):
-            kept = snapshot(*fold_log(reader, ROOM_RULE, until), reader.log_id)
-            semantic_map, view = restore(kept, ROOM_RULE, reader.log_id)
-            for event in fold_events(reader.read(until), semantic_map):
-                view.apply_event(event.offset, event.deltas)
-            assert map_digest(view) == map_digest(whole)
+            again = resumed(Folded(*fold_log(reader, ROOM_RULE, until), []))
+            for event in fold_events(reader.read(until), again.map):
+                again.view.apply_event(event.offset, event.deltas)
+            assert map_digest(again.view) == map_digest(whole)
 
 
-def test_a_snapshot_has_the_map(tmp_path: Path) -> None:
+def test_a_kept_fold_has_the_map(tmp_path: Path) -> None:
     log = _write(tmp_path / "L", *DRIVE, HALL)
     with LogReader(log) as reader:
-        semantic_map, view = fold_log(reader, Settings())
-        restored, seen = restore(
-            snapshot(semantic_map, view, reader.log_id), Settings(), reader.log_id
-        )
-    assert map_digest(seen) == map_digest(view)
-    assert seen.map is restored.current_map.given[None]
-    assert seen.map is not None
-    assert (seen.map.offset, seen.map.map.origin) == (8, HALL.origin)
-    assert restored.use_map(9, ROOMS)[0] is restored.current_map.given[None]
+        again = resumed(Folded(*fold_log(reader, Settings()), []))
+    given = again.map.current_map.given[None]
+    assert (given.offset, given.map.origin) == (8, HALL.origin)
+    assert again.map.use_map(9, ROOMS)[0] is again.map.current_map.given[None]
 
 
 def test_time_travel_has_the_map_of_its_time(tmp_path: Path) -> None:

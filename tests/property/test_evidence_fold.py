@@ -1,4 +1,4 @@
-"""Fusion by evidence in the whole fold: its deltas, its view, snapshots and histories."""
+"""Fusion by evidence in the whole fold: its deltas, its view, kept folds and histories."""
 
 import copy
 import tempfile
@@ -19,14 +19,13 @@ from projections.history.explanation import explain_object
 from projections.map.digest import map_digest
 from projections.map.export import state_document
 from projections.map.fold import fold_log
-from projections.map.snapshot import restore, snapshot
 from projections.map.view import MapView
 from tests.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
 from tests.fixtures_timetravel import write_log
-from tests.folds import Folded
+from tests.folds import Folded, resumed, state_bytes
 from tests.memory_history import MemoryHistory
 from tests.past_view import view_at
-from tests.property.test_snapshots import _plain
+from tests.property.test_kept_folds import _plain
 from tests.rooms_with_things import drive, drives, long_drive
 from tests.thorough import mostly_slow
 
@@ -65,7 +64,7 @@ def test_the_view_equals_a_recount_after_every_event(documents: list[dict[str, A
 
 @SLOW
 @given(documents=drives(), data=st.data())
-def test_restore_then_fold_is_fold_from_the_start(
+def test_resume_then_fold_is_fold_from_the_start(
     documents: list[dict[str, Any]], data: st.DataObject
 ) -> None:
     cut = data.draw(st.integers(0, len(documents)))
@@ -77,14 +76,13 @@ def test_restore_then_fold_is_fold_from_the_start(
     corrections = compiled(*commands)
     whole = Folded.start(EVIDENCE, corrections=corrections).extend(documents)
     begun = Folded.start(EVIDENCE, corrections=corrections).extend(documents[:cut])
-    data_ = snapshot(begun.map, begun.view, "log")
-    again = Folded(*restore(data_, EVIDENCE, "log", corrections=corrections), [])
+    again = resumed(begun)
     again.extend(documents[cut:])
     assert [list(map(_plain, each)) for each in again.deltas] == [
         list(map(_plain, each)) for each in whole.deltas[cut:]
     ]
     assert map_digest(again.view) == map_digest(whole.view)
-    assert snapshot(again.map, again.view, "log") == snapshot(whole.map, whole.view, "log")
+    assert state_bytes(again) == state_bytes(whole)
 
 
 @SLOW
@@ -114,7 +112,7 @@ def test_a_timeline_gives_the_fold_of_every_offset(
 
 @pytest.mark.parametrize("seed", mostly_slow([0, 5]))
 def test_maps_of_things_carried_away_are_the_same_whichever_way_they_are_made(seed: int) -> None:
-    """Recounted, out of snapshots, out of a history and as `why` tells them."""
+    """Recounted, out of kept folds, out of a history and as `why` tells them."""
     documents = long_drive(seed)
     whole = Folded.start(EVIDENCE).extend(documents)
     assert whole.all(d.ObjectMissing)
@@ -124,12 +122,12 @@ def test_maps_of_things_carried_away_are_the_same_whichever_way_they_are_made(se
         check_order(deltas)
     for cut in (90, 165, 239):
         begun = Folded.start(EVIDENCE).extend(documents[:cut])
-        again = Folded(*restore(snapshot(begun.map, begun.view, "log"), EVIDENCE, "log"), [])
+        again = resumed(begun)
         again.extend(documents[cut:])
         assert [list(map(_plain, each)) for each in again.deltas] == [
             list(map(_plain, each)) for each in whole.deltas[cut:]
         ]
-        assert snapshot(again.map, again.view, "log") == snapshot(whole.map, whole.view, "log")
+        assert state_bytes(again) == state_bytes(whole)
     history = MemoryHistory(EVIDENCE)
     for offset, deltas in enumerate(whole.deltas):
         history.apply(Offset(offset), deltas)

@@ -1,4 +1,4 @@
-"""Views, snapshots, histories and digests of fusion by evidence, from deltas made by hand.
+"""Views, histories and digests of fusion by evidence, from deltas made by hand.
 
 The oracle of each is a view to which the same deltas were applied one by one.
 """
@@ -21,7 +21,6 @@ from projections.history.diff import difference_of, rows_of
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
 from projections.map.records import Estimate, ObjectRecord, Relocation
-from projections.map.snapshot import dump_view, load_view, pack, unpack
 from projections.map.view import MapView
 from tests.memory_history import MemoryHistory
 from tests.past_view import view_at
@@ -64,21 +63,6 @@ def test_a_delta_applied_twice_does_no_harm(steps: list[Step]) -> None:
     assert map_digest(
         view_of([[delta for delta in deltas for _ in (1, 2)] for deltas in events])
     ) == map_digest(view_of(events))
-
-
-@SLOW
-@given(STEPS, st.data())
-def test_a_view_out_of_a_snapshot_goes_on_as_the_one_put_in(
-    steps: list[Step], data: st.DataObject
-) -> None:
-    events = SyntheticDeltas.of(steps).events
-    at = data.draw(st.integers(0, len(events)))
-    loaded = MapView(EVIDENCE, keep_embeddings=False)
-    load_view(loaded, unpack(pack(dump_view(view_of(events[:at])))))
-    for offset, deltas in enumerate(events[at:], at):
-        loaded.apply_event(Offset(offset), deltas)
-    assert map_digest(loaded) == map_digest(view_of(events))
-    assert state_document(loaded, "") == state_document(view_of(events), "")
 
 
 @SLOW

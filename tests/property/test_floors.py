@@ -11,17 +11,10 @@ from projections.fold.corrections import Corrections, Keyframe
 from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot
 from projections.map.view import MapView
 from tests.envelopes import detection, envelope
 from tests.evidence_folds import recounted_votes
-from tests.folds import (
-    Folded,
-    fold,
-    near_matrix,
-    recounted_adjacency,
-    recounted_places,
-)
+from tests.folds import Folded, fold, near_matrix, recounted_adjacency, recounted_places, resumed
 from tests.memory_history import MemoryHistory
 from tests.naive_map import NaiveMap, micrometres
 from tests.property.test_whole_fold import worlds
@@ -121,12 +114,12 @@ def test_after_every_event_the_digest_is_that_of_the_naive_map_with_floors(
 
 
 @given(building=buildings())
-def test_snapshots_with_floors_go_on_as_the_fold_does(
+def test_kept_folds_with_floors_go_on_as_the_fold_does(
     building: tuple[dict[str, Any], list[dict[str, Any]]],
 ) -> None:
     raw, documents = building
     settings = Settings(**raw)
-    check_snapshots(settings, documents)
+    check_resumed(settings, documents)
 
 
 @given(documents=drives(), seed=st.integers(0, 2**32), places=st.sampled_from(["page", "rooms"]))
@@ -138,7 +131,7 @@ def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
     few = rng.sample(FLOORS, 3)
     documents = [{**document, **rng.choice(few)} for document in documents]
     settings = Settings(fusion="evidence", eps_m=1.0, places=places)
-    folded = check_snapshots(settings, documents)
+    folded = check_resumed(settings, documents)
     check_floors(folded)
     for found in folded.view.objects.values():
         estimate = found.estimate
@@ -146,15 +139,14 @@ def test_fusion_by_evidence_and_rooms_keep_floors_apart_too(
         assert abs(estimate.x_um) < 10**8, "as far as a picture shows, on its own floor"
 
 
-def check_snapshots(settings: Settings, documents: list[dict[str, Any]]) -> Folded:
+def check_resumed(settings: Settings, documents: list[dict[str, Any]]) -> Folded:
     """A fold that is stored and restored after each event is one that is not, which is returned."""
     whole, restored = Folded.start(settings), Folded.start(settings)
     for document in documents:
         whole.extend([document])
         restored.extend([document])
         assert map_digest(restored.view) == map_digest(whole.view)
-        kept = snapshot(restored.map, restored.view, "log")
-        restored = Folded(*restore(kept, settings, "log"), [])
+        restored = resumed(restored)
         assert restored.view.floors == whole.view.floors
     return whole
 
@@ -258,14 +250,12 @@ def test_a_join_and_a_same_object_across_floors_are_obeyed_on_the_first_floor_on
     assert len(folded.all(PlacesMerged)) == 1
     by_det = {o.det_id: o.object for o in view.observations}
     assert by_det["cup-0-0"] == by_det["far-cup-0-0"] != by_det["cup-1-0"]
-    assert map_digest(snapshot_in_the_middle(corrections, documents)) == map_digest(view)
+    assert map_digest(resumed_in_the_middle(corrections, documents)) == map_digest(view)
 
 
-def snapshot_in_the_middle(corrections: Corrections, documents: list[dict[str, Any]]) -> MapView:
+def resumed_in_the_middle(corrections: Corrections, documents: list[dict[str, Any]]) -> MapView:
     first = Folded.start(corrections=corrections).extend(documents[:9])
-    kept = snapshot(first.map, first.view, "log")
-    again = restore(kept, Settings(), "log", corrections=corrections)
-    return Folded(*again, []).extend(documents[9:]).view
+    return resumed(first).extend(documents[9:]).view
 
 
 def test_neighbours_of_a_history_are_on_one_floor() -> None:

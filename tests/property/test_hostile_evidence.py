@@ -19,9 +19,8 @@ from projections.fold.spots import Spots
 from projections.fold.things import Thing
 from projections.map.digest import map_digest
 from projections.map.export import state_document
-from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope, payload
-from tests.folds import Folded
+from tests.folds import Folded, resumed, state_bytes
 from tests.thorough import examples
 
 EVIDENCE = Settings(fusion="evidence", eps_m=1.0)
@@ -77,7 +76,7 @@ def hostile_drive(seed: int) -> list[dict[str, Any]]:
 
 @settings(deadline=None, max_examples=examples(60))
 @given(seed=st.integers(0, 2**32), is_commanded=st.booleans())
-def test_estimates_of_anything_are_finite_and_snapshots_go_on(
+def test_estimates_of_anything_are_finite_and_kept_folds_go_on(
     seed: int, is_commanded: bool
 ) -> None:
     documents = hostile_drive(seed)
@@ -95,7 +94,7 @@ def test_estimates_of_anything_are_finite_and_snapshots_go_on(
         )
     cut = len(documents) // 2
     whole = Folded.start(EVIDENCE, corrections=corrections).extend(documents[:cut])
-    kept = snapshot(whole.map, whole.view, "log")
+    again = resumed(whole)
     whole.extend(documents[cut:])
     for found in whole.view.objects.values():
         at = found.estimate
@@ -106,10 +105,9 @@ def test_estimates_of_anything_are_finite_and_snapshots_go_on(
         assert max(abs(at.x_um), abs(at.y_um)) < 2 * _FAR * 1e6
         assert max(at.var_xx_um2, at.var_yy_um2) < 2**63
     json.dumps(state_document(whole.view, ""), allow_nan=False)
-    again = Folded(*restore(kept, EVIDENCE, "log", corrections=corrections), [])
     again.extend(documents[cut:])
     assert map_digest(again.view) == map_digest(whole.view)
-    assert snapshot(again.map, again.view, "log") == snapshot(whole.map, whole.view, "log")
+    assert state_bytes(again) == state_bytes(whole)
 
 
 @pytest.mark.slow

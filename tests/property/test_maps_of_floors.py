@@ -17,9 +17,8 @@ from projections.localize.relocalize import CandidatePlace, Candidates, Match
 from projections.localize.relocalize.floors import STEP_M, Layout
 from projections.localize.relocalize.walls import WallMap
 from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot
 from tests.envelopes import envelope
-from tests.folds import Folded
+from tests.folds import Folded, resumed
 from tests.thorough import examples
 
 ROOMS = Settings(places="rooms")
@@ -100,21 +99,21 @@ def test_each_floor_is_folded_as_if_it_were_alone(seed: int) -> None:
 
 @settings(max_examples=examples(10), deadline=None)
 @given(st.integers(0, 10**6))
-def test_snapshots_have_the_maps_of_all_floors(seed: int) -> None:
+def test_kept_folds_have_the_maps_of_all_floors(seed: int) -> None:
     items = _items(seed)
     half = _fold(items[: len(items) // 2])
-    kept = snapshot(half.map, half.view, "log")
-    semantic_map, view = restore(kept, ROOMS, "log")
-    resumed = Folded(semantic_map, view, [])
+    again = resumed(half)
     for item in items[len(items) // 2 :]:
         if isinstance(item, OccupancyMap):
-            offset = resumed.map.next_offset
-            view.apply_event(offset, semantic_map.use_map(offset, item))
+            offset = again.map.next_offset
+            again.view.apply_event(offset, again.map.use_map(offset, item))
         else:
-            resumed.extend([item])
+            again.extend([item])
     whole = _fold(items)
-    assert map_digest(view) == map_digest(whole.view)
-    offsets = [{f: g.offset for f, g in v.maps_in_force().items()} for v in (view, whole.view)]
+    assert map_digest(again.view) == map_digest(whole.view)
+    offsets = [
+        {f: g.offset for f, g in v.maps_in_force().items()} for v in (again.view, whole.view)
+    ]
     assert offsets[0] == offsets[1]
 
 

@@ -1,4 +1,4 @@
-"""What is in a place is counted as a recount does, live, from snapshots and in past maps."""
+"""What is in a place is counted as a recount does, live and in past maps."""
 
 import tempfile
 from pathlib import Path
@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 from eventsrc.envelope.model import Offset
 from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot
 from projections.map.view import MapView
 from tests.folds import Folded
 from tests.logs import write_log
@@ -44,9 +42,6 @@ def check_all(settings: Settings, documents: list[dict[str, Any]]) -> None:
     for document in documents:
         folded.extend([document])
         check(folded.view)
-    restored = restore(snapshot(folded.map, folded.view, "log"), settings, "log")[1]
-    check(restored)
-    assert map_digest(restored) == map_digest(folded.view)
     with tempfile.TemporaryDirectory() as folder:
         log = write_log(Path(folder) / "log", documents)
         with Timeline(log, settings) as timeline:

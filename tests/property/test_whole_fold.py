@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
-from tests.folds import Folded
+from tests.folds import Folded, resumed
 from tests.naive_map import NaiveMap
 
 LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0]]
@@ -89,7 +88,7 @@ def test_the_digest_is_that_of_the_naive_map_when_every_event_is_folded_by_a_res
         folded.extend([document])
         naive.fold(document)
         assert map_digest(folded.view) == naive.digest()
-        folded = Folded(*restore(snapshot(folded.map, folded.view, "log"), settings, "log"), [])
+        folded = resumed(folded)
     assert folded.view.skipped == {kind: naive.left_out[kind] for kind in folded.view.skipped}
 
 

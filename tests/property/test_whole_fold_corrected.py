@@ -28,9 +28,8 @@ from projections.fold.corrections import Corrections, RecordedCommand, compile_c
 from projections.fold.deltas import MergeRefused, ObjectsMerged, PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
-from tests.folds import Folded
+from tests.folds import Folded, resumed
 from tests.naive_corrected import NaiveCorrectedMap, corrected
 from tests.property.test_whole_fold import LOOKS, worlds
 
@@ -139,9 +138,8 @@ def test_after_every_event_the_digest_is_that_of_the_naive_corrected_map(world: 
         naive.fold(document)
         assert map_digest(folded.view) == naive.digest()
         if number % 3 == 0:
-            data = snapshot(folded.map, folded.view, "log")
-            again = restore(data, settings, "log", corrections=corrections)
-            folded = Folded(*again, folded.deltas)
+            again = resumed(folded)
+            folded = Folded(again.map, again.view, folded.deltas)
     counts = {kind: naive.left_out[kind] for kind in folded.view.skipped}
     assert folded.view.skipped == counts
     for kind in (MergeRefused, ObjectsMerged):

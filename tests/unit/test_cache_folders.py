@@ -1,15 +1,13 @@
 """Where the caches of a log are, whatever path names the log, and who may read them."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from eventsrc.log import cache_folder, cache_sizes, make_cache_folder
-from projections.fold.corrections import NO_CORRECTIONS
-from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.map.snapshot_cache import SnapshotCache
 from tests.envelopes import envelope
 from tests.fixtures_timetravel import write_log
 from tests.property.test_timeline_cache import kept_early
@@ -27,11 +25,11 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_every_path_of_a_log_has_its_caches_beside_it(log: Path) -> None:
     for path in (log, Path(".."), Path("../."), Path("../../log"), Path("../within/..")):
-        assert cache_folder(path, "history").resolve() == log.with_name("log.history"), path
+        assert cache_folder(path).resolve() == log.with_name("log.history"), path
     os.chdir("..")
-    assert cache_folder(Path(), "snapshots").resolve() == log.with_name("log.snapshots")
-    assert cache_folder(log.with_name("link"), "history") == log.with_name("link.history")
-    assert cache_folder(Path("/"), "history") == Path("/.history")
+    assert cache_folder(Path()).resolve() == log.with_name("log.history")
+    assert cache_folder(log.with_name("link")) == log.with_name("link.history")
+    assert cache_folder(Path("/")) == Path("/.history")
 
 
 @pytest.mark.parametrize("named", [".", ".."])
@@ -44,7 +42,6 @@ def test_a_log_named_by_dots_is_answered_and_kept(log: Path, named: str) -> None
     assert [folder.resolve() for folder, _ in cache_sizes(Path(named))] == [
         log.with_name("log.history")
     ]
-    assert SnapshotCache(Path(named), "id", Settings(), print, corrections=NO_CORRECTIONS).folder
 
 
 @pytest.mark.parametrize(("of_log", "of_cache"), [(0o750, 0o750), (0o700, 0o700), (0o555, 0o755)])
@@ -54,7 +51,7 @@ def test_who_may_not_read_the_log_may_not_read_its_caches(
     was = os.umask(0o022)
     try:
         log.chmod(of_log)
-        assert make_cache_folder(log, "history").stat().st_mode & 0o777 == of_cache
+        assert make_cache_folder(log).stat().st_mode & 0o777 == of_cache
     finally:
         os.umask(was)
         log.chmod(0o755)
@@ -62,8 +59,10 @@ def test_who_may_not_read_the_log_may_not_read_its_caches(
 
 def test_sizes_of_caches_that_change_or_cannot_be_read(log: Path) -> None:
     assert cache_sizes(log) == []
-    make_cache_folder(log, "snapshots")
-    (log.with_name("log.snapshots") / "a").write_bytes(b"1234")
-    (log.with_name("log.snapshots") / "gone").symlink_to("nowhere")
+    make_cache_folder(log)
+    (log.with_name("log.history") / "a").write_bytes(b"1234")
+    (log.with_name("log.history") / "gone").symlink_to("nowhere")
+    assert cache_sizes(log) == [(log.with_name("log.history"), 4 + len("nowhere"))]
+    shutil.rmtree(log.with_name("log.history"))
     log.with_name("log.history").write_text("no folder")
-    assert cache_sizes(log) == [(log.with_name("log.snapshots"), 4 + len("nowhere"))]
+    assert cache_sizes(log) == []

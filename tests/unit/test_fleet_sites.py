@@ -27,7 +27,7 @@ def _log(path: Path) -> Path:
 def test_a_folder_has_a_site_in_each_subfolder_with_a_log(tmp_path: Path) -> None:
     for name in ("kitchen", "Büro 2", "a"):
         _log(tmp_path / name)
-    for name in ("empty", "a.snapshots", "kitchen.history"):  # caches beside a log are not named
+    for name in ("empty", "a.history", "kitchen.history"):  # caches beside a log are not named
         (tmp_path / name).mkdir()
     (tmp_path / "notes.txt").write_text("x")
     _log(tmp_path / ".mapfold")  # hidden, as the embedded server's folder is

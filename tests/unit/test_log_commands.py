@@ -13,10 +13,10 @@ from projections.fold.deltas import PlaceNamed
 from projections.fold.errors import FoldError
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import fold_log, fold_log_cached
+from projections.map.fold import fold_log
 from projections.map.log_commands import read_commands, read_corrections
-from projections.map.snapshot import SnapshotRefused, restore, snapshot
 from projections.postgres.live_fold import LiveFold
+from projections.store.history_recorder import map_after
 from tests.envelopes import envelope, payload
 from tests.folds import Folded
 
@@ -74,15 +74,15 @@ def test_an_event_that_is_no_command_is_an_error_with_its_offset(
         read_corrections(reader)
 
 
-def test_a_log_is_folded_under_its_corrections_with_and_without_snapshots(tmp_path: Path) -> None:
+def test_a_log_is_folded_under_its_corrections_with_and_without_a_history(tmp_path: Path) -> None:
     log = write(tmp_path / "log", *keyframes("a", 0.0, 0.1, 0.2), *keyframes("b", 0.0, 5.0))
     corrections = compile_corrections([RecordedCommand(Offset(9), FORGET)])
     with LogReader(log) as reader:
         folded = fold_log(reader, Settings(), corrections=corrections)[1]
-        cached = fold_log_cached(reader, Settings(), corrections=corrections)[1]
+        kept = map_after(reader, Settings(), corrections=corrections)
     assert [k.run_id for k in folded.keyframes] == ["a", "a", "a"]
     assert folded.counts()["forgotten"] == 2
-    assert map_digest(folded) == map_digest(cached)
+    assert map_digest(folded) == map_digest(kept)
 
 
 def named(*commands: NamePlace) -> Corrections:
@@ -133,16 +133,3 @@ def test_a_live_fold_takes_names_over_and_reports_the_places_as_changed(tmp_path
     with LogReader(log) as reader:
         assert list(again.feed(list(reader.read()))) == [None] * 6
     assert map_digest(fold.view) == map_digest(again.view)
-
-
-def test_a_snapshot_is_good_under_other_names_and_not_under_other_corrections() -> None:
-    documents = [envelope(k, 0.2 * k, 0.0, run_id="a") for k in range(4)]
-    plain = Folded.start().extend(documents)
-    data = snapshot(plain.map, plain.view, "log")
-    corrections = named(name("c1", 2, "hall"))
-    restored = restore(data, Settings(), "log", corrections=corrections)[1]
-    whole = Folded.start(corrections=corrections).extend(documents)
-    assert map_digest(restored) == map_digest(whole.view)
-    forgetful = compile_corrections([RecordedCommand(Offset(9), FORGET)])
-    with pytest.raises(SnapshotRefused, match="other corrections"):
-        restore(data, Settings(), "log", corrections=forgetful)

@@ -10,9 +10,8 @@ from projections.fold.deltas import ObjectMissing, ObjectRelocated, ObjectsMerge
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.records import ObjectRecord
-from projections.map.snapshot import restore, snapshot
 from tests.envelopes import detection, envelope
-from tests.folds import Folded
+from tests.folds import Folded, resumed
 from tests.thorough import mostly_slow
 
 SETTINGS = Settings(fusion="evidence")
@@ -135,11 +134,11 @@ def test_no_object_is_missing_where_none_was_carried_away():
 
 @pytest.mark.parametrize("cut", mostly_slow([96, 185, 120, 150], 2))
 @pytest.mark.seconds
-def test_a_fold_goes_on_from_a_snapshot_between(cut):
+def test_a_fold_goes_on_from_a_kept_state_between(cut):
     documents = run("a", ROOM) + run("b", ROOM | {"chair": (7.0, 2.0)})
     whole = Folded.start(SETTINGS).extend(documents)
     begun = Folded.start(SETTINGS).extend(documents[:cut])
-    again = Folded(*restore(snapshot(begun.map, begun.view, "log"), SETTINGS, "log"), [])
+    again = resumed(begun)
     again.extend(documents[cut:])
     assert map_digest(again.view) == map_digest(whole.view)
     assert told(whole, ObjectRelocated) == told(begun, ObjectRelocated) + told(

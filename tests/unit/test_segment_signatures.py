@@ -15,10 +15,12 @@ from eventsrc.log import (
     segment_signatures,
 )
 from eventsrc.record.append import append_payload
-from projections.map.fold import fold_log, fold_log_cached
+from projections.map.fold import fold_log
+from projections.store.history_recorder import map_after
 from tests.envelopes import envelope, payload
 from tests.fixtures_timetravel import write_log
 from tests.history_process import RULES
+from tests.property.test_timeline_cache import kept_early
 
 
 def documents(first: int, last: int, step: float) -> list[dict[str, object]]:
@@ -56,20 +58,17 @@ def test_a_segment_of_an_unreadable_head_is_not_the_one_it_was(tmp_path: Path) -
     assert not same_but_sealed(before, segment_signatures(log, Offset(12)))
 
 
-def test_a_snapshot_of_a_log_put_back_from_a_copy_and_recorded_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_history_of_a_log_put_back_from_a_copy_and_recorded_on(tmp_path: Path) -> None:
     """The segment that was growing is there again, under the same name, with other events."""
-    monkeypatch.setattr("projections.map.fold.SNAPSHOT_MIN_EVENTS", 1)
     log = write_log(tmp_path / "log", documents(0, 12, 0.5))
     shutil.copytree(log, tmp_path / "copy")
-    with begun(log, 30, 0.5), LogReader(log) as reader:
-        fold_log_cached(reader, RULES)
+    with kept_early(), begun(log, 30, 0.5), LogReader(log) as reader:
+        map_after(reader, RULES)
     shutil.rmtree(log)
     shutil.copytree(tmp_path / "copy", log)
     notes: list[str] = []
-    with begun(log, 35, 0.2), LogReader(log) as reader:
-        counts = fold_log_cached(reader, RULES, note=notes.append)[1].counts()
+    with kept_early(), begun(log, 35, 0.2), LogReader(log) as reader:
+        counts = map_after(reader, RULES, note=notes.append).counts()
         assert counts == fold_log(reader, RULES)[1].counts()
     assert ["the log has lost events since it was made" in note for note in notes] == [True]
 

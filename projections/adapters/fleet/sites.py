@@ -59,7 +59,7 @@ def _in_folder(folder: Path, note: Note) -> list[Site]:
             f"{folder} is one log; give the folder above it, with one log in each subfolder, or"
             " use the command without `fleet`"
         )
-    caches = {f"{name}.{kind}" for name in names for kind in ("history", "snapshots")}
+    caches = {f"{name}.history" for name in names}
     sites, others = [], []
     for name in names:
         if _holds_log(folder / name):

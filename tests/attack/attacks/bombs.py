@@ -1,17 +1,13 @@
 """Decompression bombs, and files that claim to be large: each command refuses or reads them in
 bounded memory and time."""
 
-import hashlib
 import sqlite3
-import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from eventsrc.log import LogWriter
 from eventsrc.ros.messages import DETECTIONS
-from projections.fold.settings import Settings
-from projections.map.snapshot import MAGIC as SNAPSHOT_MAGIC
 from tests.attack.arena import Arena
 from tests.attack.bomb_files import gzip_line, mcap_with, mcap_with_large_message, zstd_chunk
 from tests.envelopes import envelope, payload
@@ -79,23 +75,10 @@ def zstd_in_segment(arena: Arena) -> None:
     _read(arena, log)
 
 
-def snapshot(arena: Arena) -> None:
-    """A snapshot beside a log unfolds into 2 GB; its checksum is right."""
-    log = _log(arena, "log")
-    compressor = zlib.compressobj(1)
-    body = b"".join(compressor.compress(bytes(GB // 50)) for _ in range(100)) + compressor.flush()
-    folder = log.with_name(f"{log.name}.snapshots")
-    folder.mkdir()
-    name = f"{Settings().fingerprint()}-{5:020d}.map"
-    data = SNAPSHOT_MAGIC + hashlib.sha256(body).digest() + body
-    (folder / name).write_bytes(data)
-    arena.run("reader", "state", log, "--digest", codes=(0,), patience_s=PATIENCE_S)
-
-
 CASES: tuple[Callable[[Arena], None], ...] = (
     *(zstd_import, zstd_import_with_false_size, large_message, gzip_import),
     large_message_in_sqlite,
-    *(sparse_segment, zstd_in_segment, snapshot),
+    *(sparse_segment, zstd_in_segment),
 )
 
 

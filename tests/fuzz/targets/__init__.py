@@ -3,12 +3,12 @@
 from tests.fuzz.target import Target
 
 from .envelope import EnvelopeTarget
+from .kept_fold import KeptFoldTarget
 from .ledger import LedgerTarget
 from .mcap import McapTarget
 from .question import QuestionTarget
 from .segment import SegmentTarget
 from .settings import SettingsTarget
-from .snapshot import SnapshotTarget
 
 TARGETS: dict[str, Target] = {
     "envelope": EnvelopeTarget(),
@@ -16,6 +16,6 @@ TARGETS: dict[str, Target] = {
     "mcap": McapTarget(),
     "segment": SegmentTarget(),
     "ledger": LedgerTarget(),
-    "snapshot": SnapshotTarget(),
+    "kept-fold": KeptFoldTarget(),
     "settings": SettingsTarget(),
 }

@@ -1,4 +1,4 @@
-"""A snapshot beside a log: a fold and a view that go on as before, or SnapshotRefused."""
+"""A fold kept beside a log: it goes on as before, or is passed over."""
 
 import hashlib
 import random
@@ -6,10 +6,12 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 
+from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.snapshot import MAGIC, SnapshotRefused, restore, snapshot
+from projections.store.state_file import MAGIC, unpack
+from projections.store.timeline_cache import MISFITS
 from tests.attack.corruption import corrupt_bytes, corrupt_json
-from tests.folds import fold
+from tests.folds import fold, state_bytes
 from tests.fuzz.target import Target
 from tests.logs import walk
 
@@ -17,13 +19,13 @@ _HEAD = len(MAGIC) + hashlib.sha256().digest_size
 _LENGTH_BYTES = 8
 
 
-class SnapshotTarget(Target):
+class KeptFoldTarget(Target):
     """The bytes of the file."""
 
     def seeds(self) -> Sequence[bytes]:
         """A small map, and an empty one."""
         folded = [fold(walk(count, seed=2)) for count in (0, 12)]
-        return [snapshot(one.map, one.view, "log") for one in folded]
+        return [state_bytes(one) for one in folded]
 
     def mutate(self, data: bytes, rng: random.Random) -> bytes:
         """The file itself, its index or its arrays, with lengths and checksum made right."""
@@ -43,7 +45,7 @@ class SnapshotTarget(Target):
         return MAGIC + hashlib.sha256(body).digest() + body
 
     def check(self, data: bytes) -> None:
-        """Refused, or restored. A reader cannot know whether the content is true: anybody who can
+        """Passed over, or loaded. A reader cannot know whether the content is true: anybody who can
         write here can make a false map with its checksum."""
-        with suppress(SnapshotRefused):
-            restore(data, Settings(), "log")
+        with suppress(*MISFITS, zlib.error):
+            SemanticMap(Settings()).load(unpack(data))

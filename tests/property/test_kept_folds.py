@@ -1,4 +1,4 @@
-"""A snapshot taken anywhere, restored and folded on, equals the fold from the start."""
+"""A fold kept anywhere and folded on equals the fold from the start."""
 
 from typing import Any
 
@@ -10,8 +10,7 @@ from projections.fold.adjacency import Adjacency
 from projections.fold.deltas import Delta
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.snapshot import restore, snapshot, unpack
-from tests.folds import Folded, fold
+from tests.folds import Folded, fold, resumed, state_bytes
 from tests.property.test_fold_recounts import SETTINGS, runs
 
 
@@ -30,14 +29,13 @@ def _lists(state: dict[str, Any]) -> dict[str, Any]:
     least=st.sampled_from([1, 2, 3, 5]),
     places=st.sampled_from(["page", "rooms"]),
 )
-def test_restore_then_fold_is_fold_from_the_start(
+def test_resume_then_fold_is_fold_from_the_start(
     documents: list[dict[str, Any]], cut: int, least: int, places: str
 ) -> None:
     settings = Settings(**{**SETTINGS, "min_samples": least, "places": places})
     whole = Folded.start(settings).extend(documents)
     begun = Folded.start(settings).extend(documents[:cut])
-    data = snapshot(begun.map, begun.view, "log")
-    again = Folded(*restore(data, begun.view.settings, "log"), [])
+    again = resumed(begun)
     again.extend(documents[cut:])
     assert [list(map(_plain, d)) for d in again.deltas] == [
         list(map(_plain, d)) for d in whole.deltas[cut:]
@@ -47,11 +45,9 @@ def test_restore_then_fold_is_fold_from_the_start(
 
 
 @given(documents=runs())
-def test_a_restored_fold_gives_the_same_snapshot(documents: list[dict[str, Any]]) -> None:
+def test_a_resumed_fold_has_the_same_state(documents: list[dict[str, Any]]) -> None:
     folded = fold(documents, **SETTINGS)
-    data = snapshot(folded.map, folded.view, "log")
-    again = restore(data, folded.view.settings, "log")
-    assert _lists(unpack(data)) == _lists(unpack(snapshot(*again, "log")))
+    assert state_bytes(resumed(folded)) == state_bytes(folded)
 
 
 def test_a_dump_does_not_depend_on_the_order_of_edge_changes() -> None:
