@@ -19,7 +19,7 @@ from eventsrc.ros.derivation import derive
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.surfaces.cli.bridged import NOTHING, recording_of
+from projections.surfaces.cli.bridged import BridgeChoice, recording_of
 from tests import ros2dds
 from tests.fixtures_log import read_log
 from tests.fixtures_zenoh import DEADLINE_S
@@ -32,7 +32,9 @@ from tests.ros_messages import (
 
 
 def choice(namespace: str = "", **more: Any) -> Any:
-    return NOTHING._replace(namespace=namespace, embeddings="/embeddings", run_id="drive", **more)
+    return BridgeChoice(
+        namespace=namespace, **{"embeddings": "/embeddings", "run_id": "drive"} | more
+    )
 
 
 def new_bridge(namespace: str = "", **more: Any) -> Bridge:

@@ -21,7 +21,7 @@ from eventsrc.log import LogReader
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
-from projections.surfaces.cli.options import settings_from
+from projections.surfaces.cli.folded_log import settings_from
 from tests.commands import Commands, Said
 from tests.docs.console import ROOT, Command, matches, read
 from tests.prefork import folder_with_mapfold

@@ -29,11 +29,11 @@ HOLDER = """
 import sys, signal
 # A shell that runs the tests in its background has its children ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from projections.surfaces.cli.options import databases
+from projections.surfaces.cli.options import Databases
 from projections.surfaces.cli.program import run_app
 
 def command():
-    with databases(None, None) as targets:
+    with Databases().opened() as targets:
         print(targets.graph_url, flush=True)
         sys.stdin.read()
 

@@ -80,4 +80,4 @@ def test_no_command_takes_a_point_of_a_log_in_its_own_way() -> None:
         if isinstance(node, ast.ImportFrom) and node.module == "eventsrc.log.seek"
     }
     # `log cat` shows events, not a map: a range of offsets and times, in its own words.
-    assert taking == {"options.py", "log.py"}
+    assert taking == {"folded_log.py", "log.py"}

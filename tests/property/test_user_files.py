@@ -20,7 +20,8 @@ from projections.adapters.fleet.sites import find_sites
 from projections.fold.errors import QuestionError, SettingsError
 from projections.localize.evaluate.truth import read_truth
 from projections.localize.relocalize import parse_question
-from projections.surfaces.cli.options import question_from, settings_from
+from projections.surfaces.cli.folded_log import settings_from
+from projections.surfaces.cli.options import question_from
 
 GOOD = """\
 image: map.pgm

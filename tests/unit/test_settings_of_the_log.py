@@ -7,7 +7,7 @@ from eventsrc.envelope.commands import UseSettings
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
-from projections.surfaces.cli.options import settings_from
+from projections.surfaces.cli.folded_log import settings_from
 
 LOGGED = compile_corrections(
     [

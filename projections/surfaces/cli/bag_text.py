@@ -3,6 +3,7 @@
 import functools
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -11,8 +12,8 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.label_files import read_label_file
 from eventsrc.base.text import counted, visible
-from eventsrc.record.importers import BagReport
-from eventsrc.ros.stream import Counts
+from eventsrc.record.importers import BagOptions, BagReport
+from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
 _PANEL: Final = "Bags of ROS 2"
 _MOST_UNUSED: Final = 10
@@ -65,61 +66,88 @@ def _topic(name: str, text: str) -> typer.models.OptionInfo:
     return _named(name, "TOPIC", text)
 
 
-DetectionsOption = Annotated[
-    list[str] | None,
-    _topic("--detections", "Topic of vision_msgs/Detection2DArray; may be repeated. Default: all."),
-]
-PoseOption = Annotated[
-    str | None,
-    _named(
-        "--pose",
-        "tf|TOPIC|none",
-        "Where poses come from: transforms, or a topic of nav_msgs/Odometry or "
-        "geometry_msgs/PoseWithCovarianceStamped. Default: transforms, else such a topic.",
-    ),
-]
-CovarianceOption = Annotated[
-    str | None,
-    _topic(
-        "--covariance",
-        "Topic whose latest covariance is the error of poses by transforms; or none. Default: one "
-        "in the map's frame.",
-    ),
-]
-EmbeddingsOption = Annotated[
-    str | None,
-    _topic(
-        "--embeddings",
-        "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none. "
-        "Default: one with embedding in its name.",
-    ),
-]
-CameraOption = Annotated[
-    str | None,
-    _topic(
-        "--camera",
-        "Topic of sensor_msgs/CameraInfo; or none. Default: that of the detections' frame.",
-    ),
-]
-GridOption = Annotated[
-    str | None,
-    _topic("--grid", "Topic of nav_msgs/OccupancyGrid; or none. Default: topics called map."),
-]
-MapFrameOption = Annotated[
-    str | None, _named("--map-frame", "FRAME", "The frame of the map. Default: map, else the root.")
-]
-BaseFrameOption = Annotated[
-    str | None,
-    _named("--base-frame", "FRAME", "The robot's frame. Default: base_link or base_footprint."),
-]
-RunIdOption = Annotated[
-    str | None,
-    _named("--run-id", "ID", "The run of a bag's keyframes. Default: its name and when it began."),
-]
-LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
-ModelOption = Annotated[str | None, model_option(_PANEL)]
-HeightsOption = Annotated[bool, heights_option(_PANEL)]
-MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
+@dataclass(frozen=True, kw_only=True)
+class BagChoice:
+    """Which topics of a bag `mapfold import` uses, and how."""
+
+    detections: Annotated[
+        list[str] | None,
+        _topic(
+            "--detections", "Topic of vision_msgs/Detection2DArray; may be repeated. Default: all."
+        ),
+    ] = None
+    pose: Annotated[
+        str | None,
+        _named(
+            "--pose",
+            "tf|TOPIC|none",
+            "Where poses come from: transforms, or a topic of nav_msgs/Odometry or "
+            "geometry_msgs/PoseWithCovarianceStamped. Default: transforms, else such a topic.",
+        ),
+    ] = None
+    covariance: Annotated[
+        str | None,
+        _topic(
+            "--covariance",
+            "Topic whose latest covariance is the error of poses by transforms; or none. Default: "
+            "one in the map's frame.",
+        ),
+    ] = None
+    embeddings: Annotated[
+        str | None,
+        _topic(
+            "--embeddings",
+            "Topic of std_msgs/String or Float32MultiArray, as docs/ros.md describes; or none. "
+            "Default: one with embedding in its name.",
+        ),
+    ] = None
+    camera: Annotated[
+        str | None,
+        _topic(
+            "--camera",
+            "Topic of sensor_msgs/CameraInfo; or none. Default: that of the detections' frame.",
+        ),
+    ] = None
+    grid: Annotated[
+        str | None,
+        _topic("--grid", "Topic of nav_msgs/OccupancyGrid; or none. Default: topics called map."),
+    ] = None
+    map_frame: Annotated[
+        str | None,
+        _named("--map-frame", "FRAME", "The frame of the map. Default: map, else the root."),
+    ] = None
+    base_frame: Annotated[
+        str | None,
+        _named("--base-frame", "FRAME", "The robot's frame. Default: base_link or base_footprint."),
+    ] = None
+    run_id: Annotated[
+        str | None,
+        _named(
+            "--run-id", "ID", "The run of a bag's keyframes. Default: its name and when it began."
+        ),
+    ] = None
+    labels: Annotated[Path | None, labels_option(_PANEL)] = None
+    embedding_model: Annotated[str | None, model_option(_PANEL)] = None
+    heights: Annotated[bool, heights_option(_PANEL)] = False
+    max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
+
+    def options(self) -> BagOptions:
+        """These choices for the importer. Raises MisuseError for an invalid one."""
+        return BagOptions(
+            tuple(self.detections or ()),
+            self.pose,
+            self.covariance,
+            self.embeddings,
+            self.camera,
+            self.grid,
+            self.map_frame,
+            self.base_frame,
+            check_run_id(self.run_id),
+            self.embedding_model,
+            labels_by_number(self.labels),
+            self.heights,
+            max_gap_ns(self.max_gap),
+        )
 
 
 def check_run_id(run_id: str | None) -> str | None:

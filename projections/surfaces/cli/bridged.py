@@ -2,9 +2,10 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import typer
 
@@ -52,103 +53,70 @@ Ros2ddsOption = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-NamespaceOption = Annotated[
-    str, _option("--namespace", "NS", "The namespace in the bridge's configuration, as /bot1.")
-]
-DetectionsOption = Annotated[
-    list[str] | None,
-    _option(
-        "--detections",
-        "TOPIC",
-        f"Topic of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
-    ),
-]
-PoseOption = Annotated[
-    str,
-    _option(
-        "--pose",
-        "tf|TOPIC|none",
-        "Where poses come from: transforms, or a topic of Odometry or PoseWithCovarianceStamped.",
-    ),
-]
-CovarianceOption = Annotated[
-    str | None,
-    _option(
-        "--covariance",
-        "TOPIC",
-        "Topic whose latest covariance is the error of poses by transforms, such as /amcl_pose.",
-    ),
-]
-EmbeddingsOption = Annotated[
-    str | None,
-    _option("--embeddings", "TOPIC", "Topic of the detections' embeddings; see docs/ros.md."),
-]
-CameraOption = Annotated[str | None, _option("--camera", "TOPIC", "Topic of CameraInfo.")]
-GridOption = Annotated[
-    str,
-    _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none."),
-]
-MapFrameOption = Annotated[str, _option("--map-frame", "FRAME", "The frame of the map.")]
-BaseFrameOption = Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")]
-RunIdOption = Annotated[
-    str | None,
-    _option(
-        "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
-    ),
-]
-LabelsOption = Annotated[Path | None, labels_option(_PANEL)]
-ModelOption = Annotated[str | None, model_option(_PANEL)]
-HeightsOption = Annotated[bool, heights_option(_PANEL)]
-MaxGapOption = Annotated[float, max_gap_option(_PANEL)]
-TopicOption = Annotated[
-    list[str] | None,
-    _option("--topic", "TOPIC", "Another topic to keep, of any type; may be repeated."),
-]
 
 
-class BridgeChoice(NamedTuple):
-    """The values of the ROS options of `mapfold record`."""
+@dataclass(frozen=True, kw_only=True)
+class BridgeChoice:
+    """The options of `mapfold record` that go with ``--ros2dds``."""
 
-    namespace: str
-    detections: list[str] | None
-    pose: str
-    covariance: str | None
-    embeddings: str | None
-    camera: str | None
-    grid: str
-    map_frame: str
-    base_frame: str
-    run_id: str | None
-    labels: Path | None
-    embedding_model: str | None
-    heights: bool
-    max_gap_s: float
-    topics: list[str] | None
-
-
-NOTHING: Final = BridgeChoice(
-    "",
-    None,
-    TF_POSE,
-    None,
-    None,
-    None,
-    _GRID,
-    "map",
-    "base_link",
-    None,
-    None,
-    None,
-    False,
-    DEFAULT_MAX_GAP_NS / 1e9,
-    None,
-)
-"""The values of these options when none is given."""
+    namespace: Annotated[
+        str, _option("--namespace", "NS", "The namespace in the bridge's configuration, as /bot1.")
+    ] = ""
+    detections: Annotated[
+        list[str] | None,
+        _option(
+            "--detections",
+            "TOPIC",
+            f"Topic of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
+        ),
+    ] = None
+    pose: Annotated[
+        str,
+        _option(
+            "--pose",
+            "tf|TOPIC|none",
+            "Where poses come from: transforms, or a topic of Odometry or "
+            "PoseWithCovarianceStamped.",
+        ),
+    ] = TF_POSE
+    covariance: Annotated[
+        str | None,
+        _option(
+            "--covariance",
+            "TOPIC",
+            "Topic whose latest covariance is the error of poses by transforms, such as "
+            "/amcl_pose.",
+        ),
+    ] = None
+    embeddings: Annotated[
+        str | None,
+        _option("--embeddings", "TOPIC", "Topic of the detections' embeddings; see docs/ros.md."),
+    ] = None
+    camera: Annotated[str | None, _option("--camera", "TOPIC", "Topic of CameraInfo.")] = None
+    grid: Annotated[
+        str, _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none.")
+    ] = _GRID
+    map_frame: Annotated[str, _option("--map-frame", "FRAME", "The frame of the map.")] = "map"
+    base_frame: Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")] = "base_link"
+    run_id: Annotated[
+        str | None,
+        _option(
+            "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
+        ),
+    ] = None
+    labels: Annotated[Path | None, labels_option(_PANEL)] = None
+    embedding_model: Annotated[str | None, model_option(_PANEL)] = None
+    heights: Annotated[bool, heights_option(_PANEL)] = False
+    max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
+    topic: Annotated[
+        list[str] | None,
+        _option("--topic", "TOPIC", "Another topic to keep, of any type; may be repeated."),
+    ] = None
 
 
 def check_unused(choice: BridgeChoice) -> None:
     """Raise MisuseError if an option needs --ros2dds, which is not given."""
-    if choice != NOTHING:
+    if choice != BridgeChoice():
         raise MisuseError(
             "--namespace, --detections, --pose and the other options for messages of ROS go with "
             "--ros2dds"
@@ -190,7 +158,7 @@ def recording_of(
     )
     run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
     by_transforms = choice.pose == TF_POSE
-    labels, gap_ns = labels_by_number(choice.labels), max_gap_ns(choice.max_gap_s)
+    labels, gap_ns = labels_by_number(choice.labels), max_gap_ns(choice.max_gap)
     streams = []
     for topic in detections:
         run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")
@@ -218,7 +186,7 @@ def recording_of(
     recording = RosRecording(
         key=DEFAULT_KEYS[0], streams=tuple(streams), grids=() if grid is None else (grid,)
     )
-    others = (full(topic, "--topic") for topic in choice.topics or ())
+    others = (full(topic, "--topic") for topic in choice.topic or ())
     return recording, tuple(dict.fromkeys([*used_topics(recording), *others]))
 
 

@@ -1,8 +1,8 @@
 """`mapfold calibrate`: the constants of fusion by evidence, from the map's own revisits."""
 
-import functools
 import uuid
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,7 +11,6 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import counted
 from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
-from eventsrc.record.transport.session import open_session
 from projections.edit import make
 from projections.edit.current import CurrentMap
 from projections.edit.make import Stamp
@@ -23,16 +22,8 @@ from projections.localize.calibrate.rounds import Calibration, calibrate
 from projections.map.log_commands import read_corrections
 
 from .edit_command import keep_effect, recorded_document, recorded_text, user_at_host
-from .options import (
-    ConfigOption,
-    ConnectOption,
-    JsonOption,
-    LogArgument,
-    SetOption,
-    SettingsOption,
-    settings_of,
-    zenoh_options,
-)
+from .folded_log import LogSettings
+from .options import JsonOption, ZenohClient
 from .terminal import Bar, display, emit, say
 
 
@@ -62,15 +53,14 @@ class _Calibrator:
 
 
 def calibrate_command(
-    log: LogArgument,
+    *,
     write: Annotated[
         bool,
         typer.Option("--write", help="Record the constants in the log, as a use-settings command."),
     ] = False,
     all_: Annotated[bool, typer.Option("--all", help="Show the size of every class.")] = False,
     json_: JsonOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    source: LogSettings,
     reason: Annotated[
         str,
         typer.Option(
@@ -84,8 +74,7 @@ def calibrate_command(
             help="With --write: who gives the command [default: your user@host].",
         ),
     ] = None,
-    connect: ConnectOption = None,
-    zenoh_config: ConfigOption = None,
+    client: ZenohClient,
 ) -> None:
     """Estimate the constants of fusion by evidence from the map's own revisits.
 
@@ -101,7 +90,7 @@ def calibrate_command(
     With --write every fold of the log uses them from then on, with the other settings in force and
     those of --set; `mapfold edit LOG undo` takes it back.
     """
-    chosen = settings_of(settings_file, set_)
+    log, chosen = source.log, source.checked()
     if (reason or issued_by is not None) and not write:
         raise MisuseError("--reason and --issued-by are for --write")
     if not write:
@@ -111,7 +100,6 @@ def calibrate_command(
         else:
             display(text(found, all_=all_))
         return
-    options = zenoh_options(connect, None, zenoh_config)
     stamp = Stamp(uuid.uuid4().hex, user_at_host() if issued_by is None else issued_by, reason)
     with Bar() as bar:
         calibrator = _Calibrator(bar.show_fold)
@@ -121,7 +109,7 @@ def calibrate_command(
                 calibrator,
                 stamp,
                 chosen,
-                functools.partial(open_session, options, mode=options.mode),
+                client.session,
                 say,
             )
         except _NothingNew:
@@ -141,7 +129,7 @@ def calibrate_command(
         display(text(found, all_=all_) + last)
 
 
-def _calibrated(log: LogArgument, chosen: Callable[[Corrections], Settings]) -> Calibration:
+def _calibrated(log: Path, chosen: Callable[[Corrections], Settings]) -> Calibration:
     with LogReader(log) as reader, Bar() as bar:
         corrections = read_corrections(reader)
         return calibrate(reader, chosen(corrections), corrections, progress=bar.show_fold)

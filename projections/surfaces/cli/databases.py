@@ -19,7 +19,6 @@ from eventsrc.log import LogReader
 from eventsrc.record.transport.config import parse_address
 from projections.fold.settings import Settings
 from projections.map.advice import places_advice
-from projections.map.log_commands import read_corrections
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 from projections.postgres import (
     ForeignEmbedding,
@@ -33,19 +32,8 @@ from projections.postgres.loader import LoaderName
 from projections.postgres.origin import command_line
 from projections.postgres.sink import SinkName
 
-from .options import (
-    DbOption,
-    JsonOption,
-    LogArgument,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    W,
-    databases,
-    point,
-    settings_from,
-    settings_of,
-)
+from .folded_log import LogSettings, W
+from .options import Databases, JsonOption
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say, say_metrics
 
@@ -167,13 +155,11 @@ def loader_of(loader: Loaders) -> LoaderName:
 
 
 def replay(
-    log: LogArgument,
+    *,
     until: Annotated[str, typer.Option("--until", metavar="W", help=f"Fold to here: {W}.")] = "end",
     only: OnlyOption = None,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    databases: Databases,
+    source: LogSettings,
     loader: LoaderOption = Loaders.copy,
     no_hnsw: Annotated[
         bool, typer.Option("--no-hnsw", help="Do not index a large table for vector search.")
@@ -182,11 +168,9 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """Rebuild the databases from LOG. Readers see the old map until the new one is whole."""
-    with LogReader(log) as reader:
-        end = point(reader, until)
-        corrections = read_corrections(reader, end)
-    settings = settings_from(settings_file, assignments, corrections)
-    with databases(db, vector_db) as targets, Bar() as bar:
+    with source.opened(until) as (_, end, _, corrections, settings):
+        log = source.log
+    with databases.opened() as targets, Bar() as bar:
         report = rebuild(
             log,
             targets,
@@ -229,13 +213,11 @@ def _print_rebuilt(
 
 
 def tail_command(
-    log: LogArgument,
+    *,
     once: Annotated[bool, typer.Option("--once", help="Stop when caught up.")] = False,
     only: OnlyOption = None,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    databases: Databases,
+    source: LogSettings,
     loader: LoaderOption = Loaders.copy,
     metrics: Annotated[
         str | None,
@@ -244,14 +226,14 @@ def tail_command(
     as_json: JsonOption = False,
 ) -> None:
     """Keep the databases live while LOG grows; what cannot be folded is parked and listed."""
-    settings = settings_of(settings_file, assignments)
+    log, settings = source.log, source.checked()
     address = None if metrics is None else parse_address(metrics, "--metrics")
     progress = TailProgress()
     with LogReader(log) as reader:
         end = reader.next_offset
     with (
         stop_on_signals() as stop,
-        databases(db, vector_db) as targets,
+        databases.opened() as targets,
         _metrics(address, progress, log),
         Bar() as bar,
     ):

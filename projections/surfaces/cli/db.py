@@ -20,16 +20,8 @@ from projections.postgres.sink import SinkName
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .databases import OnlyOption, only_of
-from .options import (
-    DbOption,
-    JsonOption,
-    LogArgument,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    databases,
-    settings_of,
-)
+from .folded_log import LogSettings
+from .options import Databases, JsonOption
 from .terminal import display, emit, finish, say
 
 group = typer.Typer(
@@ -96,21 +88,19 @@ def reset(as_json: JsonOption = False) -> None:
 
 @group.command()
 def check(
-    log: LogArgument,
+    *,
     only: OnlyOption = None,
     repair: Annotated[
         bool, typer.Option("--repair", help="Rebuild what differs, up to the same offset.")
     ] = False,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    databases: Databases,
+    source: LogSettings,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the databases with LOG at their checkpoints, row by row, and try one question; exit 3
     if they differ or it fails."""
-    settings = settings_of(settings_file, assignments)
-    with databases(db, vector_db) as targets:
+    log, settings = source.log, source.checked()
+    with databases.opened() as targets:
         reports = check_projections(log, targets, settings, only=only_of(only))
         wrong = [report for report in reports if report.differing]
         # A rebuild would drop the foreign tables in the graph.
@@ -148,16 +138,14 @@ def roles(only: OnlyOption = None) -> None:
 
 @group.command(name="retry")
 def retry_command(
-    log: LogArgument,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    *,
+    databases: Databases,
+    source: LogSettings,
     as_json: JsonOption = False,
 ) -> None:
     """Try parked events again: rebuild if all of them can be folded now, else say why not."""
-    settings = settings_of(settings_file, assignments)
-    with databases(db, vector_db) as targets:
+    log, settings = source.log, source.checked()
+    with databases.opened() as targets:
         reports = retry(log, targets, settings)
     if as_json:
         emit({"sinks": [asdict(r) for r in reports]})
@@ -200,20 +188,18 @@ def _print_check(reports: list[CheckReport]) -> None:
 
 
 def status(
-    log: LogArgument,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    *,
+    databases: Databases,
+    source: LogSettings,
     as_json: JsonOption = False,
 ) -> None:
     """Show offsets, lag, checkpoints, dead letters, rejected, losses, versions; try one question.
 
     Exit 3 on findings.
     """
-    settings = settings_of(settings_file, assignments)
+    log, settings = source.log, source.checked()
     info = log_info(log)
-    with databases(db, vector_db) as targets:
+    with databases.opened() as targets:
         found = projection_status(log, targets, settings)
         away = any(sink.condition in ("missing", "unreachable") for sink in found.sinks)
         failure = None if away else question_error(targets)

@@ -7,11 +7,12 @@ import typer
 
 from eventsrc.adapters.sim import DEFAULT_SEED
 
-from .options import DbOption, JsonOption, VectorDbOption
+from .options import Databases, JsonOption
 from .terminal import emit, finish, say
 
 
 def demo(
+    *,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder for the log, the databases and map.png.")
     ] = Path("logs/demo"),
@@ -21,8 +22,7 @@ def demo(
     speed: Annotated[
         float, typer.Option(metavar="X", help="Times real time.", min=1.0, max=1000.0)
     ] = 30.0,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
+    databases: Databases,
     json_: JsonOption = False,
 ) -> None:
     """Record, replay, map and re-localise a simulated robot on this machine.
@@ -37,7 +37,7 @@ def demo(
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
     from projections.surfaces.demo import DemoOptions, run_demo
 
-    numbers = run_demo(DemoOptions(out, seed, speed, db, vector_db), say)
+    numbers = run_demo(DemoOptions(out, seed, speed, databases.db, databases.vector_db), say)
     if json_:
         emit(numbers)
     finish(findings=not numbers["sound"])

@@ -51,14 +51,7 @@ from .detect_checks import (
     timing_of,
 )
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
-from .options import (
-    ConfigOption,
-    ConnectBesideListenOption,
-    JsonOption,
-    ListenOption,
-    PublishKeyOption,
-    zenoh_options,
-)
+from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -68,6 +61,7 @@ _KEYFRAMES: Final = "Keyframes"
 
 
 def detect(
+    *,
     images: Annotated[
         str | None,
         typer.Option(
@@ -291,9 +285,7 @@ def detect(
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
     ] = None,
     json_: JsonOption = False,
-    connect: ConnectBesideListenOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ConfigOption = None,
+    peer: ZenohPeer,
 ) -> None:
     """Find objects in pictures and publish them as envelopes.
 
@@ -328,7 +320,7 @@ def detect(
     preparation = read_preparation(encoder)
     opened = Encoder(OnnxModel(encoder, wanted, threads), preparation)
     limits = limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
-    zenoh = zenoh_options(connect, listen, zenoh_config)
+    zenoh = peer.zenoh
     with stop_on_signals() as stop, ExitStack() as stack:
         session = None
         if zenoh_image or zenoh_pose or keep_crops:

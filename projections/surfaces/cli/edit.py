@@ -4,7 +4,6 @@
 that all of them share (`edit_command`).
 """
 
-import functools
 from pathlib import Path
 from typing import Annotated
 
@@ -22,10 +21,10 @@ from projections.edit.effect import effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
 from projections.edit.poses import DEFAULT_SLACK_S
-from projections.edit.record import MakeCommand
 
-from .edit_command import kind_of
-from .options import JsonOption, LogArgument, SetOption, SettingsOption, settings_from
+from .edit_command import EditOptions, NewCommand
+from .folded_log import AssignedSettings, LogArgument, LogSettings, settings_from
+from .options import JsonOption
 from .terminal import display, emit, say
 
 PlaceArgument = Annotated[
@@ -50,100 +49,109 @@ app = typer.Typer(
 )
 
 
-_kind = functools.partial(kind_of, app)
-
-
 @app.callback()
 def _log(context: typer.Context, log: LogArgument) -> None:
     context.obj = log
 
 
-@_kind("name-place")
+@app.command("name-place")
 def _name_place(
+    *,
     place: PlaceArgument,
     name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Give a place a name."""
-    return lambda current, stamp: make.name_place(current, stamp, place, name)
+    edit.record(lambda current, stamp: make.name_place(current, stamp, place, name))
 
 
-@_kind("keep-apart")
-def _keep_apart(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
+@app.command("keep-apart")
+def _keep_apart(*, first: PlaceArgument, second: OtherPlaceArgument, edit: EditOptions) -> None:
     """Keep two places apart, whatever joins them later."""
-    return lambda current, stamp: make.keep_apart(current, stamp, first, second)
+    edit.record(lambda current, stamp: make.keep_apart(current, stamp, first, second))
 
 
-@_kind("undo-merge")
+@app.command("undo-merge")
 def _undo_merge(
+    *,
     offset: Annotated[
         int,
         typer.Argument(
             metavar="OFFSET", help="The offset of the merge, from `mapfold merges LOG`."
         ),
     ],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Undo a merge of places and keep them apart."""
-    return lambda current, stamp: make.undo_merge(current, stamp, offset)
+    edit.record(lambda current, stamp: make.undo_merge(current, stamp, offset))
 
 
-@_kind("join")
-def _join(first: PlaceArgument, second: OtherPlaceArgument) -> MakeCommand:
+@app.command("join")
+def _join(*, first: PlaceArgument, second: OtherPlaceArgument, edit: EditOptions) -> None:
     """Join two places into one.
 
     Also where no chain of poses connects them.
     """
-    return lambda current, stamp: make.join(current, stamp, first, second)
+    edit.record(lambda current, stamp: make.join(current, stamp, first, second))
 
 
-@_kind("same-object")
-def _same_object(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
+@app.command("same-object")
+def _same_object(*, first: ObjectArgument, second: OtherObjectArgument, edit: EditOptions) -> None:
     """Fuse two objects into one."""
-    return lambda current, stamp: make.same_object(current, stamp, first, second)
+    edit.record(lambda current, stamp: make.same_object(current, stamp, first, second))
 
 
-@_kind("different-objects")
-def _different_objects(first: ObjectArgument, second: OtherObjectArgument) -> MakeCommand:
+@app.command("different-objects")
+def _different_objects(
+    *, first: ObjectArgument, second: OtherObjectArgument, edit: EditOptions
+) -> None:
     """Keep two objects apart.
 
     Two observations of one object, named by their det_ids, become two objects.
     """
-    return lambda current, stamp: make.different_objects(current, stamp, first, second)
+    edit.record(lambda current, stamp: make.different_objects(current, stamp, first, second))
 
 
-@_kind("drop-object")
+@app.command("drop-object")
 def _drop_object(
+    *,
     thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Drop an object from the map, with the observations that it has now.
 
     The log keeps them.
     """
-    return lambda current, stamp: make.drop_object(current, stamp, thing)
+    edit.record(lambda current, stamp: make.drop_object(current, stamp, thing))
 
 
-@_kind("drop-detection")
+@app.command("drop-detection")
 def _drop_detection(
+    *,
     det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID", help="The det_id of each.")],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Drop detections from the map; the log keeps them."""
-    return lambda current, stamp: make.drop_detection(current, stamp, det_ids)
+    edit.record(lambda current, stamp: make.drop_detection(current, stamp, det_ids))
 
 
-@_kind("forget-run")
-def _forget_run(run: RunArgument) -> MakeCommand:
+@app.command("forget-run")
+def _forget_run(*, run: RunArgument, edit: EditOptions) -> None:
     """Drop all keyframes of a run from the map; the log keeps them."""
-    return lambda current, stamp: make.forget_run(current, stamp, run)
+    edit.record(lambda current, stamp: make.forget_run(current, stamp, run))
 
 
-@_kind("forget-keyframes")
+@app.command("forget-keyframes")
 def _forget_keyframes(
+    *,
     run: RunArgument,
     span: Annotated[
         str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
     ],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Drop some keyframes of a run from the map; the log keeps them."""
-    return lambda current, stamp: make.forget_keyframes(current, stamp, run, span)
+    edit.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
 
 
 _FromOption = Annotated[
@@ -154,8 +162,9 @@ _ToOption = Annotated[
 ]
 
 
-@_kind("correct-poses")
+@app.command("correct-poses")
 def _correct_poses(
+    *,
     run: RunArgument,
     file: Annotated[
         Path | None,
@@ -183,7 +192,8 @@ def _correct_poses(
             "--ignore-missing", help="Skip poses of keyframes that the run does not have."
         ),
     ] = False,
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Correct the poses of a run.
 
     By a trajectory file, or by one rigid transform. Keyframes that the file has no pose for keep
@@ -195,10 +205,13 @@ def _correct_poses(
     span = Span(_keyframe_id(first), _keyframe_id(last))
     if file is None:
         moves = (dx or 0.0, dy or 0.0, dyaw or 0.0)
-        return lambda current, stamp: by_transform(current, stamp, run, span, *moves)
+        edit.record(lambda current, stamp: by_transform(current, stamp, run, span, *moves))
+        return
     trajectory = read_trajectory(file)
-    return lambda current, stamp: by_trajectory(
-        current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
+    edit.record(
+        lambda current, stamp: by_trajectory(
+            current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
+        )
     )
 
 
@@ -206,39 +219,45 @@ def _keyframe_id(number: int | None) -> KeyframeId | None:
     return None if number is None else KeyframeId(number)
 
 
-@_kind("use-settings", settings=False)
+@app.command("use-settings")
 def _use_settings(
+    *,
     file: Annotated[
         Path | None, typer.Argument(metavar="FILE", help="JSON object of settings.")
     ] = None,
-    set_: SetOption = None,
-) -> MakeCommand:
+    chosen: AssignedSettings,
+    new: NewCommand,
+) -> None:
     """Change the settings of the map.
 
     To those of FILE, else those in force, changed by --preset and --set.
     """
-    if file is None and not set_:
+    if file is None and not chosen.assignments:
         raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
 
     def command(current: CurrentMap, stamp: Stamp) -> Command:
-        return make.use_settings(current, stamp, settings_from(file, set_, current.corrections))
+        return make.use_settings(
+            current, stamp, settings_from(file, chosen.assignments, current.corrections)
+        )
 
-    return command
+    new.record(command)
 
 
-@_kind("undo")
+@app.command("undo")
 def _undo(
+    *,
     undone: Annotated[str, typer.Argument(metavar="COMMAND_ID", help="From `mapfold edits LOG`.")],
-) -> MakeCommand:
+    edit: EditOptions,
+) -> None:
     """Undo a command, as if it had never been given.
 
     Undoing an undo restores the command.
     """
-    return lambda current, stamp: make.undo(current, stamp, undone)
+    edit.record(lambda current, stamp: make.undo(current, stamp, undone))
 
 
 def edits(
-    log: LogArgument,
+    *,
     effects: Annotated[
         bool,
         typer.Option(
@@ -246,17 +265,15 @@ def edits(
         ),
     ] = False,
     json_: JsonOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    source: LogSettings,
 ) -> None:
     """List the commands in a log: who gave which when and why, what it changed, what is undone.
 
     An effect counts the places, objects and keyframes that were changed in the map of the events
     before the command. `mapfold edit` keeps the effect of its command beside the log.
     """
-    settings_of = functools.partial(settings_from, settings_file, set_)
-    with LogReader(log) as reader:
-        current = CurrentMap(reader, settings_of, note=say)
+    with LogReader(source.log) as reader:
+        current = CurrentMap(reader, source.settings, note=say)
         found = effects_of(current, known_only=not effects)
         times = {event.offset: event.logged_ns for event in current.command_events()}
     if json_:

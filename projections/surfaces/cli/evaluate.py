@@ -15,17 +15,8 @@ from projections.localize.evaluate.questions import DEFAULT_SEED
 from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 
-from .options import (
-    HfovOption,
-    ImageOption,
-    JsonOption,
-    SetOption,
-    SettingsOption,
-    W,
-    camera_from,
-    check_picture,
-    settings_of,
-)
+from .folded_log import FoldSettings, W
+from .options import CameraOptions, JsonOption, check_picture
 from .relocalize import method_from
 from .terminal import display, emit, say
 
@@ -80,6 +71,7 @@ _LABEL = 30
 
 
 def evaluate(
+    *,
     map_logs: Annotated[
         list[Path],
         typer.Option("--map", metavar="LOG", help="Log of a map; may be repeated."),
@@ -105,8 +97,7 @@ def evaluate(
         int,
         typer.Option("--seed", metavar="N", help="Seed of the choice of crops."),
     ] = DEFAULT_SEED,
-    hfov: HfovOption = None,
-    image: ImageOption = None,
+    camera: CameraOptions,
     self_: Annotated[
         bool,
         typer.Option("--self", help="Ask the map about its own keyframes too; needs no truth."),
@@ -119,8 +110,7 @@ def evaluate(
             help="Draw the questions of three crops, and the error of each.",
         ),
     ] = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    chosen: FoldSettings,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -149,8 +139,8 @@ def evaluate(
         raise MisuseError("--picture draws one map; give one --map")
     asked = bool(query_logs or truth_files) or not self_
     if not asked:
-        _refuse_alone(method_from(method), hfov, image)
-    truth, settings = read_truth(truth_files or []), settings_of(settings_file, set_)
+        _refuse_alone(method_from(method), camera)
+    truth, settings = read_truth(truth_files or []), chosen.checked()
     found = []
     for map_log in map_logs:
         result = score(
@@ -160,7 +150,7 @@ def evaluate(
             settings,
             until=until,
             method=method_from(method),
-            camera=camera_from(hfov, image),
+            camera=camera.camera,
             seed=seed,
             own=self_,
             workers=workers,
@@ -185,12 +175,12 @@ def _print_scores(found: "_Scored", *, asked: bool) -> None:
         display(worst_text(found))
 
 
-def _refuse_alone(method: Method, hfov: float | None, image: str | None) -> None:
+def _refuse_alone(method: Method, camera: CameraOptions) -> None:
     """Raise MisuseError for options that questions of the map's own do not read."""
     given = {
         "--method plain": method == "plain",
-        "--hfov": hfov is not None,
-        "--image": image is not None,
+        "--hfov": camera.hfov is not None,
+        "--image": camera.image is not None,
     }
     unread = [option for option, is_given in given.items() if is_given]
     if unread:

@@ -13,24 +13,13 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.output_files import write_files
 from eventsrc.base.text import counted
-from eventsrc.log import LogReader
 from eventsrc.record.transport.config import is_loopback
 from projections.fold.corrections import map_fingerprint
-from projections.map.log_commands import read_corrections
 from projections.map.one_floor import view_of_floor
 from projections.map.scenes import RecordedFold
 from projections.store.history_recorder import map_after
 
-from .options import (
-    KnownAtOption,
-    LogArgument,
-    SetOption,
-    SettingsOption,
-    W,
-    known_point,
-    point,
-    settings_from,
-)
+from .folded_log import FoldToOption, KnownAtOption, LogSettings
 from .signals import stop_on_signals
 from .terminal import Bar, say
 
@@ -39,8 +28,8 @@ if TYPE_CHECKING:
 
 
 def export(
-    log: LogArgument,
-    at: Annotated[str, typer.Option("--at", metavar="W", help=f"Fold to here: {W}.")] = "end",
+    *,
+    at: FoldToOption = "end",
     graphml: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Places and Objects as a graph: Gephi, yEd, networkx."),
@@ -103,8 +92,7 @@ def export(
         ),
     ] = None,
     known_at: KnownAtOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    source: LogSettings,
 ) -> None:
     """Write the map folded to a point in the log for other programs.
 
@@ -129,11 +117,7 @@ def export(
     from projections.adapters import export as formats  # here: with the imports of several formats
 
     where = None if origin is None else formats.Origin(*_degrees(origin))
-    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
-    with LogReader(log) as reader:
-        end = point(reader, at)
-        corrections = read_corrections(reader, known_point(reader, known_at, end))
-        settings = settings_from(settings_file, set_, corrections)
+    with source.opened(at, known_at) as (reader, end, _, corrections, settings):
         for name, file in recordings.items():
             if file is not None:
                 write = _recorder(
@@ -204,7 +188,7 @@ def _degrees(text: str) -> tuple[float, ...]:
 
 
 def foxglove(
-    log: LogArgument,
+    *,
     host: Annotated[str, typer.Option(metavar="ADDRESS", help="Listen here.")] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
@@ -216,8 +200,7 @@ def foxglove(
         ),
     ] = None,
     known_at: KnownAtOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    source: LogSettings,
 ) -> None:
     """Show a log's map in Foxglove, whose timeline sets the time.
 
@@ -237,14 +220,11 @@ def foxglove(
             f"mapfold foxglove needs {error.name}, which is not installed;"
             " pip install 'mapfold[foxglove]'"
         ) from None
-    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
+    source.checked()
     if layout is not None:
         write_files({layout: layout_json().encode()})
         say(f"wrote {layout}")
-    with LogReader(log) as reader:
-        end = reader.next_offset
-        corrections = read_corrections(reader, known_point(reader, known_at, end))
-        settings = settings_from(settings_file, set_, corrections)
+    with source.opened(known_at=known_at) as (reader, end, _, corrections, settings):
         with Bar() as bar:
             maps = PastMaps(reader, settings, corrections, end, bar.show_fold)
         if maps.moments.backwards:
@@ -253,7 +233,7 @@ def foxglove(
                 " before; the timeline shows them at that event's time"
             )
         try:
-            playback = Playback(maps, log.resolve().name, host, port)
+            playback = Playback(maps, source.log.resolve().name, host, port)
         except (OSError, UnicodeError) as error:  # the latter of a host that is no text
             raise MisuseError(
                 f"cannot listen on {host}:{port}: {error}; give another --host or --port"
@@ -262,7 +242,9 @@ def foxglove(
             if not is_loopback(host):
                 say(f"warning: others can reach {host}, and can read the log; there is no token")
             shown = f"[{host}]" if ":" in host else host
-            say(f"showing {counted(end, 'event')} of {log} at ws://{shown}:{playback.server.port}")
+            say(
+                f"showing {counted(end, 'event')} of {source.log} at ws://{shown}:{playback.server.port}"
+            )
             say(
                 f"in Foxglove: Open connection, Foxglove WebSocket (it must speak {PROTOCOL});"
                 " Ctrl-C ends it"

@@ -5,41 +5,34 @@ something was found at one.
 """
 
 from dataclasses import asdict
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
 from projections.adapters.fleet.engine import Ended, usable_cores
-from projections.adapters.fleet.site_databases import check_server, site_databases, template_of
+from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
-from projections.fold.settings import Settings
 
 from .databases import LoaderOption, Loaders, loader_of
 from .fleet_options import (
     EngineOption,
+    FleetDatabases,
     JobsOption,
     QuestionJobsOption,
     SitesArgument,
     TemplateOption,
-    VectorTemplateOption,
     ended_sites,
     sites_of,
 )
 from .fleet_text import status_table, which_site_text
-from .options import (
-    HfovOption,
-    ImageOption,
-    JsonOption,
-    QuestionArgument,
-    SetOption,
-    SettingsOption,
-    camera_from,
-    question_from,
-    settings_from,
-)
+from .folded_log import FoldSettings, settings_from
+from .options import CameraOptions, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, finish, say
+
+if TYPE_CHECKING:
+    from projections.adapters.fleet.replaying import ChosenSettings
 
 fleet_app = typer.Typer(
     help="Rebuild, check and ask many sites, each with a log and a database of its own.",
@@ -49,13 +42,13 @@ fleet_app = typer.Typer(
 _NAMED: Final = 10
 
 
-def _chosen(file: Any, assignments: list[str] | None) -> Any:
+def _chosen(given: FoldSettings) -> "ChosenSettings":
     """The values of ``--settings`` and ``--set``, read here: workers may be on other machines."""
     from projections.adapters.fleet.replaying import ChosenSettings
 
-    settings_from(file, assignments)  # raises for invalid ones
-    base: Settings | None = None if file is None else settings_from(file, None)
-    return ChosenSettings(base, tuple(assignments or ()))
+    given.checked()
+    base = None if given.settings_file is None else settings_from(given.settings_file, None)
+    return ChosenSettings(base, tuple(given.assignments))
 
 
 def _check_reach(engine: str, db: str | None) -> None:
@@ -69,6 +62,7 @@ def _check_reach(engine: str, db: str | None) -> None:
 
 @fleet_app.command()
 def replay(
+    *,
     place: SitesArgument,
     engine: EngineOption = "local",
     jobs: JobsOption = None,
@@ -78,10 +72,8 @@ def replay(
     replace: Annotated[
         bool, typer.Option("--replace", help="Rebuild also over the map of another log.")
     ] = False,
-    db: TemplateOption = None,
-    vector_db: VectorTemplateOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    stores: FleetDatabases,
+    settings: FoldSettings,
     loader: LoaderOption = Loaders.copy,
     no_hnsw: Annotated[
         bool, typer.Option("--no-hnsw", help="Do not index large tables for vector search.")
@@ -95,11 +87,11 @@ def replay(
     """
     from projections.adapters.fleet.replaying import ReplayRequest, SiteReplay, replay_site
 
-    chosen = _chosen(settings_file, assignments)
+    chosen = _chosen(settings)
     sites = sites_of(place)
-    _check_reach(engine, db)
+    _check_reach(engine, stores.db)
     entries: dict[int, dict[str, Any]] = {}
-    with site_databases(sites, db, vector_db) as databases:
+    with stores.opened(sites) as databases:
         requests = [
             ReplayRequest(
                 site,
@@ -167,12 +159,11 @@ def _say_failed(failed: list[tuple[str, str]]) -> None:
 
 @fleet_app.command()
 def status(
+    *,
     place: SitesArgument,
     jobs: JobsOption = None,
-    db: TemplateOption = None,
-    vector_db: VectorTemplateOption = None,
-    assignments: SetOption = None,
-    settings_file: SettingsOption = None,
+    stores: FleetDatabases,
+    settings: FoldSettings,
     as_json: JsonOption = False,
 ) -> None:
     """Show a table of all sites: log, last keyframe, losses, and how far the databases are.
@@ -184,10 +175,10 @@ def status(
     from .db import status_document
     from .log import info_document
 
-    chosen = _chosen(settings_file, assignments)
+    chosen = _chosen(settings)
     sites = sites_of(place)
     found: list[SiteStatus] = [SiteStatus()] * len(sites)
-    with site_databases(sites, db, vector_db) as databases:
+    with stores.opened(sites) as databases:
         requests = [StatusRequest(site, databases[site.name], chosen) for site in sites]
         with ended_sites(look_at_site, requests, sites, "local", jobs) as results:
             for ended in results:
@@ -210,6 +201,7 @@ def status(
 
 @fleet_app.command()
 def verify(
+    *,
     place: SitesArgument,
     engine: EngineOption = "local",
     jobs: JobsOption = None,
@@ -250,16 +242,15 @@ def verify(
 
 @fleet_app.command()
 def relocalize(
+    *,
     place: SitesArgument,
     query: QuestionArgument,
     top: Annotated[
         int, typer.Option("--top", metavar="N", min=1, max=100, help="Places of each site.")
     ] = 3,
-    hfov: HfovOption = None,
-    image: ImageOption = None,
+    camera: CameraOptions,
     jobs: QuestionJobsOption = None,
-    db: TemplateOption = None,
-    vector_db: VectorTemplateOption = None,
+    stores: FleetDatabases,
     as_json: JsonOption = False,
 ) -> None:
     """Find the site a robot is at, from a few object crops: the probability of each, and of none.
@@ -269,11 +260,11 @@ def relocalize(
     """
     from projections.adapters.fleet.asking import ask_sites
 
-    question, camera = question_from(query), camera_from(hfov, image)
+    question, asked_by = question_from(query), camera.camera
     sites = sites_of(place)
-    with site_databases(sites, db, vector_db) as databases:
+    with stores.opened(sites) as databases:
         answer = ask_sites(
-            sites, databases, question, top=top, camera=camera, jobs=jobs or 2 * usable_cores()
+            sites, databases, question, top=top, camera=asked_by, jobs=jobs or 2 * usable_cores()
         )
     best = answer.which.best
     if as_json:
@@ -294,6 +285,7 @@ def relocalize(
 
 @fleet_app.command()
 def url(
+    *,
     place: SitesArgument,
     site: Annotated[str, typer.Argument(metavar="SITE", help="The site's name.")],
     db: TemplateOption = None,
@@ -307,7 +299,7 @@ def url(
         names = ", ".join(visible(each.name) for each in sites[:_NAMED])
         more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
         raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
-    with site_databases(sites, db, None) as databases:
+    with FleetDatabases(db=db).opened(sites) as databases:
         display(databases[site].graph_url)
 
 

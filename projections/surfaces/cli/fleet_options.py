@@ -2,6 +2,8 @@
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +14,7 @@ from eventsrc.base.text import counted
 from eventsrc.log import LogReader
 from projections.adapters.fleet.engine import Ended, Engine, Task, usable_cores
 from projections.adapters.fleet.local_pool import LocalPool
+from projections.adapters.fleet.site_databases import SiteDatabases, site_databases
 from projections.adapters.fleet.sites import Site, find_sites
 
 from .terminal import Bar, people, say
@@ -74,6 +77,18 @@ def _jobs_option(default: str) -> Any:
 JobsOption = Annotated[int | None, _jobs_option("the number of cores")]
 QuestionJobsOption = Annotated[int | None, _jobs_option("twice the number of cores")]
 """For `relocalize`, which waits for databases."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetDatabases:
+    """``--db`` and ``--vector-db``, each with a database for every site."""
+
+    db: TemplateOption = None
+    vector_db: VectorTemplateOption = None
+
+    def opened(self, sites: Sequence[Site]) -> AbstractContextManager[dict[str, SiteDatabases]]:
+        """The databases by name of site."""
+        return site_databases(sites, self.db, self.vector_db)
 
 
 def sites_of(place: Path) -> list[Site]:

@@ -28,27 +28,8 @@ from eventsrc.record.importers.map_yaml import read_map_yaml
 from eventsrc.record.importers.source import Source
 from eventsrc.record.importers.topics import NOT_CHOSEN
 from eventsrc.record.transport.config import check_key
-from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS
 
-from .bag_text import (
-    BaseFrameOption,
-    CameraOption,
-    CovarianceOption,
-    DetectionsOption,
-    EmbeddingsOption,
-    GridOption,
-    HeightsOption,
-    LabelsOption,
-    MapFrameOption,
-    MaxGapOption,
-    ModelOption,
-    PoseOption,
-    RunIdOption,
-    bag_lines,
-    check_run_id,
-    labels_by_number,
-    max_gap_ns,
-)
+from .bag_text import BagChoice, bag_lines
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -59,6 +40,7 @@ _MOST_TOPICS: Final = 10
 
 
 def import_(
+    *,
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
     ],
@@ -95,19 +77,7 @@ def import_(
             help="Only topics (keys) that match this, such as 'tb/*'; may be repeated.",
         ),
     ] = None,
-    detections: DetectionsOption = None,
-    pose: PoseOption = None,
-    covariance: CovarianceOption = None,
-    embeddings: EmbeddingsOption = None,
-    camera: CameraOption = None,
-    grid: GridOption = None,
-    map_frame: MapFrameOption = None,
-    base_frame: BaseFrameOption = None,
-    run_id: RunIdOption = None,
-    labels: LabelsOption = None,
-    embedding_model: ModelOption = None,
-    heights: HeightsOption = False,
-    max_gap: MaxGapOption = DEFAULT_MAX_GAP_NS / 1e9,
+    choice: BagChoice,
     json_: JsonOption = False,
 ) -> None:
     """Append recorded envelopes and occupancy maps to a log, in the order of the files.
@@ -132,21 +102,7 @@ def import_(
         raise MisuseError(f"--floor {visible(floor)} is for a map; give one by --map, too")
     topics = TopicChoice.of(topic or ())
     given_map = None if map_ is None else read_map_yaml(map_, floor)
-    bags = BagOptions(
-        tuple(detections or ()),
-        pose,
-        covariance,
-        embeddings,
-        camera,
-        grid,
-        map_frame,
-        base_frame,
-        check_run_id(run_id),
-        embedding_model,
-        labels_by_number(labels),
-        heights,
-        max_gap_ns(max_gap),
-    )
+    bags = choice.options()
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer:

@@ -3,12 +3,12 @@ needs the same log, settings and databases: a fault that a check found under ``-
 repaired only under these settings.
 """
 
-import inspect
-from collections.abc import Callable, Collection, Sequence
-from functools import lru_cache, wraps
+from collections.abc import Collection, Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import typer
+from typer.core import TyperCommand
 
 from eventsrc.base.advised import complete_by
 
@@ -27,46 +27,23 @@ _ANSWERS_OTHERS: Final = frozenset({"serve", "ui"})
 """Commands whose messages are also sent to other machines, which must not get the databases'
 URLs."""
 _LOG: Final = "log"
-_CONTEXT: Final = "running_context"
 
 _running: list[Any] = []
 """The click contexts of running commands: one, or none."""
 
 
-def remember_running(app: typer.Typer) -> None:
-    """Have each command of ``app`` complete the command lines that are advised while it runs."""
-    for command in app.registered_commands:
-        if command.callback is not None:
-            command.callback = _remembered(command.callback)
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            remember_running(group.typer_instance)
+class AdvisingCommand(TyperCommand):
+    """A command that completes the command lines that are advised while it runs."""
 
-
-def _remembered(callback: Callable[..., Any]) -> Callable[..., Any]:
-    """``callback``, given its context under the name `_CONTEXT`, or under its own."""
-    parameters = list(inspect.signature(callback, eval_str=True).parameters.values())
-    own = next((each.name for each in parameters if each.annotation is typer.Context), None)
-    if own == _CONTEXT:  # a group's commands stay as they are when the program is made again
-        return callback
-
-    @wraps(callback)
-    def run(**values: Any) -> Any:
-        _running.append(values[own] if own is not None else values.pop(_CONTEXT))
+    def invoke(self, ctx: Any) -> Any:
+        """As typer does it."""
+        _running.append(ctx)
         complete_by(_complete)
         try:
-            return callback(**values)
+            return super().invoke(ctx)
         finally:
             _running.pop()
             complete_by(None)
-
-    keyword_only = inspect.Parameter.KEYWORD_ONLY
-    keywords = [each.replace(kind=keyword_only) for each in parameters]
-    if own is None:
-        keywords.append(inspect.Parameter(_CONTEXT, keyword_only, annotation=typer.Context))
-    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in keywords}
-    return run
 
 
 def _complete(words: Sequence[str], without: Collection[str]) -> list[str]:

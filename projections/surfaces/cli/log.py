@@ -29,7 +29,8 @@ from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 
 from .event_text import event_document, event_line, iso_time
-from .options import JsonOption, LogArgument
+from .folded_log import LogArgument
+from .options import JsonOption
 from .spaces import spaces
 from .terminal import display, emit, emit_lines, finish, say
 

@@ -9,36 +9,21 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
-from eventsrc.log import LogReader
 from projections.map.advice import places_advice, space_advice
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
-from projections.map.log_commands import read_corrections
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache
 
-from .options import (
-    JsonOption,
-    KnownAtOption,
-    NoCacheOption,
-    SetOption,
-    SettingsOption,
-    W,
-    check_picture,
-    known_point,
-    point,
-    settings_from,
-)
+from .folded_log import CachedLog, FoldToOption, KnownAtOption, LogSettings
+from .options import JsonOption, check_picture
 from .terminal import display, emit, say
 
 
 def state(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
-    at: Annotated[
-        str,
-        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
-    ] = "end",
+    *,
+    at: FoldToOption = "end",
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
@@ -46,9 +31,7 @@ def state(
         bool,
         typer.Option("--no-digest", help="Leave out the digest, which reads the whole map."),
     ] = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    source: CachedLog,
 ) -> None:
     """Show the map folded to a point in the log.
 
@@ -58,14 +41,9 @@ def state(
         raise MisuseError("--json and --digest together: --json prints the digest too")
     if digest and no_digest:
         raise MisuseError("--digest and --no-digest exclude each other")
-    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
-    with LogReader(log) as reader:
-        end = point(reader, at)
-        known = known_point(reader, known_at, end)
-        corrections = read_corrections(reader, known)
-        settings = settings_from(settings_file, set_, corrections)
+    with source.opened(at, known_at) as (reader, end, known, corrections, settings):
         view = map_after(
-            reader, settings, end, corrections=corrections, note=say, cache=not no_cache
+            reader, settings, end, corrections=corrections, note=say, cache=not source.no_cache
         )
     hexdigits = None
     if not no_digest:
@@ -83,11 +61,8 @@ def state(
 
 
 def draw(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")],
-    at: Annotated[
-        str,
-        typer.Option("--at", metavar="W", help=f"Fold to here: {W}."),
-    ] = "end",
+    *,
+    at: FoldToOption = "end",
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="The picture: .png, .svg or .pdf.")
     ] = Path("map.png"),
@@ -110,8 +85,7 @@ def draw(
         bool, typer.Option("--merges", help="Mark the keyframes that merged places.")
     ] = False,
     known_at: KnownAtOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    source: LogSettings,
 ) -> None:
     """Draw the map folded to a point in the log.
 
@@ -124,16 +98,12 @@ def draw(
     from projections.map.one_floor import view_of_floor
 
     check_picture(out)
-    settings_from(settings_file, set_)  # a bad value is an error before the log is opened
-    with LogReader(log) as reader:
-        end = point(reader, at)
-        corrections = read_corrections(reader, known_point(reader, known_at, end))
-        settings = settings_from(settings_file, set_, corrections)
+    with source.opened(at, known_at) as (reader, end, _, corrections, settings):
         cache = TimelineCache(reader, settings, corrections, say)
         recorder = HistoryRecorder(reader, settings, corrections, cache, None)
         view: MapView = recorder.at(end)
         merged = [m for m in recorder.history(end).merges if m.cause.offset < end]
-    title = f"{log.resolve().name} after {counted(view.next_offset, 'event')}"
+    title = f"{source.log.resolve().name} after {counted(view.next_offset, 'event')}"
     if floor is not None:
         view, title = view_of_floor(view, floor), f"{title}, floor {visible(floor)}"
     elif len(floors := {k.floor for k in view.keyframes if k.pose is not None}) > 1:

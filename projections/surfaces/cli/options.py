@@ -1,142 +1,27 @@
-"""Options and arguments that several commands share, and their parsing.
+"""Groups of options that several commands share, and their parsing: databases, Zenoh, questions.
 
 What only some commands need (databases, re-localisation, pictures) is imported in the
 function that uses it: the imports of all of them take longer than most commands.
 """
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eventsrc.base.advised import advised
-from eventsrc.base.errors import MisuseError
 from eventsrc.base.user_files import FileFault, read_file
-from eventsrc.envelope.model import Offset
-from eventsrc.log import LogReader
-from eventsrc.log.seek import resolve
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
-from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.errors import QuestionError, SettingsError
-from projections.fold.settings import Settings, read_settings
-
-from .terminal import say
+from projections.fold.errors import QuestionError
 
 if TYPE_CHECKING:
+    from eventsrc.record.transport.session import Session
     from projections.localize.relocalize import Camera, Question
     from projections.postgres.connection import Targets
 
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
-NoCacheOption = Annotated[
-    bool,
-    typer.Option("--no-cache", help="Do not use the cached history beside the log, nor write it."),
-]
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
-
-# Points of a log
-
-W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
-"""The forms of W, for help texts."""
-
-
-def point(reader: LogReader, text: str) -> Offset:
-    """The number of events that W means in this log; warns when times run backwards in it."""
-    return resolve(reader, text, note=say)
-
-
-KnownAtOption = Annotated[
-    str | None,
-    typer.Option(
-        "--known-at",
-        metavar="V",
-        help="Apply only the commands recorded before here [default: the end of the map].",
-    ),
-]
-
-
-def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
-    """The point of ``--known-at``; the map's own ``end`` without it."""
-    return end if text is None else point(reader, text)
-
-
-# Settings of the fold
-
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Change a setting of the fold, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
-    ),
-]
-SettingsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--settings",
-        metavar="FILE",
-        help="JSON object of settings instead of those that the log names; --set goes on top.",
-    ),
-]
-
-
-def settings_from(
-    file: Path | None, assignments: list[str] | None, corrections: Corrections = NO_CORRECTIONS
-) -> Settings:
-    """The settings of a command: those of ``--settings``, else those that the log names
-    (``use-settings``), else the defaults; ``--set`` changes them.
-
-    Raises SettingsError naming file and field.
-    """
-    logged = corrections.settings or Settings()
-    settings = logged if file is None else _settings_of_file(file)
-    return settings.with_assignments(assignments or ())
-
-
-def settings_of(
-    file: Path | None, assignments: list[str] | None
-) -> Callable[[Corrections], Settings]:
-    """`settings_from` as a function of the corrections, which are read later. Raises SettingsError
-    for invalid options at once."""
-    settings_from(file, assignments)
-    return partial(settings_from, file, assignments)
-
-
-def _settings_of_file(file: Path) -> Settings:
-    try:
-        return read_settings(file)
-    except (FileFault, SettingsError) as error:
-        raise SettingsError(f"--settings {file}: {error}") from None
-
-
-def past_settings(
-    log: Path | None,
-    file: Path | None,
-    assignments: list[str] | None,
-    corrections: Corrections = NO_CORRECTIONS,
-) -> Settings:
-    """The settings to fold ``log`` with, for a question to a past map.
-
-    Raises MisuseError when there are settings but no log: the live map keeps its own.
-    """
-    if log is None and (file is not None or assignments):
-        raise MisuseError(
-            "--preset, --set and --settings are for folding a log, and the live map keeps the"
-            " settings it was made with; give --log LOG too, or run"
-            f" `{advised('replay')}`"
-        )
-    return settings_from(file, assignments, corrections)
-
-
-def say_defaults(settings: Settings) -> None:
-    """Print, after a fold with default settings, that the live map may have others."""
-    if settings == Settings():
-        say("folded with the default settings; if the live map has others, give them by --set")
-
-
 # Databases
 
 DbOption = Annotated[
@@ -157,13 +42,18 @@ VectorDbOption = Annotated[
 ]
 
 
-@contextlib.contextmanager
-def databases(db: str | None, vector_db: str | None) -> "Iterator[Targets]":
-    """The databases a command uses; an embedded server it started is stopped, also by a signal."""
-    from projections.postgres.connection import open_targets
+@dataclass(frozen=True, kw_only=True)
+class Databases:
+    """``--db`` and ``--vector-db``."""
 
-    with open_targets(db, vector_db) as targets:
-        yield targets
+    db: DbOption = None
+    vector_db: VectorDbOption = None
+
+    def opened(self) -> "AbstractContextManager[Targets]":
+        """The databases; an embedded server that this starts is stopped at the end."""
+        from projections.postgres.connection import open_targets
+
+        return open_targets(self.db, self.vector_db)
 
 
 # Zenoh
@@ -212,11 +102,38 @@ PublishKeyOption = Annotated[
 ]
 
 
-def zenoh_options(
-    connect: list[str] | None, listen: list[str] | None, config: Path | None
-) -> ZenohOptions:
-    """The Zenoh configuration of ``--connect``, ``--listen`` and ``--zenoh-config``."""
-    return ZenohOptions(tuple(connect or ()), tuple(listen or ()), config)
+@dataclass(frozen=True, kw_only=True)
+class ZenohClient:
+    """``--connect`` and ``--zenoh-config``."""
+
+    connect: ConnectOption = None
+    zenoh_config: ConfigOption = None
+
+    @property
+    def zenoh(self) -> ZenohOptions:
+        """The Zenoh configuration."""
+        return ZenohOptions(tuple(self.connect or ()), (), self.zenoh_config)
+
+    def session(self) -> "AbstractContextManager[Session]":
+        """A new session."""
+        from eventsrc.record.transport.session import open_session
+
+        return open_session(self.zenoh, mode=self.zenoh.mode)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ZenohPeer:
+    """``--connect``, ``--listen`` and ``--zenoh-config``."""
+
+    connect: ConnectBesideListenOption = None
+    listen: ListenOption = None
+    zenoh_config: ConfigOption = None
+
+    @property
+    def zenoh(self) -> ZenohOptions:
+        """The Zenoh configuration."""
+        listen = tuple(self.listen or ())
+        return ZenohOptions(tuple(self.connect or ()), listen, self.zenoh_config)
 
 
 # Questions to the map
@@ -235,25 +152,6 @@ OptionalQuestion = Annotated[
         metavar="QUERY",
         help="JSON file with the crops: an envelope, a list of detections, or an object with"
         " crops or views; - reads stdin.",
-        show_default=False,
-    ),
-]
-HfovOption = Annotated[
-    float | None,
-    typer.Option(
-        "--hfov",
-        metavar="DEGREES",
-        help="Horizontal field of view of the robot's camera [default: that of the map's"
-        " settings].",
-        show_default=False,
-    ),
-]
-ImageOption = Annotated[
-    str | None,
-    typer.Option(
-        "--image",
-        metavar="WxH",
-        help="Size of the camera's pictures in pixels [default: that of the map's settings].",
         show_default=False,
     ),
 ]
@@ -278,21 +176,51 @@ def question_from(query: str) -> "Question":
         raise QuestionError(f"{query}: {error}") from None
 
 
-def camera_from(hfov: float | None, image: str | None) -> "Camera | None":
-    """The camera that ``--hfov`` and ``--image`` describe; None without either of them, and with
-    one alone the other is that of mapfold's defaults. Raises QuestionError for a bad size."""
-    from projections.localize.relocalize import DEFAULT_CAMERA, Camera
+_HfovOption = Annotated[
+    float | None,
+    typer.Option(
+        "--hfov",
+        metavar="DEGREES",
+        help="Horizontal field of view of the robot's camera [default: that of the map's"
+        " settings].",
+        show_default=False,
+    ),
+]
+_ImageOption = Annotated[
+    str | None,
+    typer.Option(
+        "--image",
+        metavar="WxH",
+        help="Size of the camera's pictures in pixels [default: that of the map's settings].",
+        show_default=False,
+    ),
+]
 
-    if hfov is None and image is None:
-        return None
-    hfov = DEFAULT_CAMERA.hfov_deg if hfov is None else hfov
-    if image is None:
-        return Camera(DEFAULT_CAMERA.width_px, DEFAULT_CAMERA.height_px, hfov)
-    width, _, height = image.lower().partition("x")
-    try:
-        return Camera(float(width), float(height), hfov)
-    except ValueError:
-        raise QuestionError(f"--image {image}: write it as 640x400, in pixels") from None
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """``--hfov`` and ``--image``."""
+
+    hfov: _HfovOption = None
+    image: _ImageOption = None
+
+    @property
+    def camera(self) -> "Camera | None":
+        """The camera that these describe; None without either of them, and with one alone the other
+        is that of mapfold's defaults. Raises QuestionError for a bad size."""
+        from projections.localize.relocalize import DEFAULT_CAMERA, Camera
+
+        hfov, image = self.hfov, self.image
+        if hfov is None and image is None:
+            return None
+        hfov = DEFAULT_CAMERA.hfov_deg if hfov is None else hfov
+        if image is None:
+            return Camera(DEFAULT_CAMERA.width_px, DEFAULT_CAMERA.height_px, hfov)
+        width, _, height = image.lower().partition("x")
+        try:
+            return Camera(float(width), float(height), hfov)
+        except ValueError:
+            raise QuestionError(f"--image {image}: write it as 640x400, in pixels") from None
 
 
 # Pictures

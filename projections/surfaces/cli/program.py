@@ -37,8 +37,8 @@ from typer.core import TyperGroup
 from eventsrc.base.errors import MapfoldError, MisuseError
 
 from . import COMMANDS, SECTIONS
-from .in_force import remember_running
-from .presets import add_presets
+from .in_force import AdvisingCommand
+from .option_groups import flattened
 from .reading_bar import ReadingBar
 from .signals import unwind_on_signals
 from .terminal import EXIT_FAILED, OutputLost, output_begins, say
@@ -132,11 +132,24 @@ def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
     app.callback()(_main_options)
     for module in dict.fromkeys(modules[name] for name in names):
         importlib.import_module(module).register(app)
-    add_presets(app)
-    _refuse_empty_paths(app)
-    remember_running(app)
-    _list_whole_sentences(app)
+    _complete(app)
     return app
+
+
+def _complete(app: typer.Typer) -> None:
+    """Give typer the options of groups, refuse empty paths, have each command complete the command
+    lines that it advises, and list its whole first sentence, which typer would cut."""
+    for command in app.registered_commands:
+        said = inspect.getdoc(command.callback) or ""
+        command.short_help = said.split("\n\n")[0].replace("\n", " ")
+        command.cls = AdvisingCommand
+        if command.callback is not None:
+            command.callback = flattened(command.callback)
+            _refuse_empty_paths(command.callback)
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            group.short_help = group.typer_instance.info.help
+            _complete(group.typer_instance)
 
 
 class _GivenPath(type(Path())):  # type: ignore[misc]
@@ -160,32 +173,16 @@ class _GivenPath(type(Path())):  # type: ignore[misc]
         return core_schema.no_info_plain_validator_function(cls)
 
 
-def _refuse_empty_paths(app: typer.Typer) -> None:
-    """Make every path of the commands a `_GivenPath`."""
-    for command in app.registered_commands:
-        parameters = inspect.signature(command.callback, eval_str=True).parameters.values()  # type: ignore[arg-type]
-        for annotation in (each.annotation for each in parameters):
-            if _has_path(annotation):
-                for note in annotation.__metadata__:
-                    note.path_type = _GivenPath
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            _refuse_empty_paths(group.typer_instance)
+def _refuse_empty_paths(command: Callable[..., Any]) -> None:
+    """Make every path of a command a `_GivenPath`."""
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        if _has_path(parameter.annotation):
+            for note in parameter.annotation.__metadata__:
+                note.path_type = _GivenPath
 
 
 def _has_path(annotation: Any) -> bool:
     return annotation is Path or any(map(_has_path, get_args(annotation)))
-
-
-def _list_whole_sentences(app: typer.Typer) -> None:
-    """Make lists of commands show the first sentence of each one's help, which they would cut."""
-    for command in app.registered_commands:
-        said = inspect.getdoc(command.callback) or ""
-        command.short_help = said.split("\n\n")[0].replace("\n", " ")
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            group.short_help = group.typer_instance.info.help
-            _list_whole_sentences(group.typer_instance)
 
 
 def _print_version(wanted: bool) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,50 +25,74 @@ from projections.postgres.queries.map_queries import (
 from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
 from projections.store.history_recorder import map_after
 
-from .options import (
-    DbOption,
-    JsonOption,
-    QuestionArgument,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    W,
-    databases,
-    past_settings,
-    point,
-    question_from,
-    say_defaults,
-)
+from .folded_log import FoldSettings, W, point, say_defaults
+from .options import Databases, DbOption, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, say
 
-AtOption = Annotated[
-    str | None,
-    typer.Option("--at", metavar="W", help=f"Ask the map as it was: {W} of --log."),
-]
-LogOption = Annotated[
-    Path | None,
-    typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
-]
 PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
 
 
+@dataclass(frozen=True, kw_only=True)
+class PastMap:
+    """The log to ask instead of the live map, and the point up to which it is folded."""
+
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="W", help=f"Ask the map as it was: {W} of --log."),
+    ] = None
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AskedMap(FoldSettings, PastMap):
+    """The map that a question is for."""
+
+    db: DbOption = None
+
+    @contextlib.contextmanager
+    def source(self) -> Iterator[MapSource]:
+        """The live graph, or the log folded to a point with its settings and corrections."""
+        if self.log is not None:
+            with LogReader(self.log) as reader:
+                end = point(reader, self.at or "end")
+                corrections = read_corrections(reader, end)
+                settings = self.of_past_map(self.log, corrections)
+                view = map_after(reader, settings, end, corrections=corrections, note=say)
+            say_defaults(settings)
+            yield FoldedMap(view)
+            return
+        self.of_past_map(None)  # refuses settings
+        if self.at is not None:
+            raise MisuseError("--at asks a past map, which only the log knows; give --log LOG too")
+        with (
+            Databases(db=self.db).opened() as targets,
+            connect(targets.graph_url, application="mapfold query", autocommit=True) as connection,
+        ):
+            prepare_graph(connection)
+            yield LiveMap(connection)
+
+
 def similar(
+    *,
     query: QuestionArgument,
     top: Annotated[
         int, typer.Option("--top", metavar="N", min=1, max=64, help="Objects to list.")
     ] = 10,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
+    databases: Databases,
     json_: JsonOption = False,
 ) -> None:
     """List the objects that look most like the crops of QUERY."""
     crops = question_from(query).crops
-    with databases(db, vector_db) as targets, CandidateReader(targets) as reader:
+    with databases.opened() as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
     _print(found, json_)
 
 
 def where(
+    *,
     wanted: Annotated[
         str,
         typer.Argument(
@@ -75,98 +100,56 @@ def where(
             help="An object's id, a kind of room such as kitchen, or a place's name.",
         ),
     ],
-    at: AtOption = None,
-    log: LogOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    db: DbOption = None,
+    asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """Find an object, or the places that are rooms of a kind, such as kitchens.
 
     What kind of room a place is follows from the objects in it, or from its name.
     """
-    with _map_source(db, log, at, settings_file, set_) as source:
+    with asked.source() as source:
         _print(where_is(source, wanted), json_)
 
 
 def contents(
+    *,
     place_id: PlaceArgument,
-    at: AtOption = None,
-    log: LogOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    db: DbOption = None,
+    asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """List the objects located in a place."""
-    with _map_source(db, log, at, settings_file, set_) as source:
+    with asked.source() as source:
         _print(objects_of(source, place_id), json_)
 
 
 def holding(
+    *,
     class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
     start: Annotated[
         str, typer.Option("--from", metavar="PLACE", help="The id of the place to start from.")
     ],
     hops: Annotated[int, typer.Option("--hops", metavar="N", min=0, help="Most steps.")] = 2,
-    at: AtOption = None,
-    log: LogOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    db: DbOption = None,
+    asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """List the places near a place that hold an object of a class.
 
     Near is at most --hops steps away; a step is from a place to an adjacent one.
     """
-    with _map_source(db, log, at, settings_file, set_) as source:
+    with asked.source() as source:
         _print(places_holding(source, class_name, start, hops), json_)
 
 
 def path(
+    *,
     start: PlaceArgument,
     goal: Annotated[str, typer.Argument(metavar="GOAL", help="The other place's id.")],
-    at: AtOption = None,
-    log: LogOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    db: DbOption = None,
+    asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """List the places on the way from one place to another."""
-    with _map_source(db, log, at, settings_file, set_) as source:
+    with asked.source() as source:
         _print(path_between(source, start, goal), json_)
-
-
-@contextlib.contextmanager
-def _map_source(
-    db: str | None,
-    log: Path | None,
-    at: str | None,
-    settings_file: Path | None,
-    assignments: list[str] | None,
-) -> Iterator[MapSource]:
-    """The live graph, or the log folded to a point with its settings and corrections."""
-    if log is not None:
-        with LogReader(log) as reader:
-            end = point(reader, at or "end")
-            corrections = read_corrections(reader, end)
-            settings = past_settings(log, settings_file, assignments, corrections)
-            view = map_after(reader, settings, end, corrections=corrections, note=say)
-        say_defaults(settings)
-        yield FoldedMap(view)
-        return
-    past_settings(log, settings_file, assignments)  # refuses them
-    if at is not None:
-        raise MisuseError("--at asks a past map, which only the log knows; give --log LOG too")
-    with (
-        databases(db, None) as targets,
-        connect(targets.graph_url, application="mapfold query", autocommit=True) as connection,
-    ):
-        prepare_graph(connection)
-        yield LiveMap(connection)
 
 
 def _print(found: Any, as_json: bool) -> None:

@@ -25,38 +25,15 @@ from projections.fold.corrections import check_settings
 
 from .bag_text import stream_lines
 from .bridged import (
-    NOTHING,
-    TF_POSE,
-    BaseFrameOption,
     BridgeChoice,
-    CameraOption,
-    CovarianceOption,
-    DetectionsOption,
-    EmbeddingsOption,
-    GridOption,
-    HeightsOption,
-    LabelsOption,
-    MapFrameOption,
-    MaxGapOption,
-    ModelOption,
-    NamespaceOption,
-    PoseOption,
     Ros2ddsOption,
-    RunIdOption,
-    TopicOption,
     check_unused,
     open_bridge,
     recording_of,
     say_topics,
     warn_of_silence,
 )
-from .options import (
-    ConfigOption,
-    ConnectBesideListenOption,
-    JsonOption,
-    ListenOption,
-    zenoh_options,
-)
+from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
 from .terminal import say, say_metrics
@@ -67,12 +44,11 @@ large should reach the recorder and be counted."""
 
 
 def record(
+    *,
     log: Annotated[
         Path, typer.Argument(metavar="LOG", help="The log to append to; created if there is none.")
     ],
-    connect: ConnectBesideListenOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ConfigOption = None,
+    peer: ZenohPeer,
     key: Annotated[
         list[str] | None,
         typer.Option(
@@ -128,21 +104,7 @@ def record(
         ),
     ] = False,
     ros2dds: Ros2ddsOption = False,
-    namespace: NamespaceOption = "",
-    detections: DetectionsOption = None,
-    pose: PoseOption = TF_POSE,
-    covariance: CovarianceOption = None,
-    embeddings: EmbeddingsOption = None,
-    camera: CameraOption = None,
-    grid: GridOption = NOTHING.grid,
-    map_frame: MapFrameOption = NOTHING.map_frame,
-    base_frame: BaseFrameOption = NOTHING.base_frame,
-    run_id: RunIdOption = None,
-    labels: LabelsOption = None,
-    embedding_model: ModelOption = None,
-    heights: HeightsOption = False,
-    max_gap: MaxGapOption = NOTHING.max_gap_s,
-    topic: TopicOption = None,
+    choice: BridgeChoice,
     json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
@@ -151,15 +113,11 @@ def record(
 
     Exit 3 when anything was rejected or lost, is missing, or could not be read.
     """
-    choice = BridgeChoice(
-        namespace, detections, pose, covariance, embeddings, camera, grid, map_frame, base_frame,
-        run_id, labels, embedding_model, heights, max_gap, topic,
-    )  # fmt: skip
     if not ros2dds:
         check_unused(choice)
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
-        zenoh_options(connect, listen, zenoh_config),
+        peer.zenoh,
         max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
     )
     keys = tuple(key or (() if ros2dds else DEFAULT_KEYS))
@@ -265,7 +223,7 @@ def router(
     It listens on tcp/127.0.0.1:7447 unless --listen or a configuration file says otherwise.
     --connect links it to other routers.
     """
-    options = zenoh_options(connect, listen, zenoh_config)
+    options = ZenohPeer(connect=connect, listen=listen, zenoh_config=zenoh_config).zenoh
     with stop_on_signals() as stop, Router(options) as running:
         say(f"router listening on {', '.join(running.endpoints)}; Ctrl-C ends it")
         stop.wait()

@@ -22,7 +22,8 @@ from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
 from .detect_checks import device_of
 from .edit_command import user_at_host
-from .options import JsonOption, LogArgument
+from .folded_log import LogArgument
+from .options import JsonOption
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say
 

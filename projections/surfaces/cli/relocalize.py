@@ -38,27 +38,13 @@ from projections.localize.relocalize import (
 from projections.map.log_commands import read_corrections
 from projections.store.history_recorder import map_after
 
-from .options import (
-    DbOption,
-    HfovOption,
-    ImageOption,
-    JsonOption,
-    OptionalQuestion,
-    SetOption,
-    SettingsOption,
-    VectorDbOption,
-    W,
-    camera_from,
-    databases,
-    past_settings,
-    point,
-    question_from,
-    say_defaults,
-)
+from .folded_log import FoldSettings, W, point, say_defaults
+from .options import CameraOptions, Databases, JsonOption, OptionalQuestion, question_from
 from .terminal import display, emit, emit_lines, say
 
 
 def relocalize(
+    *,
     query: OptionalQuestion = None,
     track: Annotated[
         bool,
@@ -95,12 +81,9 @@ def relocalize(
             help="joint: by poses, from all crops together; plain: similarities summed per Place.",
         ),
     ] = "joint",
-    hfov: HfovOption = None,
-    image: ImageOption = None,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
+    camera_options: CameraOptions,
+    databases: Databases,
+    chosen: FoldSettings,
     json_: JsonOption = False,
 ) -> None:
     """Find where a robot is, from a few object crops or classes.
@@ -108,7 +91,7 @@ def relocalize(
     Ranked Places with evidence, a pose hypothesis, how likely it is right (confidence) and how
     likely the map has the things shown (known).
     """
-    how, camera = method_from(method), camera_from(hfov, image)
+    how, camera = method_from(method), camera_options.camera
     if as_of is not None and log is None:
         raise MisuseError("--as-of asks a past map, which only the log knows; give --log LOG too")
     with contextlib.ExitStack() as stack:
@@ -118,17 +101,17 @@ def relocalize(
         else:
             question = _question(query, classes)
         if log is None:
-            past_settings(log, settings_file, set_)
+            chosen.of_past_map(log)
             # Here: `evaluate` and `whatif` import this module and ask no database.
             from projections.postgres.queries.relocalize import CandidateReader
 
-            targets = stack.enter_context(databases(db, vector_db))
+            targets = stack.enter_context(databases.opened())
             search: Search = stack.enter_context(CandidateReader(targets)).candidates
         else:
             with LogReader(log) as reader:
                 end = point(reader, as_of or "end")
                 corrections = read_corrections(reader, end)
-                settings = past_settings(log, settings_file, set_, corrections)
+                settings = chosen.of_past_map(log, corrections)
                 view = map_after(
                     reader, settings, end, corrections=corrections, note=say, embeddings=True
                 )

@@ -17,21 +17,10 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.record.transport.session import open_session
-from projections.postgres.connection import open_targets
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
 
-from .options import (
-    ConfigOption,
-    ConnectBesideListenOption,
-    DbOption,
-    HfovOption,
-    ImageOption,
-    ListenOption,
-    VectorDbOption,
-    camera_from,
-    zenoh_options,
-)
+from .options import CameraOptions, Databases, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import say
 
@@ -42,15 +31,44 @@ if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they 
     from projections.surfaces.serve.metrics import ServiceMetrics
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True)
 class HttpOptions:
     """The options beside ``--http``."""
 
-    token_file: Path | None
-    tls_cert: Path | None
-    tls_key: Path | None
-    hosts: tuple[str, ...]
-    origins: tuple[str, ...]
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--token-file",
+            metavar="FILE",
+            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
+            " --http is on loopback.",
+        ),
+    ] = None
+    tls_cert: Annotated[
+        Path | None,
+        typer.Option("--tls-cert", metavar="FILE", help="PEM certificate: serve HTTPS."),
+    ] = None
+    tls_key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM key of --tls-cert.")
+    ] = None
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--allow-host",
+            metavar="NAME",
+            help="Name by which HTTP clients call this service, beside its addresses; may be"
+            " repeated.",
+        ),
+    ] = None
+    cors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--cors",
+            metavar="ORIGIN",
+            help="Site whose pages may ask from a browser, such as https://map.example; may be"
+            " repeated.",
+        ),
+    ] = None
 
     def refuse_without_http(self) -> None:
         """Raise MisuseError when one of them is given."""
@@ -58,8 +76,8 @@ class HttpOptions:
             ("--token-file", self.token_file),
             ("--tls-cert", self.tls_cert),
             ("--tls-key", self.tls_key),
-            ("--allow-host", self.hosts),
-            ("--cors", self.origins),
+            ("--allow-host", self.allow_host),
+            ("--cors", self.cors),
         ):
             if value:
                 raise MisuseError(f"{name} is for HTTP; give --http HOST:PORT too")
@@ -93,7 +111,7 @@ class HttpEndpoint:
             ) from None
         if (options.tls_cert is None) != (options.tls_key is None):
             raise MisuseError("--tls-cert and --tls-key need each other; give both")
-        origins = tuple(read_origin(origin) for origin in options.origins)
+        origins = tuple(read_origin(origin) for origin in options.cors or ())
         token, tls = read_token(options.token_file, os.environ, say), None
         if options.tls_cert is not None and options.tls_key is not None:
             tls = tls_context(options.tls_cert, options.tls_key)
@@ -110,7 +128,7 @@ class HttpEndpoint:
                     f"warning: --http {http} without TLS: others on the way can read the token and"
                     " all answers; give --tls-cert and --tls-key"
                 )
-            yield cls(host, listener, token, tls, options.hosts, origins)
+            yield cls(host, listener, token, tls, tuple(options.allow_host or ()), origins)
 
     @contextmanager
     def serving(
@@ -135,6 +153,7 @@ _LARGEST_BYTES: Final = 16 * 1024 * 1024
 
 
 def serve(
+    *,
     http: Annotated[
         str | None,
         typer.Option(
@@ -143,44 +162,9 @@ def serve(
             help="Answer over HTTP, too, at this address (extra [serve]).",
         ),
     ] = None,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--token-file",
-            metavar="FILE",
-            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
-            " --http is on loopback.",
-        ),
-    ] = None,
-    tls_cert: Annotated[
-        Path | None,
-        typer.Option("--tls-cert", metavar="FILE", help="PEM certificate: serve HTTPS."),
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM key of --tls-cert.")
-    ] = None,
-    allow_host: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--allow-host",
-            metavar="NAME",
-            help="Name by which HTTP clients call this service, beside its addresses; may be"
-            " repeated.",
-        ),
-    ] = None,
-    cors: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--cors",
-            metavar="ORIGIN",
-            help="Site whose pages may ask from a browser, such as https://map.example; may be"
-            " repeated.",
-        ),
-    ] = None,
+    options: HttpOptions,
     zenoh: Annotated[bool, typer.Option(help="Answer over Zenoh.")] = True,
-    connect: ConnectBesideListenOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ConfigOption = None,
+    peer: ZenohPeer,
     workers: Annotated[
         int,
         typer.Option("--workers", metavar="N", min=1, max=64, help="Questions answered at a time."),
@@ -197,10 +181,8 @@ def serve(
             "--max-bytes", metavar="BYTES", min=1000, help="Longer questions are refused."
         ),
     ] = DEFAULT_MAX_BYTES,
-    hfov: HfovOption = None,
-    image: ImageOption = None,
-    db: DbOption = None,
-    vector_db: VectorDbOption = None,
+    camera: CameraOptions,
+    databases: Databases,
 ) -> None:
     """Answer questions from the live databases until Ctrl-C.
 
@@ -210,23 +192,22 @@ def serve(
     """
     if http is None and not zenoh:
         raise MisuseError("nothing to serve on; give --http HOST:PORT, or leave out --no-zenoh")
-    camera = camera_from(hfov, image)
-    options = dataclasses.replace(
-        zenoh_options(connect, listen, zenoh_config),
+    asked_by = camera.camera
+    session_options = dataclasses.replace(
+        peer.zenoh,
         max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
     )
-    given = HttpOptions(token_file, tls_cert, tls_key, tuple(allow_host or ()), tuple(cors or ()))
     with ExitStack() as stack:
-        endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, given))
+        endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, options))
         if http is None:
-            given.refuse_without_http()
+            options.refuse_without_http()
         stop = stack.enter_context(stop_on_signals())
-        targets = stack.enter_context(open_targets(db, vector_db))
+        targets = stack.enter_context(databases.opened())
         pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
-        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=camera, note=say)
+        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=asked_by, note=say)
         session = None
         if zenoh:
-            session = stack.enter_context(open_session(options, mode=options.mode))
+            session = stack.enter_context(open_session(session_options, mode=session_options.mode))
         # Closed before the session, which sends its last answers.
         queue = stack.enter_context(FairQueue(workers))
         metrics = None if endpoint is None else _metrics(answerer, queue)

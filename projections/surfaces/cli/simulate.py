@@ -20,14 +20,7 @@ from eventsrc.base.text import counted
 from eventsrc.record.transport.config import check_key
 from eventsrc.record.transport.session import ZenohOptions, check_keys, open_session
 
-from .options import (
-    ConfigOption,
-    ConnectBesideListenOption,
-    JsonOption,
-    ListenOption,
-    PublishKeyOption,
-    zenoh_options,
-)
+from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -36,6 +29,7 @@ _MAX_NAME: Final = 100
 
 
 def simulate(
+    *,
     seed: Annotated[int, typer.Option(metavar="N", help="Which house.", min=0)] = DEFAULT_SEED,
     run: Annotated[
         str,
@@ -88,9 +82,7 @@ def simulate(
         float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
     ] = 30.0,
     json_: JsonOption = False,
-    connect: ConnectBesideListenOption = None,
-    listen: ListenOption = None,
-    zenoh_config: ConfigOption = None,
+    peer: ZenohPeer,
 ) -> None:
     """Simulate a run through a house, over Zenoh or into files.
 
@@ -111,9 +103,7 @@ def simulate(
         else:
             keys = (zenoh_image or "", zenoh_pose)
             check_keys(keys)
-            taken = _publish_pictures(
-                pictures, zenoh_options(connect, listen, zenoh_config), keys, speed, wait
-            )
+            taken = _publish_pictures(pictures, peer.zenoh, keys, speed, wait)
             where = keys[0]
         say(f"sim-{seed}-{run}: {counted(taken, 'picture')} to {where}")
         if json_:
@@ -126,7 +116,7 @@ def simulate(
         say(f"{_summary(document)}: wrote {out}, truth in {truth}")
         document |= {"out": str(out), "truth": str(truth)}
     else:
-        options = zenoh_options(connect, listen, zenoh_config)
+        options = peer.zenoh
         document["published"] = _publish(simulated, options, key, speed, wait)
         say(f"{_summary(document)}: published {document['published']} on {key}")
     if json_:

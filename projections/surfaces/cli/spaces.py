@@ -6,7 +6,8 @@ from eventsrc.base.text import counted, visible
 from eventsrc.log import LogReader
 from projections.map.space_vectors import log_spaces
 
-from .options import JsonOption, LogArgument
+from .folded_log import LogArgument
+from .options import JsonOption
 from .terminal import Bar, display, emit
 
 

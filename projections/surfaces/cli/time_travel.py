@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
 from typing import Annotated
@@ -25,19 +26,8 @@ from projections.history.rendering import (
 )
 from projections.store.records import Merge
 
-from .options import (
-    JsonOption,
-    KnownAtOption,
-    LogArgument,
-    NoCacheOption,
-    SetOption,
-    SettingsOption,
-    W,
-    check_picture,
-    known_point,
-    point,
-    settings_of,
-)
+from .folded_log import CachedLog, KnownAtOption, W, known_point, point
+from .options import JsonOption, check_picture
 from .terminal import Bar, display, emit, say
 
 MOST_LINES = 5
@@ -49,22 +39,30 @@ AllOption = Annotated[
 AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Use the map as of here: {W}.")]
 
 
-@contextlib.contextmanager
-def _timeline(
-    log: Path, settings_file: Path | None, sets: list[str] | None, no_cache: bool
-) -> Iterator[Timeline]:
-    """The log's timeline under the settings of the command line or the log, with a progress
-    bar."""
-    settings, cache = settings_of(settings_file, sets), not no_cache
-    with (
-        Bar() as bar,
-        Timeline(log, settings, progress=bar.show_fold, note=say, cache=cache) as timeline,
-    ):
-        yield timeline
+@dataclass(frozen=True, kw_only=True)
+class PastLog(CachedLog):
+    """The log whose past is asked."""
+
+    @contextlib.contextmanager
+    def timeline(self) -> Iterator[Timeline]:
+        """Its timeline under the settings of the command line or the log, with a progress bar."""
+        settings, cache = self.checked(), not self.no_cache
+        with (
+            Bar() as bar,
+            Timeline(self.log, settings, progress=bar.show_fold, note=say, cache=cache) as timeline,
+        ):
+            yield timeline
+
+    @contextlib.contextmanager
+    def known(self, at: str, known_at: str | None) -> Iterator[tuple[KnownHistory, Offset]]:
+        """Its history under the commands of ``--known-at``, and the offset that W means."""
+        with self.timeline() as timeline:
+            end = point(timeline.reader, at)
+            yield timeline.knowing(known_point(timeline.reader, known_at, end)), end
 
 
 def merges(
-    log: LogArgument,
+    *,
     at: AtOption = "end",
     show: Annotated[
         int | None,
@@ -94,9 +92,7 @@ def merges(
     ] = False,
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    past: PastLog,
 ) -> None:
     """List every merge of places, and which keyframe made it.
 
@@ -110,9 +106,7 @@ def merges(
     picture = out or Path("merge.png")
     if draw is not None:
         check_picture(picture)
-    with _timeline(log, settings_file, set_, no_cache) as timeline:
-        end = point(timeline.reader, at)
-        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+    with past.known(at, known_at) as (known, end):
         if refused:
             _show_refusals(known, end, json_=json_)
             return
@@ -166,7 +160,7 @@ def _numbered(found: list[Merge], number: int) -> Merge:
 
 
 def why(
-    log: LogArgument,
+    *,
     thing: Annotated[
         str | None,
         typer.Argument(
@@ -190,9 +184,7 @@ def why(
     at: AtOption = "end",
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    past: PastLog,
 ) -> None:
     """Explain why a place or an object is what it is, event by event.
 
@@ -201,9 +193,7 @@ def why(
     if (thing is None) == (same is None):
         raise MisuseError("give a place, an object, or two keyframes as RUN:KEYFRAME RUN:KEYFRAME")
     pair = (thing, other) if thing is not None and other is not None else same
-    with _timeline(log, settings_file, set_, no_cache) as timeline:
-        end = point(timeline.reader, at)
-        known = timeline.knowing(known_point(timeline.reader, known_at, end))
+    with past.known(at, known_at) as (known, end):
         found = _explanation(known, thing, pair, end)
     if json_:
         emit(found.document())
@@ -220,7 +210,7 @@ def _explanation(
 
 
 def diff(
-    log: LogArgument,
+    *,
     first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
     second: Annotated[str, typer.Argument(metavar="W2", help="To here, given as W1.")] = "end",
     known_at: Annotated[
@@ -234,15 +224,13 @@ def diff(
     ] = None,
     json_: JsonOption = False,
     all_: AllOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    past: PastLog,
 ) -> None:
     """Show what changed from one moment of the map to another.
 
     Keyframes, places, objects and adjacency, and the commands recorded in between.
     """
-    with _timeline(log, settings_file, set_, no_cache) as timeline:
+    with past.timeline() as timeline:
         reader = timeline.reader
         span = point(reader, first), point(reader, second)
         known = None if known_at is None else point(reader, known_at)
@@ -265,7 +253,7 @@ none is no place. It may call:
 
 
 def bisect(
-    log: LogArgument,
+    *,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
     start: Annotated[
         str, typer.Option("--from", metavar="W", help=f"Search from here: {W}.")
@@ -278,11 +266,9 @@ def bisect(
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
     all_: AllOption = False,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    past: PastLog,
 ) -> None:
-    with _columns_shown(), _timeline(log, settings_file, set_, no_cache) as timeline:
+    with _columns_shown(), past.timeline() as timeline:
         asked = Expression(expression)
         span = point(timeline.reader, start), point(timeline.reader, end)
         known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
@@ -305,7 +291,6 @@ def _columns_shown() -> Iterator[None]:
 
 def register(app: typer.Typer) -> None:
     """Add these commands to the program."""
-    app.command()(merges)
-    app.command()(why)
-    app.command()(diff)
+    for command in (merges, why, diff):
+        app.command()(command)
     app.command(help=_BISECT_HELP)(bisect)

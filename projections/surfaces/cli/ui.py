@@ -1,6 +1,5 @@
 """``mapfold ui``: the web debugger of a log, until a signal."""
 
-import functools
 import secrets
 import webbrowser
 from contextlib import ExitStack, closing
@@ -14,18 +13,8 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 
-from .options import (
-    ConfigOption,
-    ConnectOption,
-    LogArgument,
-    NoCacheOption,
-    SetOption,
-    SettingsOption,
-    W,
-    point,
-    settings_of,
-    zenoh_options,
-)
+from .folded_log import CachedLog, FoldSettings, W, point
+from .options import ZenohClient
 from .signals import stop_on_signals
 from .terminal import say
 
@@ -42,7 +31,7 @@ _KINDS: Final = ("place", "object", "keyframe", "merge")
 
 
 def ui(
-    log: LogArgument,
+    *,
     host: Annotated[
         str,
         typer.Option(
@@ -90,18 +79,15 @@ def ui(
             "--vector-db", metavar="URL", help="The database of the vectors [default: --db]."
         ),
     ] = None,
-    connect: ConnectOption = None,
-    zenoh_config: ConfigOption = None,
-    set_: SetOption = None,
-    settings_file: SettingsOption = None,
-    no_cache: NoCacheOption = False,
+    client: ZenohClient,
+    source: CachedLog,
 ) -> None:
     """Show a log's map in a browser, at any point in time.
 
     The map at every moment, merges and their causes, changes, and the map under other settings.
     Only this machine can connect unless --host says otherwise. Ctrl-C ends it.
     """
-    settings = settings_of(settings_file, set_)
+    log, settings = source.log, source.checked()
     if vector_db is not None and db is None:
         raise MisuseError("--vector-db is for the lag of the tails; give --db URL too")
     with LogReader(log) as reader:  # errors of log and options come before anything is served
@@ -129,18 +115,18 @@ def ui(
         opened = Opened(
             log,
             settings,
-            sets=tuple(set_ or ()),
-            settings_file=settings_file,
+            sets=tuple(source.assignments),
+            settings_file=source.settings_file,
             truth_files=tuple(truth or ()),
             truth=scored,
             edits=allow_edits,
             token_needed=not local,
-            cache=not no_cache,
+            cache=not source.no_cache,
         )
         service = stack.enter_context(UiService(opened))
         watch = stack.enter_context(LiveWatch(service, tails))
         token = None if local and not allow_edits else secrets.token_urlsafe(24)
-        editor = _editor(service, connect, zenoh_config) if allow_edits else None
+        editor = _editor(service, client) if allow_edits else None
         app = create_app(service, watch, editor)
         gate = TokenGate(app, token, everything=not local)
         guarded = SafeHeaders(Guard(gate, hosts=(host, *(allow_host or ()))), HEADERS)
@@ -178,16 +164,13 @@ def _moment(at: Offset | None, select: str | None) -> str:
     return "#" + urlencode(parts, safe=":/") if parts else ""
 
 
-def _editor(service: "UiService", connect: list[str] | None, config: Path | None) -> "Editor":
+def _editor(service: "UiService", client: ZenohClient) -> "Editor":
     """Records commands, through a recorder where one holds the log."""
-    from eventsrc.record.transport.session import open_session
     from projections.surfaces.ui.edits import Editor
 
     from .edit_command import user_at_host
 
-    options = zenoh_options(connect, None, config)
-    session = functools.partial(open_session, options, mode=options.mode)
-    return Editor(service.opened, service.log_id, session, user_at_host())
+    return Editor(service.opened, service.log_id, client.session, user_at_host())
 
 
 def _tails(
@@ -200,7 +183,7 @@ def _tails(
     targets = stack.enter_context(open_targets(db, vector_db))
 
     def ask() -> list[dict[str, Any]]:
-        found = projection_status(log, targets, settings_of(None, None))
+        found = projection_status(log, targets, FoldSettings().checked())
         return [
             {"sink": s.sink, "condition": s.condition, "lag": s.lag, "note": s.note}
             for s in found.sinks

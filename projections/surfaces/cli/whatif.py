@@ -24,22 +24,24 @@ from projections.history.whatif_rendering import whatif_text
 from projections.localize.evaluate.truth import read_truth
 from projections.map.log_commands import read_commands
 
-from .options import (
-    JsonOption,
+from .folded_log import (
+    FoldSettings,
     KnownAtOption,
     LogArgument,
+    NamedSettings,
     SettingsOption,
-    check_picture,
     known_point,
     point,
-    settings_of,
 )
+from .options import JsonOption, check_picture
 from .terminal import Bar, display, emit, say
 from .time_travel import MOST_LINES, AllOption, AtOption
 
 
 def whatif(
     log: LogArgument,
+    *,
+    named: NamedSettings,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -111,13 +113,13 @@ def whatif(
     --truth, V is the V-measure against rooms and instances: 1 is perfect.
     """
 
-    logged = settings_of(settings_file, None)
+    logged = FoldSettings(settings_file=settings_file).checked()
 
     def settings(corrections: Corrections) -> Settings:
         return assigned(logged(corrections), base, "--base")
 
     def others(settings: Settings) -> list[Settings]:
-        return alternatives(settings, set_ or (), try_ or (), grid or ())
+        return alternatives(settings, named.around(set_), try_ or (), grid or ())
 
     tried = others(settings(NO_CORRECTIONS))  # a bad value is an error before the log is opened
     check_picture(picture)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from projections.fold.errors import SettingsError
 from projections.fold.settings import Settings
-from projections.surfaces.cli.options import settings_from
+from projections.surfaces.cli.folded_log import settings_from
 from tests.attack.corruption import corrupt_json
 from tests.fuzz.scratch import scratch
 from tests.fuzz.target import Target, check_message

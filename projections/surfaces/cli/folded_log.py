@@ -1,0 +1,222 @@
+"""The log that a command folds, the point up to which, and the settings of the fold.
+
+``--preset`` and ``--space`` are short for assignments of ``--set``: a preset comes before them, so
+that ``--set`` changes it; ``--space NAME`` is ``--set embedding_model=NAME`` and comes behind them.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.user_files import FileFault
+from eventsrc.envelope.model import Offset
+from eventsrc.log import LogReader
+from eventsrc.log.seek import resolve
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.errors import SettingsError
+from projections.fold.settings import PRESETS, Settings, read_settings
+from projections.map.log_commands import read_corrections
+
+from .terminal import say
+
+LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+
+# Points of a log
+
+W = "number of events, ISO time, RUN:KEYFRAME (inclusive) or end"
+"""The forms of W, for help texts."""
+
+
+def point(reader: LogReader, text: str) -> Offset:
+    """The number of events that W means in this log; warns when times run backwards in it."""
+    return resolve(reader, text, note=say)
+
+
+FoldToOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Fold to here: {W}.")]
+KnownAtOption = Annotated[
+    str | None,
+    typer.Option(
+        "--known-at",
+        metavar="V",
+        help="Apply only the commands recorded before here [default: the end of the map].",
+    ),
+]
+
+
+def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
+    """The point of ``--known-at``; the map's own ``end`` without it."""
+    return end if text is None else point(reader, text)
+
+
+# Settings of the fold
+
+Preset = StrEnum("Preset", list(PRESETS))  # type: ignore[misc]
+"""The values of ``--preset``."""
+
+PresetOption = Annotated[
+    Preset | None,
+    typer.Option(
+        "--preset",
+        metavar="|".join(PRESETS),
+        help="Named settings: page, for places by DBSCAN, or rooms, for places that are rooms;"
+        " --set goes on top.",
+    ),
+]
+SpaceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--space",
+        metavar="NAME",
+        help="The embedding space of the map, by its model's name [default: that of the log's first"
+        " vector]; see `mapfold reembed`.",
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a setting of the fold, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
+    ),
+]
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--settings",
+        metavar="FILE",
+        help="JSON object of settings instead of those that the log names; --set goes on top.",
+    ),
+]
+NoCacheOption = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Do not use the cached history beside the log, nor write it."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedSettings:
+    """``--preset`` and ``--space``."""
+
+    preset: PresetOption = None
+    space: SpaceOption = None
+
+    def around(self, assignments: list[str] | None) -> list[str]:
+        """All of them as assignments, with those of ``--set`` in between."""
+        preset = () if self.preset is None else PRESETS[self.preset]
+        space = () if self.space is None else (f"embedding_model={self.space}",)
+        return [*preset, *(assignments or ()), *space]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssignedSettings(NamedSettings):
+    """The options that stand for assignments."""
+
+    set_: SetOption = None
+
+    @property
+    def assignments(self) -> list[str]:
+        """Settings as NAME=VALUE."""
+        return self.around(self.set_)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldSettings(AssignedSettings):
+    """The settings of a fold: those of ``--settings``, else those that the log names
+    (``use-settings``), else the defaults; assignments change them."""
+
+    settings_file: SettingsOption = None
+
+    def settings(self, corrections: Corrections = NO_CORRECTIONS) -> Settings:
+        """The settings under the corrections of a log. Raises SettingsError naming file and
+        field."""
+        return settings_from(self.settings_file, self.assignments, corrections)
+
+    def checked(self) -> Callable[[Corrections], Settings]:
+        """`settings`, for corrections that are read later. Raises SettingsError for invalid options
+        at once."""
+        self.settings()
+        return self.settings
+
+    def of_past_map(self, log: Path | None, corrections: Corrections = NO_CORRECTIONS) -> Settings:
+        """The settings to fold ``log`` with, for a question to a past map.
+
+        Raises MisuseError when there are settings but no log: the live map keeps its own.
+        """
+        if log is None and (self.settings_file is not None or self.assignments):
+            raise MisuseError(
+                "--preset, --set and --settings are for folding a log, and the live map keeps the"
+                " settings it was made with; give --log LOG too, or run"
+                f" `{advised('replay')}`"
+            )
+        return self.settings(corrections)
+
+
+def settings_from(
+    file: Path | None, assignments: list[str] | None, corrections: Corrections = NO_CORRECTIONS
+) -> Settings:
+    """The settings of a file, else of the corrections, else the defaults, changed by assignments.
+
+    Raises SettingsError naming file and field.
+    """
+    logged = corrections.settings or Settings()
+    settings = logged if file is None else _settings_of_file(file)
+    return settings.with_assignments(assignments or ())
+
+
+def _settings_of_file(file: Path) -> Settings:
+    try:
+        return read_settings(file)
+    except (FileFault, SettingsError) as error:
+        raise SettingsError(f"--settings {file}: {error}") from None
+
+
+def say_defaults(settings: Settings) -> None:
+    """Print, after a fold with default settings, that the live map may have others."""
+    if settings == Settings():
+        say("folded with the default settings; if the live map has others, give them by --set")
+
+
+# A log and its settings
+
+
+class OpenLog(NamedTuple):
+    """A log that is open, and what to fold of it: the first ``end`` events under the commands of
+    the first ``known``."""
+
+    reader: LogReader
+    end: Offset
+    known: Offset
+    corrections: Corrections
+    settings: Settings
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogSettings(FoldSettings):
+    """A log, and the settings that it is folded with."""
+
+    log: LogArgument
+
+    @contextlib.contextmanager
+    def opened(self, at: str = "end", known_at: str | None = None) -> Iterator[OpenLog]:
+        """The log and its part up to W. Raises SettingsError for invalid options before the log is
+        opened."""
+        self.checked()
+        with LogReader(self.log) as reader:
+            end = point(reader, at)
+            known = known_point(reader, known_at, end)
+            corrections = read_corrections(reader, known)
+            yield OpenLog(reader, end, known, corrections, self.settings(corrections))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CachedLog(LogSettings):
+    """A log whose history is kept beside it."""
+
+    no_cache: NoCacheOption = False
