@@ -1,4 +1,11 @@
-"""The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md)."""
+"""The log: an append-only directory of MCAP segments, the only truth (docs/log-format.md).
+
+Most programs only read a log: what writes, verifies and repairs one is imported when one of its
+names is.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from .cache_folders import (
     cache_folder,
@@ -12,12 +19,14 @@ from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
 from .file_fault import FileFault
 from .log_identity import same_but_sealed, segment_signatures
 from .reader import LogReader
-from .recover import RecoveryReport, SegmentRecovery, recover_log
 from .segment import Unreadable
-from .tail import follow
-from .verify import Verification, verify_log
-from .verify_events import Finding
-from .writer import LogWriter, Sealing
+
+if TYPE_CHECKING:
+    from .recover import RecoveryReport, SegmentRecovery, recover_log
+    from .tail import follow
+    from .verify import Verification, verify_log
+    from .verify_events import Finding
+    from .writer import LogWriter, Sealing
 
 __all__ = [
     "ALWAYS",
@@ -50,3 +59,22 @@ __all__ = [
     "verify_log",
     "write_cache_file",
 ]
+
+_MODULES = {
+    "Finding": "verify_events",
+    "LogWriter": "writer",
+    "RecoveryReport": "recover",
+    "Sealing": "writer",
+    "SegmentRecovery": "recover",
+    "Verification": "verify",
+    "follow": "tail",
+    "recover_log": "recover",
+    "verify_log": "verify",
+}
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> object:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f".{_MODULES[name]}", __name__), name)

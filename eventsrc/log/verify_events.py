@@ -45,7 +45,6 @@ from eventsrc.envelope.system_events import (
     Loss,
     RejectedPayload,
 )
-from eventsrc.ros.derivation import read_recording
 
 from .event import Event
 
@@ -256,6 +255,8 @@ class EventFindings:
             self._add("schema", what, event.offset, what)
 
     def _check_recording(self, event: Event) -> None:
+        from eventsrc.ros.derivation import read_recording  # here: few logs have messages of ROS
+
         try:
             read_recording(event.payload)
         except ValidationError as error:
