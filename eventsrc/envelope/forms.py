@@ -28,7 +28,6 @@ from .ingest import (
     check_cost,
     ingest,
     ingest_all,
-    ingest_plain,
 )
 from .model import ENVELOPE_VERSION, MAX_DETECTIONS, contains_non_finite
 
@@ -88,17 +87,6 @@ def read_envelopes(
     if any(event.version != ENVELOPE_VERSION for event in events):
         return [read_envelope(event, max_bytes=max_bytes) for event in events]
     return ingest_all([event.payload for event in events], max_bytes=max_bytes)
-
-
-def read_fields(
-    events: Sequence[VersionedEvent], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
-) -> Sequence[Accepted | Rejected]:
-    """Like `read_envelopes`, faster, for callers that only read fields: see `ingest_plain`."""
-    if all(event.version == ENVELOPE_VERSION for event in events):
-        plain = ingest_plain([event.payload for event in events], max_bytes=max_bytes)
-        if plain is not None:
-            return plain
-    return read_envelopes(events, max_bytes=max_bytes)
 
 
 def check_envelopes(

@@ -9,15 +9,15 @@ import binascii
 import codecs
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 import pybase64
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from pydantic_core import from_json
 
 from eventsrc.base.text import visible
@@ -27,13 +27,12 @@ from .model import (
     DetId,
     Envelope,
     KeyframeId,
-    NonFinite,
     RunId,
     contains_non_finite,
     default_det_id,
     describe_error,
 )
-from .plain_envelopes import PlainEnvelope, read_plain
+from .readers import NonFinite, read_checked, read_plain
 
 DEFAULT_MAX_PAYLOAD_BYTES = 16 * 1024 * 1024
 MAX_PAYLOAD_BYTES = 2 * DEFAULT_MAX_PAYLOAD_BYTES
@@ -53,8 +52,6 @@ _MAX_SHOWN: Final = 80
 
 Vector = NDArray[np.float32]
 _FLOAT32 = np.dtype("<f4")
-_validate_json: Callable[[bytes], Envelope] = TypeAdapter(Envelope).validator.validate_json
-"""``Envelope.model_validate_json`` without its Python wrapper, a twentieth of the time."""
 
 
 class Accepted(msgspec.Struct, frozen=True, gc=False):
@@ -90,15 +87,6 @@ class CheckedEnvelope(msgspec.Struct, frozen=True, gc=False):
         return cls(envelope.run_id, envelope.keyframe_id, envelope.stamp_ns)
 
 
-class _Embedded(Protocol):
-    """The fields of a detection that hold its vector."""
-
-    @property
-    def embedding(self) -> str | None: ...
-    @property
-    def embedding_dim(self) -> int | None: ...
-
-
 class _RejectionError(Exception):
     """A reason for rejection, caught within this module."""
 
@@ -112,34 +100,12 @@ def ingest_all(
     payloads: Sequence[bytes], *, max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES
 ) -> list[Accepted | Rejected]:
     """`ingest` each payload; faster than one by one, because their vectors are decoded together."""
-    read = [_read(payload, max_bytes) for payload in payloads]
+    read = [check_cost(p, max_bytes) or read_plain(p) or _read_checked(p) for p in payloads]
     rows = _decode_uniform(_detections(read))
     if rows is None:
         return [_accept(result, None) for result in read]
     vectors = iter(list(rows))
-    return [_accept(result, vectors) for result in read]
-
-
-def ingest_plain(payloads: Sequence[bytes], *, max_bytes: int) -> list[Accepted] | None:
-    """`ingest_all` in half the time, for callers that only read fields: each envelope is a
-    `PlainEnvelope`, with the fields and values of an `Envelope`.
-
-    None if a payload is not a plain envelope or the vectors differ in dimension; use `ingest_all`
-    then.
-    """
-    plain = [read_plain(p) if check_cost(p, max_bytes) is None else None for p in payloads]
-    envelopes = [e for e in plain if e is not None]
-    rows = _decode_uniform([d for e in envelopes for d in e.detections])
-    if len(envelopes) < len(plain) or rows is None:
-        return None
-    vectors = iter(list(rows))
-    accepted = []
-    for envelope in envelopes:
-        if isinstance(envelope.floor, int):
-            envelope.floor = str(envelope.floor)
-        own = tuple(islice(vectors, len(envelope.detections)))
-        accepted.append(Accepted(cast(Envelope, envelope), _plain_det_ids(envelope), own))
-    return accepted
+    return [r if isinstance(r, Rejected) else _accept(r, vectors) for r in read]
 
 
 def check_all(
@@ -151,18 +117,16 @@ def check_all(
     if not _have_vectors([d for e in plain if e is not None for d in e.detections]):
         plain = [e if e is not None and _have_vectors(e.detections) else None for e in plain]
     return [
-        _check(payload, max_bytes)
-        if known is None
-        else CheckedEnvelope(RunId(known.run_id), KeyframeId(known.keyframe_id), known.stamp_ns)
+        _check(payload, max_bytes) if known is None else CheckedEnvelope.of(known)
         for payload, known in zip(payloads, plain, strict=True)
     ]
 
 
-def _have_vectors(detections: Sequence[_Embedded]) -> bool:
+def _have_vectors(detections: Sequence[Detection]) -> bool:
     """Whether all given embeddings are valid; those of one dimension are decoded together."""
     if _decode_uniform(detections) is not None:  # the usual case
         return True
-    by_dim: defaultdict[int | None, list[_Embedded]] = defaultdict(list)
+    by_dim: defaultdict[int | None, list[Detection]] = defaultdict(list)
     for detection in detections:
         if detection.embedding is not None:
             by_dim[detection.embedding_dim].append(detection)
@@ -170,7 +134,8 @@ def _have_vectors(detections: Sequence[_Embedded]) -> bool:
 
 
 def _check(payload: bytes, max_bytes: int) -> CheckedEnvelope | Rejected:
-    result = ingest(payload, max_bytes=max_bytes)
+    """`check_all` of a payload that `read_plain` does not read, or with a faulty vector."""
+    result = _accept(check_cost(payload, max_bytes) or _read_checked(payload), None)
     return result if isinstance(result, Rejected) else CheckedEnvelope.of(result.envelope)
 
 
@@ -191,12 +156,9 @@ def check_cost(payload: bytes, max_bytes: int) -> Rejected | None:
     return None
 
 
-def _read(payload: bytes, max_bytes: int) -> Envelope | Rejected:
-    rejected = check_cost(payload, max_bytes)
-    if rejected is not None:
-        return rejected
+def _read_checked(payload: bytes) -> Envelope | Rejected:
     try:
-        return _validate_json(payload)
+        return read_checked(payload)
     except ValidationError as error:
         return Rejected(_error_reason(error, payload))
     except NonFinite:
@@ -291,11 +253,14 @@ def _repr_start(value: Any, room: int) -> str:
 
 
 def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
+    if not envelope.detections:
+        return ()
+    given = [detection.det_id for detection in envelope.detections]
+    start = default_det_id(envelope.run_id, envelope.keyframe_id, 0)[:-1]
+    if not any(given):
+        return tuple([f"{start}{n}" for n in range(len(given))])  # type: ignore[misc]
     ids = [
-        default_det_id(envelope.run_id, envelope.keyframe_id, index)
-        if d.det_id is None
-        else d.det_id
-        for index, d in enumerate(envelope.detections)
+        DetId(f"{start}{index}") if det_id is None else det_id for index, det_id in enumerate(given)
     ]
     if len(set(ids)) == len(ids):
         return tuple(ids)
@@ -309,15 +274,6 @@ def _det_ids(envelope: Envelope) -> tuple[DetId, ...]:
     return tuple(ids)
 
 
-def _plain_det_ids(envelope: PlainEnvelope) -> tuple[DetId, ...]:
-    """The given det_ids, else the default ones. `read_plain` has checked that they are unique."""
-    given = [DetId(d.det_id) for d in envelope.detections if d.det_id is not None]
-    if given:
-        return tuple(given)
-    start = default_det_id(RunId(envelope.run_id), KeyframeId(envelope.keyframe_id), 0)[:-1]
-    return tuple([DetId(f"{start}{index}") for index in range(len(envelope.detections))])
-
-
 def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     detections = envelope.detections
     rows = _decode_uniform(detections)
@@ -329,7 +285,7 @@ def _decode_vectors(envelope: Envelope) -> tuple[Vector | None, ...]:
     )
 
 
-def _decode_uniform(detections: Sequence[_Embedded]) -> Vector | None:
+def _decode_uniform(detections: Sequence[Detection]) -> Vector | None:
     """All vectors at once, shape (len(detections), dim), if they are valid and of one dimension, as
     is usual; None if each must be decoded on its own."""
     try:

@@ -1,10 +1,7 @@
 """The envelope: one keyframe's message as it came over Zenoh.
 
-The models define a *valid* envelope. They are strict: an int is not a string, NaN is not a number.
-Unknown fields need only be JSON; they are ignored here, and the log keeps them, since it stores the
-payload verbatim. `eventsrc.envelope.ingest` makes an envelope from bytes and gives the reason if it
-cannot. The docstrings of the models are part of the JSON schema in every segment: do not change
-them.
+Everything that reads envelopes gets an `Envelope`; `eventsrc.envelope.readers` defines which are
+valid, and `eventsrc.envelope.ingest` makes one from bytes and gives the reason if it cannot.
 
 The types of identifiers are here too: `Offset`, `RunId`, `KeyframeId`, `DetId`. They are ints and
 strings at run time; mypy keeps them apart.
@@ -14,18 +11,16 @@ import math
 import unicodedata
 from collections.abc import Sequence
 from decimal import Decimal
-from typing import Annotated, Any, NewType
+from typing import TYPE_CHECKING, Annotated, NewType, TypeAlias
 
+import msgspec
+from msgspec import Meta
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
-    FailFast,
     Field,
     PlainValidator,
     StringConstraints,
     WithJsonSchema,
-    model_validator,
 )
 from pydantic_core import ErrorDetails
 
@@ -159,13 +154,6 @@ PoseCovariance = Annotated[tuple[float, ...], _COVARIANCE, AfterValidator(_check
 """Of x, y (metres) and yaw (radians), row by row."""
 
 
-class NonFinite(Exception):
-    """An unknown field holds NaN or infinity.
-
-    No ValueError, so that pydantic stops at the first one instead of collecting a million errors.
-    """
-
-
 def contains_non_finite(value: object) -> bool:
     """Whether NaN or infinity is anywhere in a JSON value."""
     rest = [value]
@@ -181,84 +169,64 @@ def contains_non_finite(value: object) -> bool:
     return False
 
 
-def _require_finite(value: object) -> None:
-    """Raise NonFinite for NaN or infinity in an unknown field: they are not JSON, and a reader of
-    the log that parses JSON would fail. Returns None: the model drops the value, the log has it."""
-    if isinstance(value, float | list | dict) and contains_non_finite(value):
-        raise NonFinite
+_KnownText = Annotated[str, Meta(min_length=1, max_length=MAX_ID_LENGTH)]
+_KnownPosition = Annotated[float, Meta(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+_Sigma = Annotated[float, Meta(ge=0.001, le=1000.0)]
+_Pixels = Annotated[float, Meta(ge=1.0, le=1e6)]
+_Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+if TYPE_CHECKING:
+    _Name: TypeAlias = str
+else:
+    _Name = _KnownText | _Number  # `eventsrc.envelope.readers` turns a number into its digits
 
 
-Unknown = Annotated[Any, AfterValidator(_require_finite)]
+class _Known(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True, gc=False):
+    """A JSON object with known fields only. The types state most of the rules, see `readers`."""
 
 
-class _Model(BaseModel):
-    __pydantic_extra__: dict[str, Unknown]
-    # "allow" makes pydantic check unknown fields; it costs nothing without any.
-    model_config = ConfigDict(
-        strict=True, frozen=True, extra="allow", allow_inf_nan=False, populate_by_name=True
-    )
+class Detection(_Known, frozen=True, rename={"class_name": "class"}):
+    """One detected object in a keyframe; its fields are those of `readers.DetectionModel`."""
 
-
-class Detection(_Model):
-    """One detected object in a keyframe.
-
-    ``bbox`` is x_min, y_min, x_max, y_max in pixels. ``embedding`` is base64 of
-    ``embedding_dim`` little-endian float32. ``depth_m`` is how far away the thing is along the ray
-    through the box's centre, ``position`` its x and y in the map frame, in metres; their standard
-    errors count only beside them.
-    """
-
-    det_id: Annotated[DetId, TEXT] | None = None
-    class_name: Text = Field(alias="class")
+    class_name: _KnownText
     confidence: float
     bbox: tuple[float, float, float, float]
+    det_id: Annotated[DetId, Meta(min_length=1, max_length=MAX_ID_LENGTH)] | None = None
     embedding: str | None = None
-    embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
-    embedding_model: Text | None = None
-    depth_m: Annotated[float, Field(gt=0.0, le=MAX_DEPTH_M)] | None = None
-    depth_sigma_m: Annotated[float, SIGMA_M] | None = None
-    position: tuple[Position, Position] | None = None
-    position_sigma_m: Annotated[float, SIGMA_M] | None = None
+    embedding_dim: Annotated[int, Meta(ge=1, le=MAX_DIMENSION)] | None = None
+    embedding_model: _KnownText | None = None
+    depth_m: Annotated[float, Meta(gt=0.0, le=MAX_DEPTH_M)] | None = None
+    depth_sigma_m: _Sigma | None = None
+    position: tuple[_KnownPosition, _KnownPosition] | None = None
+    position_sigma_m: _Sigma | None = None
 
 
-class EnvelopeCamera(_Model):
-    """The level pinhole camera that took the picture: horizontal field of view, picture size, and
-    the angle from the robot's heading to where it looks, to the left."""
+class StatedCamera(_Known, frozen=True):
+    """The camera that an envelope states; its fields are those of `readers.EnvelopeCamera`."""
 
-    hfov_deg: Annotated[float, HFOV_DEG]
-    width_px: Annotated[float, PIXELS]
-    height_px: Annotated[float, PIXELS]
-    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+    hfov_deg: Annotated[float, Meta(ge=1.0, le=170.0)]
+    width_px: _Pixels
+    height_px: _Pixels
+    yaw_rad: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
 
 
-class Envelope(_Model):
-    """One keyframe: where the robot was and what it saw.
+class Envelope(_Known, frozen=True):
+    """One keyframe: where the robot was and what it saw; its fields are those of
+    `readers.EnvelopeModel`."""
 
-    ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
-    metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
-    Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
-    is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
-    the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
-    counts only beside a pose.
-    """
-
-    run_id: Annotated[RunId, TEXT]
-    keyframe_id: Annotated[KeyframeId, INT64]
-    timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
-    map_x: Position | None = None
-    map_y: Position | None = None
+    run_id: Annotated[RunId, Meta(min_length=1, max_length=MAX_ID_LENGTH)]
+    keyframe_id: Annotated[KeyframeId, Meta(ge=-(2**63), le=2**63 - 1)]
+    timestamp: Annotated[float, Meta(ge=0.0, le=MAX_TIMESTAMP_S)]
+    detections: Annotated[tuple[Detection, ...], Meta(max_length=MAX_DETECTIONS)]
+    map_x: _KnownPosition | None = None
+    map_y: _KnownPosition | None = None
     map_yaw: float | None = None
-    camera: EnvelopeCamera | None = None
-    floor: Floor = None
-    map_z: Position | None = None
-    pose_covariance: PoseCovariance | None = None
-    detections: Annotated[tuple[Detection, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
-
-    @model_validator(mode="after")
-    def _check_pose(self) -> "Envelope":
-        if not (self.map_x is None) is (self.map_y is None) is (self.map_yaw is None):
-            raise ValueError("map_x, map_y and map_yaw must all be numbers or all be absent")
-        return self
+    camera: StatedCamera | None = None
+    floor: _Name | None = None
+    map_z: _KnownPosition | None = None
+    pose_covariance: (
+        Annotated[tuple[float, ...], Meta(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)]
+        | None
+    ) = None
 
     @property
     def stamp_ns(self) -> int:

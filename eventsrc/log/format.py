@@ -29,7 +29,8 @@ from pydantic import BaseModel, TypeAdapter
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.commands import COMMAND
-from eventsrc.envelope.model import ENVELOPE_VERSION, Envelope, Offset
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.envelope.system_events import (
     COMMAND_KEY,
     EMBEDDINGS_KEY,
@@ -230,7 +231,7 @@ _SYSTEM_MODELS: dict[str, type[BaseModel]] = {
 def schema_of(key: str) -> tuple[str, bytes]:
     """Name and JSON schema text of the payloads under ``key``."""
     if not is_system_key(key):
-        return "mapfold.Envelope", _json_schema(Envelope)
+        return "mapfold.Envelope", _json_schema(EnvelopeModel)
     if key == COMMAND_KEY:
         return "mapfold.Command", _json_schema(COMMAND)
     model = _SYSTEM_MODELS.get(key)

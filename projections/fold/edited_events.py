@@ -8,7 +8,9 @@ keyframe without a pose it is left out.
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from msgspec.structs import replace
 
 from eventsrc.base.advised import command_line
 from eventsrc.base.text import visible
@@ -73,7 +75,7 @@ class EventEdits:
             units = None if units is None else [units[i] for i in kept]
             detections = tuple(envelope.detections[i] for i in kept)
             accepted = Accepted(
-                envelope.model_copy(update={"detections": detections}),
+                replace(envelope, detections=detections),
                 tuple(accepted.det_ids[i] for i in kept),
                 tuple(accepted.vectors[i] for i in kept),
             )
@@ -101,12 +103,12 @@ def _with_pose(
             f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
             f"{command_line('edit', 'LOG', 'undo', command_id, '--reason', 'WHY')}",
         )
-    update: dict[str, object] = {"map_x": x, "map_y": y, "map_yaw": yaw}
+    update: dict[str, Any] = {"map_x": x, "map_y": y, "map_yaw": yaw}
     if envelope.pose_covariance is not None:
         update["pose_covariance"] = _turned_covariance(envelope, yaw)
     if any(detection.position is not None for detection in envelope.detections):
         update["detections"] = _with_positions(envelope, pose)
-    moved = envelope.model_copy(update=update)
+    moved = replace(envelope, **update)
     return Accepted(moved, accepted.det_ids, accepted.vectors)
 
 
@@ -114,7 +116,7 @@ def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tup
     """The detections, with positions moved as the pose is."""
     old_x, old_y, old_yaw = envelope.map_x, envelope.map_y, envelope.map_yaw
     if old_x is None or old_y is None or old_yaw is None:
-        return tuple(d.model_copy(update={"position": None}) for d in envelope.detections)
+        return tuple(replace(d, position=None) for d in envelope.detections)
     x, y, yaw = pose
     cos, sin = cos_sin(small_angle(yaw) - small_angle(old_yaw))
     moved = []
@@ -122,7 +124,7 @@ def _with_positions(envelope: Envelope, pose: tuple[float, float, float]) -> tup
         if detection.position is not None:
             dx, dy = detection.position[0] - old_x, detection.position[1] - old_y
             position = x + (cos * dx - sin * dy), y + (sin * dx + cos * dy)
-            detection = detection.model_copy(update={"position": position})
+            detection = replace(detection, position=position)
         moved.append(detection)
     return tuple(moved)
 

@@ -4,6 +4,7 @@ that ``reembed`` commands added to detections."""
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from eventsrc.envelope.ingest import Accepted
@@ -73,7 +74,7 @@ class Reembedded:
         detections, vectors = list(envelope.detections), list(accepted.vectors)
         changed = list(units)
         for i, unit in zip(given, unit_vectors(list(given.values())), strict=True):
-            detections[i] = detections[i].model_copy(update={"embedding_model": self.space})
+            detections[i] = replace(detections[i], embedding_model=self.space)
             vectors[i], changed[i] = given[i], unit
-        edited = envelope.model_copy(update={"detections": tuple(detections)})
+        edited = replace(envelope, detections=tuple(detections))
         return Accepted(edited, accepted.det_ids, tuple(vectors)), changed

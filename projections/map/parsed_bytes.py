@@ -2,7 +2,7 @@
 
 First the arrays of the vectors, stretch after stretch: float32 as recorded, then the unit vectors
 in int32. After them everything else as MessagePack, which holds each float to the last bit and is
-read straight into `PlainEnvelope`s. Both processes are of one program; a log never has these bytes.
+read straight into envelopes. Both processes are of one program; a log never has these bytes.
 A unit vector's -0.0 in float64 comes back as 0.0, which changes no product and no sum.
 
 An envelope is read without its embeddings' base64: nothing needs it once they are decoded.
@@ -10,15 +10,15 @@ An envelope is read without its embeddings' base64: nothing needs it once they a
 
 from collections.abc import Iterable, Iterator
 from itertools import accumulate, pairwise
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import force_setattr
 
 from eventsrc.envelope.ingest import Accepted, Rejected, Vector
 from eventsrc.envelope.model import DetId, Envelope, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from eventsrc.envelope.plain_envelopes import PlainCamera, PlainDetection, PlainEnvelope
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import Event
 from projections.fold.exact import Units
@@ -33,7 +33,7 @@ class _Event(msgspec.Struct, array_like=True, gc=False):
 
     offset: Offset
     logged_ns: int
-    envelope: PlainEnvelope | None = None
+    envelope: Envelope | None = None
     det_ids: tuple[DetId, ...] = ()
     digest: bytes = b""
     map: bytes | None = None
@@ -141,10 +141,10 @@ def _read_arrays(
 def _packed(event: ParsedEvent, read: Event) -> _Event:
     parsed, offset, logged_ns = event.parsed, event.offset, event.logged_ns
     if isinstance(parsed, Accepted):
-        digest, envelope = content_digest(parsed), _plain(parsed.envelope)
-        for detection in envelope.detections:
-            detection.embedding = None
-        return _Event(offset, logged_ns, envelope, parsed.det_ids, digest)
+        digest = content_digest(parsed)
+        for detection in parsed.envelope.detections:
+            force_setattr(detection, "embedding", None)
+        return _Event(offset, logged_ns, parsed.envelope, parsed.det_ids, digest)
     if read.key == MAP_KEY:
         return _Event(offset, logged_ns, map=read.payload)
     refusal = parsed.reason if isinstance(parsed, Rejected) else None
@@ -155,19 +155,7 @@ def _unpacked(
     event: _Event, vectors: tuple[Vector | None, ...]
 ) -> Accepted | OccupancyMap | Rejected | None:
     if event.envelope is not None:
-        return Accepted(cast(Envelope, event.envelope), event.det_ids, vectors, event.digest)
+        return Accepted(event.envelope, event.det_ids, vectors, event.digest)
     if event.map is not None:
         return parse_map(event.map)
     return None if event.refusal is None else Rejected(event.refusal)
-
-
-def _plain(envelope: object) -> PlainEnvelope:
-    """An envelope of `parse_events`, which is a model if it is unusual."""
-    if isinstance(envelope, PlainEnvelope):
-        return envelope
-    assert isinstance(envelope, Envelope)  # noqa: S101
-    fields = dict(envelope.__dict__)
-    if envelope.camera is not None:
-        fields["camera"] = PlainCamera(**envelope.camera.__dict__)
-    fields["detections"] = tuple([PlainDetection(**each.__dict__) for each in envelope.detections])
-    return PlainEnvelope(**fields)

@@ -10,7 +10,7 @@ from itertools import islice
 from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged
-from eventsrc.envelope.forms import read_fields
+from eventsrc.envelope.forms import read_envelopes
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
@@ -35,11 +35,10 @@ class ParsedEvent(NamedTuple):
 
 
 def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
-    """Validate events; for sixteen or so together this is quicker than one by one. The envelopes
-    are those of `eventsrc.envelope.forms.read_fields`."""
+    """Validate events; for sixteen or so together this is quicker than one by one."""
     enveloped = [event for event in events if event.is_envelope]
     # No size limit: it applied when the event was recorded.
-    outcomes = read_fields(enveloped, max_bytes=sys.maxsize)
+    outcomes = read_envelopes(enveloped, max_bytes=sys.maxsize)
     units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))
     coming, parsed_events = iter(outcomes), []
     for event in events:

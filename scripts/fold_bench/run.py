@@ -12,6 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import msgspec
 from plain import fold_plain
 from streams import DIM, MODEL, house_walk, keyframes, pictures, random_walk
 
@@ -237,7 +238,7 @@ def _whole_once(reader: LogReader) -> list[float]:
 def _payload(accepted: Accepted) -> bytes:
     import base64
 
-    document = accepted.envelope.model_dump(by_alias=True, exclude_none=True)
+    document = msgspec.to_builtins(accepted.envelope)
     for detection, det_id, vector in zip(
         document["detections"], accepted.det_ids, accepted.vectors, strict=True
     ):

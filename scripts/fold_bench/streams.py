@@ -99,7 +99,7 @@ def _accepted(
     if boxes is None:
         boxes = [(left + i, top + i, left + i + 130.0, top + i + 230.0) for i in seen]
     detections = tuple(
-        Detection.model_construct(
+        Detection(
             det_id=None,
             class_name=f"class {which % 20}",
             confidence=0.5 + which / 128,
@@ -110,7 +110,7 @@ def _accepted(
         )
         for which, box in zip(seen, boxes, strict=True)
     )
-    envelope = Envelope.model_construct(
+    envelope = Envelope(
         run_id="robot",
         keyframe_id=index,
         timestamp=1.7e9 + index,

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
 from eventsrc.envelope.ingest import Accepted, ingest
-from eventsrc.envelope.model import MAX_DEPTH_M, MAX_POSITION_M, Detection, Envelope, EnvelopeCamera
+from eventsrc.envelope.model import MAX_DEPTH_M, MAX_POSITION_M
 from eventsrc.envelope.occupancy_map import decode_map
+from eventsrc.envelope.readers import DetectionModel, EnvelopeCamera, EnvelopeModel
 from eventsrc.record.metrics import serving_metrics
 from eventsrc.record.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
 from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES
@@ -86,16 +87,16 @@ def test_the_envelope_on_the_page_has_every_field_and_is_accepted() -> None:
     document = json.loads(of_envelope)
     assert isinstance(ingest(of_envelope.encode()), Accepted)
     shown = (document, document["camera"], {**document["detections"][0], "det_id": "by default"})
-    for fields, model in zip(shown, (Envelope, EnvelopeCamera, Detection), strict=True):
+    for fields, model in zip(shown, (EnvelopeModel, EnvelopeCamera, DetectionModel), strict=True):
         assert set(fields) == {f.alias or name for name, f in model.model_fields.items()}
 
 
 def test_the_bounds_of_optional_fields_on_the_page_are_those_of_the_envelope() -> None:
-    schema = Envelope.model_json_schema()["$defs"]
+    schema = EnvelopeModel.model_json_schema()["$defs"]
     hfov = schema["EnvelopeCamera"]["properties"]["hfov_deg"]
     assert (hfov["minimum"], hfov["maximum"]) == (1, 170)
     for name in ("depth_sigma_m", "position_sigma_m"):
-        sigma = schema["Detection"]["properties"][name]["anyOf"][0]
+        sigma = schema["DetectionModel"]["properties"][name]["anyOf"][0]
         assert (sigma["minimum"], sigma["maximum"]) == (0.001, 1000)
         assert f"`{name}`" in PAGE
     assert MAX_DEPTH_M == 1000.0

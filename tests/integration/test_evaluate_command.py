@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from tests.commands import Commands
@@ -26,7 +27,7 @@ def save(folder: Path, name: str, run: list[Keyframe]) -> tuple[Path, Path]:
     """A run as log and truth file."""
     documents = []
     for keyframe in run:
-        document = keyframe.accepted.envelope.model_dump(by_alias=True)
+        document = msgspec.to_builtins(keyframe.accepted.envelope)
         for seen, vector in zip(document["detections"], keyframe.accepted.vectors, strict=True):
             assert vector is not None
             seen |= {"embedding_dim": len(vector), "embedding_model": "made"}

@@ -22,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from eventsrc.log import NEVER, LogWriter
@@ -50,7 +51,7 @@ def building(number: int) -> Building:
 def envelopes(number: int) -> Iterator[tuple[bytes, int]]:
     """The payloads of a building's run and how many observations each has."""
     for keyframe in drive(building(number), f"bench-{number}", number, KEYFRAMES):
-        document = keyframe.accepted.envelope.model_dump(by_alias=True)
+        document = msgspec.to_builtins(keyframe.accepted.envelope)
         document["map_x"] += number * APART_M
         for seen, vector in zip(document["detections"], keyframe.accepted.vectors, strict=True):
             assert vector is not None

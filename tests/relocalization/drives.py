@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 
+import msgspec
 import numpy as np
 
 from eventsrc.envelope.ingest import Accepted
@@ -124,7 +125,7 @@ def _keyframe(
         detections.append(_detection(run_id, number, len(detections), label, box))
         vectors.append(_phantom(building, label, session, rng))
         instances.append(None)
-    envelope = Envelope.model_validate(
+    envelope = msgspec.convert(
         {
             "run_id": run_id,
             "keyframe_id": number,
@@ -132,8 +133,9 @@ def _keyframe(
             "map_x": x,
             "map_y": y,
             "map_yaw": math.remainder(yaw, 2 * math.pi),
-            "detections": tuple(detections),
-        }
+            "detections": detections,
+        },
+        Envelope,
     )
     det_ids = tuple(DetId(str(d["det_id"])) for d in detections)
     return Keyframe(Accepted(envelope, det_ids, tuple(vectors)), building.room(x, y), instances)

@@ -10,7 +10,7 @@ from pydantic import create_model
 
 from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import KINDS, KeepApart, encode_command
-from eventsrc.envelope.model import Envelope
+from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.log.format import schema_of
@@ -42,13 +42,13 @@ def test_viewers_read_the_schema_of_every_key(key: str) -> None:
 
 def test_the_schema_that_pydantic_makes_is_refused() -> None:
     with pytest.raises(NotRead, match=r"map_x|floor|camera|detections"):
-        parse_json_schema(Envelope.model_json_schema(by_alias=True), "Envelope")
+        parse_json_schema(EnvelopeModel.model_json_schema(by_alias=True), "Envelope")
 
 
 def test_an_envelope_has_every_field_with_its_type() -> None:
     types = parsed("tb/detections")
     fields = types["mapfold.Envelope"]
-    assert set(fields) == {f.alias or n for n, f in Envelope.model_fields.items()}
+    assert set(fields) == {f.alias or n for n, f in EnvelopeModel.model_fields.items()}
     assert fields["detections"] == "mapfold.Envelope.detections[]"
     assert fields["camera"] == "mapfold.Envelope.camera"
     assert (fields["map_x"], fields["keyframe_id"], fields["floor"]) == (

@@ -11,7 +11,7 @@ from mcap.reader import SeekingReader
 from mcap.stream_reader import StreamReader
 
 from eventsrc.base.errors import LogDamaged, NotALog
-from eventsrc.envelope.model import Envelope
+from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
 from eventsrc.log.flat_schema import flat_schema
@@ -169,7 +169,7 @@ def test_any_mcap_reader_opens_sealed_segments_with_the_right_schema(sealed: Pat
                 times = (found.log_time, found.publish_time)
                 seen.append(Event(offset, channel.topic, *times, found.data))
     assert seen == read_log(sealed)
-    assert schemas == {KEY: flat_schema(Envelope), LOSS_KEY: flat_schema(Loss)}
+    assert schemas == {KEY: flat_schema(EnvelopeModel), LOSS_KEY: flat_schema(Loss)}
 
 
 def test_segments_of_two_logs_are_merged_without_an_option(sealed: Path, tmp_path: Path) -> None:

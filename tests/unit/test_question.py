@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.envelope.model import EnvelopeCamera
+from eventsrc.envelope.readers import EnvelopeCamera
 from projections.fold.errors import QuestionError
 from projections.localize.relocalize import (
     Camera,

@@ -23,7 +23,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from eventsrc.base import user_files
 from eventsrc.base.text import counted
 from eventsrc.base.user_files import FileFault
-from eventsrc.envelope.model import MAX_DIMENSION, EnvelopeCamera, Text, describe_error
+from eventsrc.envelope.model import MAX_DIMENSION, Text, describe_error
+from eventsrc.envelope.readers import EnvelopeCamera
 from projections.fold.errors import QuestionError
 from projections.fold.exact import quantise, to_float32
 

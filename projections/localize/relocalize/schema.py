@@ -10,7 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from eventsrc.envelope.model import MAX_DIMENSION, EnvelopeCamera
+from eventsrc.envelope.model import MAX_DIMENSION
+from eventsrc.envelope.readers import EnvelopeCamera
 
 from .question import MAX_CROPS, MAX_VIEWS
 from .reading import CropModel, MovementModel

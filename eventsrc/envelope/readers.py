@@ -1,0 +1,200 @@
+"""Two readers of envelopes, by msgspec and by pydantic, with the same result.
+
+`read_plain` reads usual envelopes in half of pydantic's time: those with known fields only, whose
+texts are printable. For any other payload it returns None, and `read_checked` reads it, which also
+checks unknown fields and gives the reasons of refusals. A property test compares the two on
+payloads near the rules' limits.
+
+The models define a *valid* envelope. They are strict: an int is not a string, NaN is not a number.
+Unknown fields need only be JSON; they are ignored here, and the log keeps them, since it stores the
+payload verbatim. The JSON schema in every segment is that of the models, docstrings included: do
+not change them.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Final
+
+import msgspec
+from msgspec.structs import force_setattr
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    TypeAdapter,
+    model_validator,
+)
+
+from .model import (
+    ANGLE_RAD,
+    HFOV_DEG,
+    INT64,
+    MAX_DEPTH_M,
+    MAX_DETECTIONS,
+    MAX_DIMENSION,
+    MAX_TIMESTAMP_S,
+    PIXELS,
+    SIGMA_M,
+    TEXT,
+    Detection,
+    DetId,
+    Envelope,
+    Floor,
+    KeyframeId,
+    PoseCovariance,
+    Position,
+    RunId,
+    StatedCamera,
+    Text,
+    contains_non_finite,
+    covariance_fault,
+)
+
+
+class NonFinite(Exception):
+    """An unknown field holds NaN or infinity.
+
+    No ValueError, so that pydantic stops at the first one instead of collecting a million errors.
+    """
+
+
+def _require_finite(value: object) -> None:
+    """Raise NonFinite for NaN or infinity in an unknown field: they are not JSON, and a reader of
+    the log that parses JSON would fail. Returns None: the model drops the value, the log has it."""
+    if isinstance(value, float | list | dict) and contains_non_finite(value):
+        raise NonFinite
+
+
+Unknown = Annotated[Any, AfterValidator(_require_finite)]
+
+
+class _Model(BaseModel):
+    __pydantic_extra__: dict[str, Unknown]
+    # "allow" makes pydantic check unknown fields; it costs nothing without any.
+    model_config = ConfigDict(
+        strict=True, frozen=True, extra="allow", allow_inf_nan=False, populate_by_name=True
+    )
+
+
+class DetectionModel(_Model, title="Detection"):
+    """One detected object in a keyframe.
+
+    ``bbox`` is x_min, y_min, x_max, y_max in pixels. ``embedding`` is base64 of
+    ``embedding_dim`` little-endian float32. ``depth_m`` is how far away the thing is along the ray
+    through the box's centre, ``position`` its x and y in the map frame, in metres; their standard
+    errors count only beside them.
+    """
+
+    det_id: Annotated[DetId, TEXT] | None = None
+    class_name: Text = Field(alias="class")
+    confidence: float
+    bbox: tuple[float, float, float, float]
+    embedding: str | None = None
+    embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
+    embedding_model: Text | None = None
+    depth_m: Annotated[float, Field(gt=0.0, le=MAX_DEPTH_M)] | None = None
+    depth_sigma_m: Annotated[float, SIGMA_M] | None = None
+    position: tuple[Position, Position] | None = None
+    position_sigma_m: Annotated[float, SIGMA_M] | None = None
+
+
+class EnvelopeCamera(_Model):
+    """The level pinhole camera that took the picture: horizontal field of view, picture size, and
+    the angle from the robot's heading to where it looks, to the left."""
+
+    hfov_deg: Annotated[float, HFOV_DEG]
+    width_px: Annotated[float, PIXELS]
+    height_px: Annotated[float, PIXELS]
+    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+
+
+class EnvelopeModel(_Model, title="Envelope"):
+    """One keyframe: where the robot was and what it saw.
+
+    ``timestamp`` is the robot's time in seconds since the Unix epoch, ``map_x`` and ``map_y`` are
+    metres and ``map_yaw`` radians in the map frame; all three are None when the robot has no pose.
+    Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
+    is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
+    the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
+    counts only beside a pose.
+    """
+
+    run_id: Annotated[RunId, TEXT]
+    keyframe_id: Annotated[KeyframeId, INT64]
+    timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
+    map_x: Position | None = None
+    map_y: Position | None = None
+    map_yaw: float | None = None
+    camera: EnvelopeCamera | None = None
+    floor: Floor = None
+    map_z: Position | None = None
+    pose_covariance: PoseCovariance | None = None
+    detections: Annotated[tuple[DetectionModel, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
+
+    @model_validator(mode="after")
+    def _check_pose(self) -> "EnvelopeModel":
+        if not (self.map_x is None) is (self.map_y is None) is (self.map_yaw is None):
+            raise ValueError("map_x, map_y and map_yaw must all be numbers or all be absent")
+        return self
+
+
+_validate_json: Callable[[bytes], EnvelopeModel] = TypeAdapter(
+    EnvelopeModel
+).validator.validate_json
+"""``EnvelopeModel.model_validate_json`` without its Python wrapper, a twentieth of the time."""
+
+
+def read_checked(payload: bytes) -> Envelope:
+    """The envelope in ``payload``, valid except for its embeddings. Raises pydantic's
+    ValidationError, NonFinite, or RecursionError for JSON that is nested too deeply."""
+    fields = dict(_validate_json(payload).__dict__)
+    if (camera := fields["camera"]) is not None:
+        fields["camera"] = StatedCamera(**camera.__dict__)
+    fields["detections"] = tuple([Detection(**each.__dict__) for each in fields["detections"]])
+    return Envelope(**fields)
+
+
+_decode: Final = msgspec.json.Decoder(Envelope).decode
+
+
+def read_plain(payload: bytes) -> Envelope | None:
+    """The envelope in ``payload``, valid except for its embeddings, which are not decoded; None if
+    `read_checked` must read it. Call `eventsrc.envelope.ingest.check_cost` before."""
+    try:
+        envelope = _decode(payload)
+    except ValueError:  # msgspec's errors, and bytes that are not UTF-8
+        return None
+    except RecursionError:
+        return None
+    if not _is_plain(envelope):
+        return None
+    floor: object = envelope.floor
+    if isinstance(floor, int):
+        force_setattr(envelope, "floor", str(floor))
+    return envelope
+
+
+def _is_plain(envelope: Envelope) -> bool:
+    """Whether the envelope keeps the rules that its types do not state. Texts are printable, so
+    they have no control characters."""
+    if not envelope.run_id.isprintable():
+        return False
+    if not (envelope.map_x is None) is (envelope.map_y is None) is (envelope.map_yaw is None):
+        return False
+    if isinstance(envelope.floor, str) and not envelope.floor.isprintable():
+        return False
+    covariance = envelope.pose_covariance
+    if covariance is not None and covariance_fault(covariance) is not None:
+        return False
+    ids: list[str] = []
+    for detection in envelope.detections:
+        if not detection.class_name.isprintable():
+            return False
+        model, det_id = detection.embedding_model, detection.det_id
+        if model is not None and not model.isprintable():
+            return False
+        if det_id is not None:
+            ids.append(det_id)
+    # A given id may equal another, or one generated for a detection without an id.
+    return not ids or (len(set(ids)) == len(envelope.detections) and all(map(str.isprintable, ids)))
