@@ -176,35 +176,14 @@ def test_every_keyframe_id_fits(spool: Spool, keyframe_id: int) -> None:
     assert [one.keyframe_id for one in spool.after(0, 9)] == [keyframe_id]
 
 
-_OLD_SCHEMA = """
-create table spooled (
-    seq integer primary key autoincrement, run_id text not null,
-    keyframe_id integer not null, payload blob not null
-);
-create index spooled_keyframe on spooled (run_id, keyframe_id);
-create table refused (
-    seq integer primary key, run_id text not null, keyframe_id integer not null,
-    payload blob, log_id text not null, reason text not null
-);
-create index refused_keyframe on refused (run_id, keyframe_id);
-insert into spooled values (4, 'run-a', 4, x'34'), (5, 'run-a', 5, x'35');
-insert into refused values (1, 'run-a', 1, null, 'log', 'too blue'),
-                           (2, 'run-a', 2, x'32', 'log', 'too blue');
-"""
-
-
-def test_a_spool_of_an_earlier_version_is_upgraded(tmp_path: Path) -> None:
+def test_a_spool_of_a_version_that_was_never_released_is_refused_unchanged(tmp_path: Path) -> None:
     """It did not name payloads; acks name nothing else."""
     with closing(sqlite3.connect(tmp_path / "spool")) as db:
-        db.executescript(_OLD_SCHEMA)
-    for _ in range(2):
-        with closing(Spool(tmp_path / "spool")) as spool:
-            assert (_payloads(spool), spool.refused_count) == ([b"4", b"5"], 2)
-    with closing(Spool(tmp_path / "spool")) as spool:
-        assert spool.acknowledge(_ack(b"2", b"4")) == 1
-        spool.add("run-a", 6, b"6")
-        assert spool.after(0, 9) == [
-            Spooled(5, "run-a", 5, b"5"),
-            Spooled(6, "run-a", 6, b"6"),
-        ]
-        assert [one.keyframe_id for one in spool.refused(9)] == [1]
+        db.executescript(
+            "create table spooled (seq integer primary key, run_id text, keyframe_id integer,"
+            " payload blob); insert into spooled values (4, 'run-a', 4, x'34');"
+        )
+    with pytest.raises(SpoolError, match="never released made it: move it away, use a new one"):
+        Spool(tmp_path / "spool")
+    with closing(sqlite3.connect(tmp_path / "spool")) as db:
+        assert db.execute("select payload from spooled").fetchall() == [(b"4",)]

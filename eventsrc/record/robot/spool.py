@@ -9,9 +9,6 @@
   sent again. It counts towards the bound, but that recorder's log has the bytes, so when there is
   no room for a new envelope, the oldest quarantined bytes are dropped; run, keyframe and reason
   stay. An ack removes a quarantined envelope too: another recorder has it.
-* A spool file of an earlier version, which did not name payloads, is given their SHA-256 when it is
-  opened. Refused envelopes without bytes get none: they can be listed and discarded, and no ack
-  removes them.
 """
 
 import contextlib
@@ -37,8 +34,8 @@ create table if not exists spooled (
     payload blob not null,
     sha256 text
 );
+create index if not exists spooled_sha256 on spooled (sha256);
 """
-_SPOOL_INDEX: Final = "create index if not exists spooled_sha256 on spooled (sha256)"
 _QUARANTINE_SCHEMA: Final = """
 create table if not exists refused (
     seq integer primary key,
@@ -50,20 +47,8 @@ create table if not exists refused (
     sha256 text
 );
 create index if not exists refused_payload on refused (seq) where payload is not null;
+create index if not exists refused_sha256 on refused (sha256);
 """
-_QUARANTINE_INDEX: Final = "create index if not exists refused_sha256 on refused (sha256)"
-_ADD_SHA256: Final = {
-    "spooled": """
-        alter table spooled add column sha256 text;
-        update spooled set sha256 = sha256_of(payload);
-        drop index if exists spooled_keyframe;
-    """,
-    "refused": """
-        alter table refused add column sha256 text;
-        update refused set sha256 = sha256_of(payload) where payload is not null;
-        drop index if exists refused_keyframe;
-    """,
-}
 
 
 class Spooled(NamedTuple):
@@ -93,8 +78,6 @@ class _Quarantine:
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
         db.executescript(_QUARANTINE_SCHEMA)
-        _add_sha256(db)
-        db.execute(_QUARANTINE_INDEX)
         row = db.execute("select count(*), coalesce(sum(length(payload)), 0) from refused")
         self.count, self.size = map(int, row.fetchone())
 
@@ -197,8 +180,7 @@ class Spool:
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = normal")
         self._db.executescript(_SPOOL_SCHEMA)
-        self._quarantine = _Quarantine(self._db)  # adds missing columns to both tables
-        self._db.execute(_SPOOL_INDEX)
+        self._quarantine = _Quarantine(self._db)
         row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
         self._count, self._bytes = row.fetchone()
 
@@ -331,18 +313,12 @@ def _spool_errors(path: Path) -> Iterator[None]:
         raise SpoolError(f"spool {path}: {error.strerror}") from None
     except sqlite3.OperationalError as error:
         hint = "another robot process uses it; give each its own spool"
-        hint = hint if "locked" in str(error) else "check the path, its rights and the disk"
+        if "no such column" in str(error):
+            hint = "a version that was never released made it: move it away, use a new one"
+        elif "locked" not in str(error):
+            hint = "check the path, its rights and the disk"
         raise SpoolError(f"spool {path}: {error}; {hint}") from None
     except sqlite3.DatabaseError as error:
         raise SpoolError(
             f"spool {path}: {error}; move the file away and publish into a new one"
         ) from None
-
-
-def _add_sha256(db: sqlite3.Connection) -> None:
-    """Add the column ``sha256`` to both tables where it is missing, all or nothing."""
-    db.create_function("sha256_of", 1, payload_sha256, deterministic=True)
-    for table, steps in _ADD_SHA256.items():
-        columns = db.execute("select name from pragma_table_info(?)", (table,)).fetchall()
-        if ("sha256",) not in columns:
-            db.executescript(f"begin immediate; {steps} commit;")
