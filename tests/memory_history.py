@@ -38,7 +38,8 @@ from projections.fold.deltas import (
     RunSeen,
 )
 from projections.fold.settings import Settings
-from projections.store.history import NEVER, NO_PLACE, History
+from projections.store.history import History
+from projections.store.history_rows import NEVER, NO_PLACE
 from projections.store.neighbours import Neighbours, Posed
 from projections.store.records import (
     Cause,

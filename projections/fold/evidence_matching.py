@@ -181,7 +181,7 @@ class Matching:
             value, ordinal, cosine = match
             rivals = exp(max(-value, _LEAST_EXPONENT))
             for other in own:
-                if other is match:
+                if other[1] == ordinal:
                     continue
                 more = other[0] - value
                 holder = holders.get(other[1])

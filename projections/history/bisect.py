@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from eventsrc.envelope.model import Offset
-from projections.store.history import NEVER, History
+from projections.store.history import History
+from projections.store.history_rows import NEVER
 from projections.store.records import Cause, ObjectHistory, PlaceHistory
 
 from .condition_functions import Direction, Names, Value

@@ -19,10 +19,10 @@ from projections.fold.settings import Settings
 from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
+from projections.store.history import History
 from projections.store.history_recorder import HistoryRecorder
 from projections.store.history_recorder import Progress as Progress
 from projections.store.records import Merge, ObjectMerge, Refusal
-from projections.store.stored_history import StoredHistory
 from projections.store.stored_view import StoredView
 from projections.store.timeline_cache import TimelineCache
 
@@ -79,7 +79,7 @@ class KnownHistory:
         kept = TimelineCache(reader, settings, corrections, note) if cache else None
         self._recorder = HistoryRecorder(reader, settings, corrections, kept, progress)
         self._latest: StoredView | None = None
-        self._index: tuple[StoredHistory, CountIndex] | None = None
+        self._index: tuple[History, CountIndex] | None = None
         self._entries = EntryMaker(reader)
 
     @property
@@ -88,7 +88,7 @@ class KnownHistory:
         return self.reader.next_offset
 
     @property
-    def history(self) -> StoredHistory:
+    def history(self) -> History:
         """The history up to `end`; folds new events first. Raises FoldError at a bad event."""
         return self._history_of(self.end)
 
@@ -97,12 +97,12 @@ class KnownHistory:
         """The map up to `end`, read-only; its observations carry no embeddings."""
         return self._whole_view(self.history)
 
-    def _whole_view(self, history: StoredHistory) -> StoredView:
+    def _whole_view(self, history: History) -> StoredView:
         if self._latest is None or self._latest.next_offset != history.next_offset:
             self._latest = self._recorder.at(history.next_offset)
         return self._latest
 
-    def covering(self, end: Offset) -> StoredHistory:
+    def covering(self, end: Offset) -> History:
         """The history of all that can be read and folded, for a question about the map after
         ``end`` events. Raises FoldError, LogDamaged for an event before ``end`` only."""
         try:
@@ -112,7 +112,7 @@ class KnownHistory:
                 raise
         return self._history_of(end)
 
-    def _history_of(self, end: Offset) -> StoredHistory:
+    def _history_of(self, end: Offset) -> History:
         """The history of ``end`` events or more."""
         return self._recorder.history(end)
 
@@ -229,7 +229,7 @@ def _check_names(expression: Expression, facts: HistoryFacts) -> None:
             raise expression.error_at(mention.column, str(error))
 
 
-def _refuse_keyframe(history: StoredHistory, text: str, end: Offset) -> None:
+def _refuse_keyframe(history: History, text: str, end: Offset) -> None:
     """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
     keyframe = keyframe_ordinal(history, text)
     if keyframe is None:

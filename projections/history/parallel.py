@@ -49,7 +49,6 @@ from projections.store.column_rows import TableWriter
 from projections.store.history import History
 from projections.store.history_recorder import map_at
 from projections.store.records import PlaceHistory
-from projections.store.stored_history import StoredHistory
 from projections.store.tables import Tables
 
 from .known import Progress
@@ -257,7 +256,7 @@ class _Fold:
 
     def result(self, truth: "Truth | None", *, keep_view: bool) -> FoldResult:
         view, tables = self.view, Tables(self._writer.finish())
-        history = StoredHistory(view.settings, view.corrections, tables, self._map_at)
+        history = History(view.settings, view.corrections, tables, self._map_at)
         result = fold_result(view, history, truth, self.seconds)
         return replace(result, view=self.view) if keep_view else result
 

@@ -8,7 +8,8 @@ the same place, and the merges on the two chains up to that event are the reason
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal
-from projections.store.history import NEVER, History
+from projections.store.history import History
+from projections.store.history_rows import NEVER
 from projections.store.records import Merge
 
 from .explanation import Entry, Explanation, position_text

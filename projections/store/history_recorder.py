@@ -29,8 +29,8 @@ from projections.map.view import MapView
 
 from .column_rows import TableWriter
 from .columns import STRIPE_EVENTS, Stripe, joined
+from .history import History
 from .recorded_vectors import RecordedVectors
-from .stored_history import StoredHistory
 from .stored_view import StoredView
 from .tables import DamagedPart, Tables
 from .timeline_cache import TimelineCache
@@ -66,14 +66,14 @@ class HistoryRecorder:
         self._reader, self._settings, self._corrections = reader, settings, corrections
         self._cache, self._progress = cache, progress
         self._folded: _Folded | None = None
-        self._history: StoredHistory | None = None
+        self._history: History | None = None
 
-    def history(self, end: Offset) -> StoredHistory:
+    def history(self, end: Offset) -> History:
         """The history of ``end`` events or more; raises as `up_to`."""
         tables, history = self.up_to(end), self._history
         if history is None or history.tables is not tables:
             map_of = partial(map_at, self._reader)
-            history = StoredHistory(self._settings, self._corrections, tables, map_of)
+            history = History(self._settings, self._corrections, tables, map_of)
             self._history = history
         return history
 

@@ -10,15 +10,16 @@ from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
 
 from .columns import NONE, Array
+from .history import History
+from .history_rows import documents, placed_columns
 from .records import Merge, ObjectMerge
-from .stored_history import StoredHistory, documents, placed_columns
 from .tables import Groups, Rows, last_rows
 
 
 class Moment:
     """The rows of a history below ``end``."""
 
-    def __init__(self, history: StoredHistory, end: Offset) -> None:
+    def __init__(self, history: History, end: Offset) -> None:
         self.tables, self.end = history.tables, end
         self._counts: dict[str, int] = {}
         self.merges = documents(self.tables, "merge", Merge, self.count("merge"))

@@ -15,7 +15,7 @@ from projections.fold.exact import Units
 from projections.map.fold import READ_AHEAD, parse_events
 from projections.map.space_vectors import vectors_of
 
-from .stored_history import StoredHistory
+from .history import History
 
 _Vectors = NDArray[np.int32]
 
@@ -23,7 +23,7 @@ _Vectors = NDArray[np.int32]
 class RecordedVectors:
     """The unit vectors of the observations of a history of this log; for many threads."""
 
-    def __init__(self, reader: LogReader, history: StoredHistory) -> None:
+    def __init__(self, reader: LogReader, history: History) -> None:
         self._log, self._log_id = reader.path, reader.log_id
         self._history = history
 

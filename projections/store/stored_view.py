@@ -19,10 +19,10 @@ from projections.map.records import KeyframeRecord, ObservationRecord
 from projections.map.view import MapView
 
 from .columns import NONE
+from .history import History
 from .lazy_rows import Chunks
 from .moment import Moment
 from .recorded_vectors import RecordedVectors
-from .stored_history import StoredHistory
 from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
 from .timeline_cache import TimelineCache
 
@@ -38,7 +38,7 @@ class StoredView(MapView):
 
     def __init__(
         self,
-        history: StoredHistory,
+        history: History,
         end: Offset,
         cache: TimelineCache | None = None,
         recorded: RecordedVectors | None = None,

@@ -20,7 +20,7 @@ from projections.map.fold import fold_log
 from projections.postgres.graph_sink import GraphSink
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.vector_sink import VectorSink
-from projections.store.stored_history import StoredHistory
+from projections.store.history import History
 from projections.store.tables import Tables
 
 SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
@@ -57,7 +57,7 @@ def no_map(offset: Offset) -> OccupancyMap:
         GraphSink,
         lambda: LiveFold(Settings()).tracker,
         VectorSink,
-        lambda: StoredHistory(Settings(), NO_CORRECTIONS, Tables(), no_map),
+        lambda: History(Settings(), NO_CORRECTIONS, Tables(), no_map),
     ],
     ids=["view", "map", "live view", "graph sink", "tracker", "vector sink", "history"],
 )

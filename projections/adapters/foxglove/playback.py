@@ -40,8 +40,8 @@ from projections.map.moments import Moments
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter
+from projections.store.history import History
 from projections.store.history_recorder import map_at
-from projections.store.stored_history import StoredHistory
 from projections.store.stored_view import StoredView
 from projections.store.tables import Tables
 
@@ -176,7 +176,7 @@ class PastMaps:
                 progress(offset, end)
         self.floors = list(view.maps)
         tables = Tables(writer.finish())
-        self._history = StoredHistory(settings, corrections, tables, partial(map_at, reader))
+        self._history = History(settings, corrections, tables, partial(map_at, reader))
 
     def lines_between(self, start: Offset, end: Offset) -> list[tuple[Offset, str]]:
         """The changes of the events from ``start`` to before ``end``: offset and line of each."""
