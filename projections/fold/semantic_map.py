@@ -246,6 +246,7 @@ class SemanticMap:
             self.space.decide(*state["space"])
         for name, reducer in self._parts():
             reducer.load(part(name, state))
+        self.names = PlaceNames(())  # none is given yet
         self._use_walls()
 
     def _parts(self) -> tuple[tuple[str, Reducer], ...]:

@@ -183,7 +183,7 @@ def test_messages_of_no_known_type_are_kept_and_make_nothing(
 ) -> None:
     with (
         ros2dds.bridge(endpoint) as bridge,
-        recording(connected(), log_path, new_bridge(topics=["/odd", "/own"])) as running,
+        recording(connected(), log_path, new_bridge(topic=["/odd", "/own"])) as running,
     ):
         announce_all(bridge)
         bridge.advertise("/odd")

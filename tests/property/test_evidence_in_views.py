@@ -96,7 +96,7 @@ def test_objects_of_a_class_are_counted_as_they_are_called_at_each_offset(
             assert facts.object_count(name) == expected[name]
         counts.append(expected)
     falls = any(b[name] < a[name] for a, b in pairwise(counts) for name in a)
-    assert not falls or HistoryFacts(history, index, Offset(0)).objects_merge
+    assert not falls or HistoryFacts(history, index, Offset(len(events))).objects_merge
 
 
 ESTIMATE = Estimate(1, 2, 30, 4, 50, 3)
