@@ -114,8 +114,8 @@ def file_head(metadata: Metadata) -> bytes:
 
 
 def mark_seed(head: dict[str, str]) -> int:
-    """The mark seed in the head of an active segment; 0 for a sealed one under the name of an active
-    one, which has no marks."""
+    """The mark seed in the head of an active segment; 0 for a sealed one under the name of one,
+    which has no marks."""
     return int(head.get(MARK_SEED, "0"), 16)
 
 
