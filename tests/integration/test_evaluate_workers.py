@@ -12,6 +12,7 @@ from eventsrc.envelope.ingest import Accepted
 from projections.fold.errors import QuestionError
 from projections.fold.settings import Settings
 from projections.localize.evaluate import evaluate, parallel, read_truth
+from projections.surfaces.cli.evaluate import CameraOptions, FoldSettings
 from projections.surfaces.cli.evaluate import evaluate as command
 from tests.commands import Commands
 from tests.integration.test_evaluate_command import save
@@ -119,10 +120,12 @@ def test_scores_of_several_maps_are_those_of_one_process(
     found = []
     for workers in (0, many):
         command(
-            [folder / "a", folder / "x"],
-            [folder / "b"],
-            [folder / f"{name}.truth.jsonl.gz" for name in "abx"],
+            map_logs=[folder / "a", folder / "x"],
+            query_logs=[folder / "b"],
+            truth_files=[folder / f"{name}.truth.jsonl.gz" for name in "abx"],
+            camera=CameraOptions(),
             self_=self_,
+            chosen=FoldSettings(),
             workers=workers,
             json_=True,
         )

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from itertools import product
 
 _ANGLES = 16
-_CELL_M = 0.25
+_CELLS = 512
+"""A cell is at least this part of the picture, so that a box touches few cells of any map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,9 @@ def place_labels(
     ``rings`` are distances from the anchor to the box's nearest edge, ascending.
     """
     placed: list[Extent | None] = []
-    taken = _Taken(occupied)
+    x0, y0, x1, y1 = bounds
+    sides = [side for label in requests for side in (label.width, label.height)]
+    taken = _Taken(occupied, max([(x1 - x0) / _CELLS, (y1 - y0) / _CELLS, *sides]))
     for label in requests:
         boxes = (box for box in _candidates(label, rings) if box.inside(bounds))
         free = next((box for box in boxes if not taken.overlap(box)), None)
@@ -76,28 +79,30 @@ class _Taken:
     """Boxes by the cells of a grid that they touch, so that a box is compared with those near it
     only."""
 
-    def __init__(self, boxes: Iterable[Extent]) -> None:
+    def __init__(self, boxes: Iterable[Extent], cell_m: float) -> None:
+        self._cell_m = cell_m
         self._by_cell: dict[tuple[int, int], list[Extent]] = {}
         for box in boxes:
             self.add(box)
 
     def add(self, box: Extent) -> None:
-        for cell in _cells(box):
+        for cell in self._cells(box):
             self._by_cell.setdefault(cell, []).append(box)
 
     def overlap(self, box: Extent) -> bool:
         """Whether one of the boxes overlaps ``box``."""
         return any(
-            box.overlaps(other) for cell in _cells(box) for other in self._by_cell.get(cell, ())
+            box.overlaps(other)
+            for cell in self._cells(box)
+            for other in self._by_cell.get(cell, ())
         )
 
-
-def _cells(box: Extent) -> Iterable[tuple[int, int]]:
-    """The cells that a box touches; a little larger, as sums are rounded."""
-    wide, high = box.half_width + 1e-6, box.half_height + 1e-6
-    x0, x1 = (math.floor((box.x + side) / _CELL_M) for side in (-wide, wide))
-    y0, y1 = (math.floor((box.y + side) / _CELL_M) for side in (-high, high))
-    return product(range(x0, x1 + 1), range(y0, y1 + 1))
+    def _cells(self, box: Extent) -> Iterable[tuple[int, int]]:
+        """The cells that a box touches; a little larger, as sums are rounded."""
+        wide, high = box.half_width + 1e-6, box.half_height + 1e-6
+        x0, x1 = (math.floor((box.x + side) / self._cell_m) for side in (-wide, wide))
+        y0, y1 = (math.floor((box.y + side) / self._cell_m) for side in (-high, high))
+        return product(range(x0, x1 + 1), range(y0, y1 + 1))
 
 
 def _candidates(label: LabelRequest, rings: Sequence[float]) -> Iterable[Extent]:
