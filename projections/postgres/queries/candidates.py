@@ -108,10 +108,10 @@ class CandidateSearch:
         when questions cannot be answered."""
         with _query_errors(self._targets.vector_url):
             row = self._vectors.execute(
-                "SELECT embedding FROM public.detection_embeddings LIMIT 1", binary=True
+                "SELECT embedding::real[] FROM public.detection_embeddings LIMIT 1", binary=True
             ).fetchone()
         if row is not None:
-            self.candidates([Crop(row[0].to_numpy())])
+            self.candidates([Crop(np.array(row[0], np.float32))])
 
     def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Linked]":
         """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
