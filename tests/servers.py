@@ -11,8 +11,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import psycopg
-
 from projections.postgres.connection import connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
 from tests.thorough import THOROUGH
@@ -98,18 +96,23 @@ def server_to_kill() -> Iterator[EmbeddedServer]:
 
 
 def kill_postgres(server: EmbeddedServer) -> None:
-    """SIGKILL to the postmaster; returns when all of its sessions have ended.
+    """SIGKILL to the postmaster; returns when all of its processes have ended.
 
-    Each notices by itself, some later than others, and serves its client until then.
+    Each notices by itself, some later than others, and serves its client until then. The postmaster
+    is stopped first, so that it forks none that would be missed.
     """
-    with psycopg.connect(server.url, autocommit=True) as witness, contextlib.ExitStack() as stack:
+    postmaster = int((server.data / "postmaster.pid").read_text().split()[0])
+    with contextlib.ExitStack() as stack:
         waiting, sessions = select.poll(), set()
-        for (pid,) in witness.execute("SELECT pid FROM pg_stat_activity").fetchall():
-            session = os.pidfd_open(pid)
-            stack.callback(os.close, session)
-            waiting.register(session, select.POLLIN)
-            sessions.add(session)
-        os.kill(int((server.data / "postmaster.pid").read_text().split()[0]), signal.SIGKILL)
+        os.kill(postmaster, signal.SIGSTOP)
+        children = Path(f"/proc/{postmaster}/task/{postmaster}/children").read_text("ascii")
+        for pid in map(int, children.split()):
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                session = os.pidfd_open(pid)
+                stack.callback(os.close, session)
+                waiting.register(session, select.POLLIN)
+                sessions.add(session)
+        os.kill(postmaster, signal.SIGKILL)
         while sessions:
             ended = waiting.poll(WAIT_S * 1000)
             assert ended, "a session outlives its server"
