@@ -151,31 +151,42 @@ def test_tables_read_back_are_the_map(view: MapView) -> None:
     assert len(read["adjacency.csv"]) == len(view.edges())
 
 
-def _area_doubled(ring: list[list[float]]) -> float:
-    return sum(a[0] * b[1] - b[0] * a[1] for a, b in pairwise(ring))
+def _naive_corners(points: list[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Ends of every segment that has all points on its left or on itself: corners of the hull."""
+
+    def side(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> int:
+        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+    def edge(a: tuple[int, int], b: tuple[int, int]) -> bool:
+        length = math.dist(a, b)
+        return all(
+            side(a, b, c) > 0
+            or (side(a, b, c) == 0 and max(math.dist(a, c), math.dist(b, c)) <= length)
+            for c in points
+        )
+
+    return {end for a in points for b in points if a != b and edge(a, b) for end in (a, b)}
 
 
 @given(maps())
 def test_geojson_outlines_are_convex_hulls(view: MapView) -> None:
-    from scipy.spatial import ConvexHull, QhullError  # takes a second to import
-
     features = json.loads(geojson(view))["features"]
     by_kind: dict[str, list[Any]] = {"place": [], "object": [], "adjacency": [], "run": []}
     for feature in features:
         by_kind[feature["properties"]["kind"]].append(feature)
     for place, feature in zip(view.places.values(), by_kind["place"], strict=True):
         poses = [view.keyframes[k].pose for k in place.members]
-        points = np.array([(pose.x_m, pose.y_m) for pose in poses if pose is not None])
-        try:
-            hull = {tuple(points[i]) for i in ConvexHull(points).vertices}
-        except (QhullError, ValueError):  # fewer than three points, or all on a line
-            shape, corners = feature["geometry"]["type"], feature["geometry"]["coordinates"]
-            assert shape == "Point" or _area_doubled(corners[0]) < 1e-12  # a line but for rounding
+        points = sorted({(pose.x_um, pose.y_um) for pose in poses if pose is not None})
+        corners = _naive_corners(points)
+        if len(corners) < 3:  # one point, or all on a line
+            assert feature["geometry"]["type"] == "Point"
             continue
         (ring,) = feature["geometry"]["coordinates"]
         assert ring[0] == ring[-1]
-        assert {tuple(corner) for corner in ring} == hull
-        assert _area_doubled(ring) > 0, "an outer ring is counter-clockwise"
+        assert len(ring) == len(corners) + 1
+        assert {tuple(corner) for corner in ring} == {(x / 1e6, y / 1e6) for x, y in corners}
+        area = sum(a[0] * b[1] - b[0] * a[1] for a, b in pairwise(ring))
+        assert area > 0, "an outer ring is counter-clockwise"
     for found, feature in zip(view.objects.values(), by_kind["object"], strict=True):
         assert tuple(feature["geometry"]["coordinates"]) == stands(view, found)
         assert feature["properties"]["class_name"] == found.class_name

@@ -7,10 +7,12 @@ its member ``coordinates``.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
+from projections.fold.deltas import Pose
+from projections.fold.exact import UM_PER_M
 from projections.map.view import MapView
 
 _WGS84_A_M: Final = 6_378_137.0
@@ -76,8 +78,7 @@ def _feature(kind: str, shape: str, coordinates: Any, **values: Any) -> dict[str
 
 def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
     for place in view.places.values():
-        poses = (view.keyframes[member].pose for member in place.members)
-        ring = hull([(pose.x_m, pose.y_m) for pose in poses if pose is not None])
+        ring = hull(view.keyframes[member].pose for member in place.members)
         kind = view.type_of(place.ordinal)
         values = {
             "place_id": place.place_id,
@@ -94,11 +95,12 @@ def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
             yield _feature("place", "Polygon", [closed], **values)
 
 
-def hull(points: Sequence[Point]) -> list[Point]:
-    """Corners of the convex hull, counter-clockwise (Andrew's monotone chain)."""
+def hull(poses: Iterable[Pose | None]) -> list[Point]:
+    """Corners in metres of the convex hull of poses, counter-clockwise, by Andrew's monotone chain
+    in whole micrometres: none lies on the line between its neighbours."""
 
-    def chain(ordered: Iterable[Point]) -> list[Point]:
-        corners: list[Point] = []
+    def chain(ordered: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        corners: list[tuple[int, int]] = []
         for x, y in ordered:
             while len(corners) > 1:
                 (ax, ay), (bx, by) = corners[-2:]
@@ -108,8 +110,9 @@ def hull(points: Sequence[Point]) -> list[Point]:
             corners.append((x, y))
         return corners[:-1]
 
-    ordered = sorted(set(points))
-    return chain(ordered) + chain(reversed(ordered)) if len(ordered) > 1 else ordered
+    ordered = sorted({(pose.x_um, pose.y_um) for pose in poses if pose is not None})
+    ring = chain(ordered) + chain(reversed(ordered)) if len(ordered) > 1 else ordered
+    return [(x / UM_PER_M, y / UM_PER_M) for x, y in ring]
 
 
 def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:

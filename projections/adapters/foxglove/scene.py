@@ -78,8 +78,7 @@ _Part = tuple[str, _Shapes]
 def _places(view: MapView) -> Iterator[_Part]:
     for place in view.places.values():
         z = height(view, view.floor_of(place.ordinal))
-        poses = (view.keyframes[member].pose for member in place.members)
-        ring = hull([(pose.x_m, pose.y_m) for pose in poses if pose is not None])
+        ring = hull(view.keyframes[member].pose for member in place.members)
         colour = _colour(place.ordinal)
         corners = [Point3(x=x, y=y, z=z) for x, y in ring]
         kind = view.type_of(place.ordinal)

@@ -115,7 +115,7 @@ def _root(floor: str | None) -> Path:
 
 def _floor(view: MapView, floor: str | None) -> Iterator[tuple[Path, Part]]:
     places = [p for p in view.places.values() if view.floor_of(p.ordinal) == floor]
-    rings = [(p, hull(_spots(view.keyframes[member] for member in p.members))) for p in places]
+    rings = [(p, hull(view.keyframes[member].pose for member in p.members)) for p in places]
     regions = [(p, (*ring, ring[0])) for p, ring in rings if len(ring) > 2]
     yield (
         ("regions",),
