@@ -1,4 +1,4 @@
-"""Fixtures every test may use; those of one subsystem live in ``tests/fixtures_*.py``."""
+"""Fixtures every test may use; those of one subsystem live in ``tests/support/fixtures_*.py``."""
 
 import gc
 import signal
@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.commands import Commands
-from tests.thorough import examples
+from tests.support.commands import Commands
+from tests.support.thorough import examples
 
 # How long an example takes says how busy the machine is; benchmarks measure speed.
 settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
@@ -27,11 +27,11 @@ for number, handler in (
 MANY_FILES = 300
 
 pytest_plugins = [
-    "tests.fixtures_postgres",
-    "tests.fixtures_log",
-    "tests.fixtures_serve",
-    "tests.fixtures_tls",
-    "tests.fixtures_zenoh",
+    "tests.support.fixtures_postgres",
+    "tests.support.fixtures_log",
+    "tests.support.fixtures_serve",
+    "tests.support.fixtures_tls",
+    "tests.support.fixtures_zenoh",
 ]
 
 UNIT = Path(__file__).parent / "unit"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.envelopes import detection, envelope, payload
+from tests.support.envelopes import detection, envelope, payload
 
 CLASSES = [
     "baker's rack",

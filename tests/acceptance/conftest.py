@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.awkward_run import awkward_payloads
-from tests.commands import Commands
-from tests.servers import furnish
+from tests.support.commands import Commands
+from tests.support.servers import furnish
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.awkward_run import awkward_payloads
-from tests.commands import Commands
-from tests.envelopes import detection, embedding, envelope, payload
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, embedding, envelope, payload
 
 REFUSED: list[bytes] = [
     b"not json",

@@ -22,11 +22,11 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
 from projections.surfaces.cli.folded_log import settings_from
-from tests.commands import Commands, Said
 from tests.docs.console import ROOT, Command, matches, read
-from tests.prefork import folder_with_mapfold
-from tests.simulated import simulated
-from tests.ui_server import showing
+from tests.support.commands import Commands, Said
+from tests.support.prefork import folder_with_mapfold
+from tests.support.simulated import simulated
+from tests.support.ui_server import showing
 
 _SPEED = 300
 _DEADLINE_S = 120.0

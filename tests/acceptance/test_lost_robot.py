@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.awkward_run import CLASSES, ROOMS, awkward_payloads
-from tests.commands import Commands
+from tests.support.commands import Commands
 
 
 @pytest.fixture(scope="module", autouse=True)

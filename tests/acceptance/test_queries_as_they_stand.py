@@ -10,7 +10,7 @@ import pytest
 
 from eventsrc.envelope.ingest import Accepted, ingest
 from tests.acceptance.awkward_run import CLASSES, RUNS, awkward_payloads
-from tests.commands import Commands
+from tests.support.commands import Commands
 
 KNN = """
     SELECT det_id, embedding <=> %s::vector AS distance FROM detection_embeddings

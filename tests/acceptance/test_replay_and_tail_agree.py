@@ -8,8 +8,8 @@ import pytest
 from psycopg import sql
 
 from tests.acceptance.awkward_run import awkward_payloads
-from tests.commands import Commands
-from tests.thorough import stride
+from tests.support.commands import Commands
+from tests.support.thorough import stride
 
 Rows = dict[str, list[tuple[Any, ...]]]
 

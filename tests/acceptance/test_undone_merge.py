@@ -9,9 +9,9 @@ import pytest
 
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.append import append_payload
-from tests.commands import Commands
-from tests.servers import furnish
-from tests.shared_data import shared_run
+from tests.support.commands import Commands
+from tests.support.servers import furnish
+from tests.support.shared_data import shared_run
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 FINE = {"eps_m": 0.75, "min_samples": 8}

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.thorough import rounds, stride
+from tests.support.thorough import rounds, stride
 
 ROOT = Path(__file__).parents[2]
 

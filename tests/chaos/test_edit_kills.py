@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from projections.postgres.connection import Targets
-
-from .edit_killer import Ordeal
+from scripts.programs.chaos.edit_killer import Ordeal
 
 
 @pytest.mark.slow
@@ -23,7 +22,7 @@ def test_two_hundred_kills(tmp_path: Path, third_database: Targets) -> None:
 
 
 def _kill(folder: Path, fresh: Targets, rounds: int, seed: int) -> None:
-    print(f"python -m tests.chaos.edit_killer --rounds {rounds} --seed {seed}")
+    print(f"python -m scripts.programs.chaos.edit_killer --rounds {rounds} --seed {seed}")
     with Ordeal(folder, random.Random(seed), fresh) as ordeal:
         ordeal.run(rounds)
         tally = ordeal.tally

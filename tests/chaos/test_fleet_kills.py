@@ -10,12 +10,12 @@ from projections.adapters.fleet.replaying import ReplayRequest, replay_site
 from projections.adapters.fleet.site_databases import SiteDatabases
 from projections.adapters.fleet.sites import Site
 from projections.postgres.embedded import EmbeddedServer
-from scripts.fleet_bench.killing import killed
-from scripts.fleet_bench.speed import dask_cluster, make_sites
-from tests.envelopes import envelope
-from tests.fleet_tasks import wait
-from tests.fleets import fleet_databases
-from tests.logs import write_log
+from scripts.programs.bench.fleet.killing import killed
+from scripts.programs.bench.fleet.speed import dask_cluster, make_sites
+from tests.support.envelopes import envelope
+from tests.support.fleet_tasks import wait
+from tests.support.fleets import fleet_databases
+from tests.support.logs import write_log
 
 
 def test_a_request_that_is_begun_again_finds_its_site_done(pg_url: str, tmp_path: Path) -> None:

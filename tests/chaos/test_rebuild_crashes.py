@@ -22,11 +22,11 @@ from projections.postgres.connection import Targets, connect, describe_target
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.loader import CopyLoader, Load, TypeName
 from projections.postgres.vector_sink import VectorShadow
-from tests import prefork
-from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows
-from tests.servers import server_to_kill
-from tests.thorough import every_other, mostly_slow, rounds
+from tests.support import prefork
+from tests.support.logs import bridge, walk, write_log
+from tests.support.rows import all_rows
+from tests.support.servers import server_to_kill
+from tests.support.thorough import every_other, mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 240.0
@@ -68,7 +68,7 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
 def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRequest) -> None:
     targets: Targets = request.getfixturevalue(kind)
     result = prefork.run(
-        "tests.chaos.rebuild_killer:main",
+        "scripts.programs.chaos.rebuild_killer:main",
         ["rebuild_killer", str(log), targets.graph_url, targets.vector_url],
         env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.thorough import rounds
-
-from .recorder_killer import kill_side_by_side
+from scripts.programs.chaos.recorder_killer import kill_side_by_side
+from tests.support.thorough import rounds
 
 
 def test_a_few_kills(tmp_path: Path) -> None:

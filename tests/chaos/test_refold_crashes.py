@@ -13,8 +13,8 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
-from tests import prefork
-from tests.commands_in_logs import (
+from tests.support import prefork
+from tests.support.commands_in_logs import (
     append_command,
     forget_keyframes,
     forget_run,
@@ -22,10 +22,10 @@ from tests.commands_in_logs import (
     name_place,
     undo,
 )
-from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows
-from tests.servers import kill_postgres, server_to_kill
-from tests.thorough import rounds, stride
+from tests.support.logs import bridge, walk, write_log
+from tests.support.rows import all_rows
+from tests.support.servers import kill_postgres, server_to_kill
+from tests.support.thorough import rounds, stride
 
 SETTINGS = Settings()
 WAIT_S = 280.0
@@ -42,7 +42,7 @@ def log(tmp_path: Path) -> Path:
 def kills(log: Path, targets: Targets, every: int, mode: str) -> dict[str, Any]:
     urls = (targets.graph_url, targets.vector_url)
     result = prefork.run(
-        "tests.chaos.refold_killer:main",
+        "scripts.programs.chaos.refold_killer:main",
         ["refold_killer", str(log), *urls, str(OLD_END), str(every), mode],
         env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip

@@ -18,11 +18,11 @@ from projections.postgres import TailProgress, TailReport, checkpoints, rebuild,
 from projections.postgres.connection import Connection, Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.sink import Checkpoint, SinkName
-from tests import prefork
-from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows
-from tests.servers import kill_postgres, server_to_kill
-from tests.thorough import mostly_slow, rounds
+from tests.support import prefork
+from tests.support.logs import bridge, walk, write_log
+from tests.support.rows import all_rows
+from tests.support.servers import kill_postgres, server_to_kill
+from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 120.0
@@ -36,7 +36,7 @@ def test_killed_between_any_two_statements(
     targets: Targets = request.getfixturevalue(kind)
     log = write_log(tmp_path / "log", walk(12) + list(bridge())[:12])
     result = prefork.run(
-        "tests.chaos.crash_driver:main",
+        "scripts.programs.chaos.crash_driver:main",
         ["crash_driver", str(log), targets.graph_url, targets.vector_url],
         env=os.environ, cwd=ROOT, timeout=WAIT_S,
     )  # fmt: skip

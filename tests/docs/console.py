@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from tests.prefork import folder_with_mapfold
-from tests.servers import furnish
+from tests.support.prefork import folder_with_mapfold
+from tests.support.servers import furnish
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 HOME_OF_DOCS: Final = "/home/you/mapfold"

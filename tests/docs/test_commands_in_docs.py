@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.console import ROOT, Command, File, matches, read, run
-from tests.thorough import THOROUGH, mostly_slow
+from tests.support.thorough import THOROUGH, mostly_slow
 
 DOCUMENTS = (
     "README.md",

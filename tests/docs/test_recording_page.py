@@ -19,7 +19,7 @@ from eventsrc.record.robot.spool import DEFAULT_SPOOL_BYTES
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from eventsrc.ros.stream import Counts
-from tests.fixtures_zenoh import Program, scrape
+from tests.support.fixtures_zenoh import Program, scrape
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 Start = Callable[..., Program]

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from eventsrc.ros.messages import embeddings_of_floats, embeddings_of_text
-from tests import ros_messages as ros
+from tests.support import ros_messages as ros
 
 PAGE = (Path(__file__).parents[2] / "docs" / "ros.md").read_text()
 COMMANDS = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()

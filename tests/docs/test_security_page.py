@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.attack.attacks import ATTACKS
+from scripts.programs.attack.attacks import ATTACKS
 from tests.docs.console import ROOT
 
 PAGE = (ROOT / "docs" / "security.md").read_text()

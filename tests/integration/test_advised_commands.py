@@ -18,10 +18,10 @@ from eventsrc.log import LogWriter
 from projections.postgres.connection import Targets, check_url, url_without_secrets
 from projections.surfaces.cli import COMMANDS, command_line
 from projections.surfaces.cli.in_force import _command
-from tests.commands import Commands, Said
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import flip
-from tests.logs import bridge, walk, write_log
+from tests.support.commands import Commands, Said
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import flip
+from tests.support.logs import bridge, walk, write_log
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = {

@@ -17,10 +17,10 @@ from projections.fold.errors import QuestionError, SettingsError
 from projections.history import NoSuchThing
 from projections.surfaces import python as api
 from projections.surfaces.python import Map, Timeline, fold, open_log, relocalize
-from tests import prefork
-from tests.commands import TIMEOUT_S, Commands
-from tests.envelopes import detection, envelope
-from tests.logs import write_log
+from tests.support import prefork
+from tests.support.commands import TIMEOUT_S, Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "logs" / "sample"

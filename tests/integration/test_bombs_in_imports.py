@@ -19,10 +19,10 @@ from mcap.writer import CompressionType, Writer
 from eventsrc.envelope.system_events import EXCERPT_BYTES, RejectedPayload
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.mcap_records import MAGIC
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
-from tests.memory import MOST_MIB, run_measured
-from tests.thorough import mostly_slow
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import read_log
+from tests.support.memory import MOST_MIB, run_measured
+from tests.support.thorough import mostly_slow
 
 GIB = 2**30
 HEADER = b"\x01" + struct.pack("<QII", 8, 0, 0)

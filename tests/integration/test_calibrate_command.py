@@ -14,12 +14,12 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Settings
 from projections.localize.calibrate.rounds import calibrate
 from projections.map.log_commands import read_corrections
-from tests.commands import Commands
-from tests.envelopes import envelope
-from tests.fixtures_zenoh import Program
-from tests.logs import walk, write_log
-from tests.seen_rooms import BEARING_RAD, SIZES, drive, write_room
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope
+from tests.support.fixtures_zenoh import Program
+from tests.support.logs import walk, write_log
+from tests.support.seen_rooms import BEARING_RAD, SIZES, drive, write_room
+from tests.support.thorough import mostly_slow, rounds
 
 BY_EVIDENCE = ("--set", "fusion=evidence")
 COUNT = rounds(80, 30)

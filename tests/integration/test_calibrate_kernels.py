@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import PROGRAM
-from tests.seen_rooms import write_room
-from tests.thorough import stride
+from tests.support.commands import PROGRAM
+from tests.support.seen_rooms import write_room
+from tests.support.thorough import stride
 
 KERNELS = ("Prescott", "Nehalem", "Sandybridge", "Haswell", "Zen")
 WITHOUT = ("AVX512_ICL AVX512_SPR X86_V4", "AVX512_ICL AVX512_SPR X86_V4 X86_V3")

@@ -12,7 +12,7 @@ import pytest
 from eventsrc.base.worker_process import ProcessGone
 from projections.localize.evaluate import parallel
 from projections.localize.evaluate.parallel import call_all
-from tests.thorough import mostly_slow
+from tests.support.thorough import mostly_slow
 
 COUNT = 400
 POWERS = [partial(pow, 3, number) for number in range(COUNT)]

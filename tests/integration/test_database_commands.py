@@ -17,11 +17,11 @@ import psycopg
 import pytest
 
 from projections.postgres.embedded import EmbeddedServer
-from tests.commands import PROGRAM, Commands
-from tests.envelopes import MODEL, detection, envelope
-from tests.logs import append_raw, walk, write_log
-from tests.servers import furnish
-from tests.thorough import mostly_slow
+from tests.support.commands import PROGRAM, Commands
+from tests.support.envelopes import MODEL, detection, envelope
+from tests.support.logs import append_raw, walk, write_log
+from tests.support.servers import furnish
+from tests.support.thorough import mostly_slow
 
 WAIT_S = 60
 REPLAYS = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'mapfold replay'"

@@ -15,9 +15,9 @@ from projections.postgres.check import NAMED, check
 from projections.postgres.connection import Connection, Targets
 from projections.postgres.sink import Checkpoint, SinkName
 from projections.postgres.status import projection_status
-from tests.commands import Commands
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.thorough import every_other, mostly_slow
+from tests.support.commands import Commands
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.thorough import every_other, mostly_slow
 
 SETTINGS = Settings()
 

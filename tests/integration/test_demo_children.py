@@ -16,7 +16,7 @@ from eventsrc.record.transport.session import Router, ZenohOptions
 from projections.surfaces.demo import progress
 from projections.surfaces.demo.progress import LEAST_CPU_S, Progress, cpu_steps, size_of
 from projections.surfaces.demo.recording import Children
-from tests.fixtures_zenoh import Program
+from tests.support.fixtures_zenoh import Program
 
 STARTER = """
 import signal, sys

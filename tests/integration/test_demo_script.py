@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import Commands
 from tests.docs.console import ROOT
+from tests.support.commands import Commands
 
 _STUB = '#!/bin/sh\necho "$PWD"\necho "$@"\n'
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.adapters.sim import build_house
-from tests.camera_truth import truth_of
-from tests.commands import Commands
-from tests.tiny_models import models_for
+from tests.support.camera_truth import truth_of
+from tests.support.commands import Commands
+from tests.support.tiny_models import models_for
 
 
 @pytest.mark.slow

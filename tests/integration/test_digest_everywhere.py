@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.envelopes import detection, envelope, payload
-from tests.shared_data import shared_run
-from tests.thorough import mostly_slow, rounds, stride
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.shared_data import shared_run
+from tests.support.thorough import mostly_slow, rounds, stride
 
 KERNELS = ("Prescott", "Nehalem", "Haswell", "SkylakeX", "Zen")
 PLACES = [(kernel, "1", "0") for kernel in KERNELS] + [
@@ -35,7 +35,7 @@ from projections.map.fold import READ_AHEAD, fold_events
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.view import MapView
-from tests.thorough import stride
+from tests.support.thorough import stride
 
 settings = Settings(eps_m=0.75, min_samples=8, fusion=sys.argv[2], places=sys.argv[3])
 fold, view, vectors = SemanticMap(settings), MapView(settings), []

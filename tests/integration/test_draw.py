@@ -8,11 +8,11 @@ import pytest
 
 from eventsrc.log import LogWriter
 from eventsrc.record.append import append_payload
-from tests.commands import Commands, Said
-from tests.envelopes import envelope
-from tests.logs import write_log
-from tests.simulated import simulated
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands, Said
+from tests.support.envelopes import envelope
+from tests.support.logs import write_log
+from tests.support.simulated import simulated
+from tests.support.thorough import mostly_slow
 
 
 @pytest.fixture(scope="module")

@@ -23,12 +23,12 @@ from projections.edit.effect import Change, Effect, effect_of
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
-from tests.commands import Commands
-from tests.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
-from tests.fixtures_log import flip, read_log
-from tests.fixtures_timetravel import write_damaged_log
-from tests.logs import walk
-from tests.thorough import every_other, mostly_slow, rounds, stride
+from tests.support.commands import Commands
+from tests.support.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
+from tests.support.fixtures_log import flip, read_log
+from tests.support.fixtures_timetravel import write_damaged_log
+from tests.support.logs import walk
+from tests.support.thorough import every_other, mostly_slow, rounds, stride
 
 WHY = ("--reason", "why")
 

@@ -16,9 +16,9 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import KeyframeId, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogWriter
-from tests.commands import Commands
-from tests.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
-from tests.fixtures_log import read_log
+from tests.support.commands import Commands
+from tests.support.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
+from tests.support.fixtures_log import read_log
 
 WHY = ("--reason", "why")
 _OUT_OF_THE_MAP = ("correct-poses", "run-b", "--dx", "9999999.99")

@@ -41,8 +41,8 @@ from eventsrc.record.recorder.edits import (
 from eventsrc.record.recorder.queue import MessageQueue
 from eventsrc.record.transport.session import Received, Session
 from projections.fold.corrections import check_settings
-from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
 
 Sessions = Callable[[], Session]
 KEY = "tb/detections"

@@ -17,11 +17,11 @@ import pytest
 from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
 from projections.postgres.connection import connect, database_errors
 from projections.postgres.embedded import EmbeddedServer
-from tests.commands import Commands
-from tests.logs import walk, write_log
-from tests.prefork import Process, start
-from tests.servers import furnish
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.logs import walk, write_log
+from tests.support.prefork import Process, start
+from tests.support.servers import furnish
+from tests.support.thorough import mostly_slow
 
 WAIT_S = 60
 

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.commands import Commands
-from tests.logs import write_log
-from tests.relocalization.buildings import Building, Keyframe
-from tests.relocalization.drives import drive
-from tests.shared_data import shared_run_path
-from tests.thorough import rounds
+from tests.support.buildings import Building, Keyframe
+from tests.support.commands import Commands
+from tests.support.drives import drive
+from tests.support.logs import write_log
+from tests.support.shared_data import shared_run_path
+from tests.support.thorough import rounds
 
 
 @pytest.fixture(scope="module")

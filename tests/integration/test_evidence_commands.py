@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from projections.fold.settings import Settings
-from tests.commands import Commands
-from tests.fixtures_timetravel import write_log
-from tests.rooms_with_things import drive
+from tests.support.commands import Commands
+from tests.support.fixtures_timetravel import write_log
+from tests.support.rooms_with_things import drive
 
 BY_EVIDENCE = ("--set", "fusion=evidence")
 COUNT = 80

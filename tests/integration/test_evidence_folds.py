@@ -23,14 +23,14 @@ from projections.postgres.graph_render import expected_rows
 from projections.postgres.labels import LABELS
 from projections.postgres.loader import LoaderName
 from projections.store.history_recorder import map_after
-from tests.commands_in_logs import append_command, command, forget_keyframes, undo
-from tests.flickering_house import flickering_house
 from tests.integration.test_projections import parsed
-from tests.live_rows import followed_and_rebuilt
-from tests.logs import write_log
 from tests.property.test_timeline_cache import kept_early
-from tests.rows import all_rows, expected_graph, graph_rows
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands_in_logs import append_command, command, forget_keyframes, undo
+from tests.support.flickering_house import flickering_house
+from tests.support.live_rows import followed_and_rebuilt
+from tests.support.logs import write_log
+from tests.support.rows import all_rows, expected_graph, graph_rows
+from tests.support.thorough import mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence")
 

@@ -25,9 +25,14 @@ from projections.postgres.queries.map_queries import FoldedMap, LiveMap
 from projections.postgres.queries.relocalize import prepare_graph
 from projections.postgres.vector_sink import VectorSink
 from tests.integration.test_projections import parsed
-from tests.rows import all_rows, expected_graph
-from tests.synthetic_objects import SyntheticDeltas, expected_rows, random_steps, without_sigma
-from tests.thorough import mostly_slow
+from tests.support.rows import all_rows, expected_graph
+from tests.support.synthetic_objects import (
+    SyntheticDeltas,
+    expected_rows,
+    random_steps,
+    without_sigma,
+)
+from tests.support.thorough import mostly_slow
 
 EVIDENCE = Settings(fusion="evidence")
 PAGE = Path(__file__).parents[2] / "docs" / "projections.md"

@@ -12,10 +12,10 @@ from projections.postgres import tail
 from projections.postgres.check import check
 from projections.postgres.checkpoints import has_schema, load
 from projections.postgres.connection import Targets, connect
-from tests.commands import PROGRAM
-from tests.logs import write_log
 from tests.property.test_hostile_evidence import hostile_drive
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands import PROGRAM
+from tests.support.logs import write_log
+from tests.support.thorough import mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence")
 WAIT_S = 60

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.logs import write_log
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
 
 ALL = ("--graphml", "m.graphml", "--dot", "m.dot", "--geojson", "m.json", "--csv", "t", "--nav2")
 

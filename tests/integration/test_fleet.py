@@ -23,12 +23,12 @@ from projections.adapters.fleet.sites import Site
 from projections.localize.relocalize import read_question
 from projections.postgres.connection import connect
 from projections.postgres.embedded import EmbeddedServer
-from tests.commands import Commands
-from tests.fleets import extend, fleet_databases, write_sites, wrong_rows
 from tests.integration.test_time_travel_commands import InProcess
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.servers import furnish
-from tests.thorough import THOROUGH
+from tests.support.commands import Commands
+from tests.support.fleets import extend, fleet_databases, write_sites, wrong_rows
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.servers import furnish
+from tests.support.thorough import THOROUGH
 
 EVENTS = 30  # of each site
 NAMES = ['a\'; DROP "x" %s', "büro", "lab"]

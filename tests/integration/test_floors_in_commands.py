@@ -9,10 +9,10 @@ from projections.edit import make as m
 from projections.edit.conflicts import EditRefused
 from projections.fold.settings import Settings
 from projections.history import Timeline
-from tests.commands import Commands
-from tests.corrected_logs import make
-from tests.logs import write_log
 from tests.property.test_floors import drive
+from tests.support.commands import Commands
+from tests.support.corrected_logs import make
+from tests.support.logs import write_log
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from tests.integration.test_projections import parsed, view_of
-from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows, expected_graph, graph_rows
+from tests.support.logs import bridge, walk, write_log
+from tests.support.rows import all_rows, expected_graph, graph_rows
 
 SETTINGS = Settings()
 HOSTILE = 'x\'}) DETACH DELETE r // \\ "q" $$'

@@ -13,9 +13,9 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from tests.logs import bridge, walk, write_log
-from tests.rows import all_rows
-from tests.thorough import mostly_slow
+from tests.support.logs import bridge, walk, write_log
+from tests.support.rows import all_rows
+from tests.support.thorough import mostly_slow
 
 SETTINGS = Settings()
 LABELS = "SELECT create_vlabel('semantic_map', 'Robot'), create_elabel('semantic_map', 'SAW')"

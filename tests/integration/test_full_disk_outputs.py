@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import PROGRAM, Commands
-from tests.envelopes import detection, envelope
-from tests.logs import write_log
-from tests.thorough import mostly_slow
+from tests.support.commands import PROGRAM, Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
+from tests.support.thorough import mostly_slow
 
 LIMITED = 'ulimit -f 1; exec "$0" "$@"'
 COMMANDS = {

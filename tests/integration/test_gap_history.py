@@ -23,8 +23,8 @@ from eventsrc.record.gap_history import (
     unread_events,
 )
 from eventsrc.record.log_info import log_info
-from tests.envelopes import detection, envelope, payload
-from tests.fixtures_log import BY_HAND, flip
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.fixtures_log import BY_HAND, flip
 
 KEY = "tb/detections"
 SAVED_AT = 7

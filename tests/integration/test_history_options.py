@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from projections.store.timeline_cache import MIN_EVENTS
-from tests.commands import Commands
-from tests.envelopes import envelope
-from tests.fixtures_timetravel import write_log
-from tests.thorough import rounds
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope
+from tests.support.fixtures_timetravel import write_log
+from tests.support.thorough import rounds
 
 ASKED = (["merges"], ["state"], ["why", "run-a_p0"], ["diff", "10"], ["bisect", "place_count > 1"])
 

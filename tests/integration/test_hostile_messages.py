@@ -19,9 +19,9 @@ from eventsrc.record.log_info import log_info
 from eventsrc.record.recorder import Recorder
 from eventsrc.record.robot.acks import Refusal, Refusals, payload_sha256, refusal_key
 from eventsrc.record.transport.session import Received, Session
-from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import DEADLINE_S
-from tests.thorough import rounds
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_zenoh import DEADLINE_S
+from tests.support.thorough import rounds
 
 Sessions = Callable[[], Session]
 LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)

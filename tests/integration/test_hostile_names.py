@@ -7,8 +7,8 @@ import pytest
 
 from eventsrc.log import LogWriter
 from eventsrc.record.append import append_payload
-from tests.commands import Commands, Said
-from tests.envelopes import detection, envelope, payload
+from tests.support.commands import Commands, Said
+from tests.support.envelopes import detection, envelope, payload
 from tests.unit.test_text_escaping import control_characters
 
 CONTROL = "\x1b]0;owned\x07\x9b2J\n       9  forged line"

@@ -13,13 +13,13 @@ from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from tests import ros_messages as ros
-from tests.commands import Commands
-from tests.fixtures_log import read_log
-from tests.imported_bags import DRIVE, envelopes, imported
-from tests.ros_bags import RUN, Drive, Raw, write_bag
-from tests.ros_messages import START, flat
-from tests.thorough import every_other
+from tests.support import ros_messages as ros
+from tests.support.commands import Commands
+from tests.support.fixtures_log import read_log
+from tests.support.imported_bags import DRIVE, envelopes, imported
+from tests.support.ros_bags import RUN, Drive, Raw, write_bag
+from tests.support.ros_messages import START, flat
+from tests.support.thorough import every_other
 
 
 @pytest.fixture(scope="module")

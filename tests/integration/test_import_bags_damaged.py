@@ -18,12 +18,12 @@ from eventsrc.envelope.system_events import (
     REJECTED_KEY,
     RejectedPayload,
 )
-from tests import ros_messages as ros
-from tests.fixtures_log import read_log
-from tests.imported_bags import DRIVE, envelopes, imported
-from tests.memory import MOST_MIB, run_measured
-from tests.ros_bags import RUN, Raw, write_bag
-from tests.ros_messages import SECOND, START, flat
+from tests.support import ros_messages as ros
+from tests.support.fixtures_log import read_log
+from tests.support.imported_bags import DRIVE, envelopes, imported
+from tests.support.memory import MOST_MIB, run_measured
+from tests.support.ros_bags import RUN, Raw, write_bag
+from tests.support.ros_messages import SECOND, START, flat
 
 # Hostile bags
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import flip, read_log
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import flip, read_log
 
 PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
 

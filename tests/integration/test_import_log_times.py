@@ -10,9 +10,9 @@ from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import verify_log
 from eventsrc.record.importers.log_times import CLOCK_SET_NS, TOGETHER_NS, LogTimes
 from eventsrc.record.log_info import log_info
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import read_log
 
 S = 1_000_000_000
 DRIVE_S = 480

@@ -18,12 +18,12 @@ from eventsrc.envelope.system_events import (
 from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.record.transport.session import Session
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY, flip, read_log
-from tests.fixtures_zenoh import DEADLINE_S, Program
 from tests.integration.test_recorder import recording
-from tests.maps import cdr_message, cells, drawn_map, grid_message, write_map_yaml
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY, flip, read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.maps import cdr_message, cells, drawn_map, grid_message, write_map_yaml
 
 DRAWING = "##### #..?# #...#"
 MESSAGE = payload(grid_message(drawn_map(DRAWING, 0.05, (1.0, 2.0, 0.0))))

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import read_log
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import pytest
 from eventsrc.log import LogWriter
 from eventsrc.record.importers import ImportInterrupted, ImportReport, import_files
 from projections.surfaces.cli.signals import ctrl_c_between_steps
-from tests.commands import PROGRAM, TIMEOUT_S, Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
+from tests.support.commands import PROGRAM, TIMEOUT_S, Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import read_log
 
 
 def _lines(first: int, count: int) -> list[bytes]:

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log.format import list_segments
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY, read_log
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY, read_log
+from tests.support.thorough import mostly_slow
 
 HOUR = 3600
 DRIVES = {"new": 20 * HOUR, "mid": 10 * HOUR, "old": HOUR}

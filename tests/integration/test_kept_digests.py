@@ -17,10 +17,10 @@ from projections.map.fold import fold_events, fold_log
 from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 from projections.store.timeline_cache import MOST_DIGESTS
-from tests.fixtures_timetravel import write_log
-from tests.history_process import RULES
 from tests.integration.test_timeline_cache_attacked import EVENTS, drive
 from tests.property.test_timeline_cache import kept_early
+from tests.support.fixtures_timetravel import write_log
+from tests.support.history_process import RULES
 
 ENDS = [1, 50, EVENTS]
 

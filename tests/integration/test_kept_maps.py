@@ -17,10 +17,10 @@ from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces.cli import command_line
-from tests.crops import drive, write
-from tests.described_maps import SAMPLE
 from tests.integration.test_reembed import IN_B, A, run
 from tests.property.test_timeline_cache import kept_early
+from tests.support.crops import drive, write
+from tests.support.described_maps import SAMPLE
 
 ASKED = [
     ("query", "contents", "sim-7-a_p0", "--log", "LOG"),

@@ -22,12 +22,12 @@ from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
-from tests.commands import Commands
-from tests.commands_in_logs import append_command, command, forget_run, keep_apart
-from tests.corrected_logs import EVENTS, LEFT, documents
-from tests.envelopes import detection, envelope, payload
-from tests.logs import KEY, append_raw, write_log
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.commands_in_logs import append_command, command, forget_run, keep_apart
+from tests.support.corrected_logs import EVENTS, LEFT, documents
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.logs import KEY, append_raw, write_log
+from tests.support.thorough import mostly_slow
 
 W = 24
 """The events asked about: behind the merge of two rooms, before those of the other run."""

@@ -8,8 +8,8 @@ import pytest
 from eventsrc.base.errors import LogError
 from eventsrc.log import LogReader, LogWriter
 from projections.surfaces.cli.event_text import iso_time
-from tests.commands import Commands
-from tests.fixtures_log import BY_HAND, KEY, envelope, flip
+from tests.support.commands import Commands
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, flip
 
 SECOND = 1_000_000_000
 CHUNK = 100

@@ -5,8 +5,8 @@ import pytest
 
 from eventsrc.log import LogWriter
 from projections.surfaces.cli.event_text import iso_time
-from tests.commands import Commands
-from tests.fixtures_log import KEY, envelope
+from tests.support.commands import Commands
+from tests.support.fixtures_log import KEY, envelope
 
 SECOND = 1_000_000_000
 

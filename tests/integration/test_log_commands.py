@@ -9,9 +9,9 @@ import pytest
 
 from eventsrc.base.errors import LogError
 from eventsrc.log import recover_log
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import flip
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import flip
 
 PAYLOADS = [payload(envelope(i)) for i in range(1, 6)]
 

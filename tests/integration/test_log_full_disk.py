@@ -12,8 +12,8 @@ import pytest
 
 from eventsrc.base.errors import LogError
 from eventsrc.log import LogWriter
-from tests.fixtures_log import read_log
-from tests.thorough import mostly_slow
+from tests.support.fixtures_log import read_log
+from tests.support.thorough import mostly_slow
 
 ROOT = Path(__file__).parents[2]
 

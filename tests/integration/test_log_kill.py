@@ -21,10 +21,10 @@ from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_event, fold_log
 from projections.map.view import MapView
-from tests.chaos.log_killer import LONGEST_LIFE_S, lives
-from tests.fixtures_log import flip
-from tests.thorough import THOROUGH
-from tests.verbatim import mixed_events
+from scripts.programs.chaos.log_killer import LONGEST_LIFE_S, lives
+from tests.support.fixtures_log import flip
+from tests.support.thorough import THOROUGH
+from tests.support.verbatim import mixed_events
 
 SEED = 20260415
 

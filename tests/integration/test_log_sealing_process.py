@@ -15,8 +15,8 @@ from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal, write_sealed
 from eventsrc.log.seal_process import ProcessGone, SealingProcess
-from tests import prefork
-from tests.fixtures_log import KEY, read_log
+from tests.support import prefork
+from tests.support.fixtures_log import KEY, read_log
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 30

@@ -16,8 +16,8 @@ from eventsrc.base.errors import LogDamaged, LogError, LogNotFound
 from eventsrc.log import Event, LogReader, LogWriter, follow
 from eventsrc.log.format import SEALED_END
 from eventsrc.log.mcap_records import MARK_BYTES
-from tests.chaos.log_writer import payload_at
-from tests.fixtures_log import BY_HAND, KEY, flip, write_log
+from scripts.programs.chaos.log_writer import payload_at
+from tests.support.fixtures_log import BY_HAND, KEY, flip, write_log
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 60
@@ -70,7 +70,7 @@ def test_rotation_under_load(log_path: Path) -> None:
 def test_a_tail_of_another_process(log_path: Path) -> None:
     with LogWriter(log_path):
         pass  # so that there is a log to follow
-    command = [sys.executable, "-m", "tests.chaos.log_writer", str(log_path), "5ms"]
+    command = [sys.executable, "-m", "scripts.programs.chaos.log_writer", str(log_path), "5ms"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         try:
             with tail(log_path) as got:

@@ -41,7 +41,7 @@ from projections.postgres.inputs import LogInputs
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.rebuild import rebuild
 from projections.postgres.tail import tail
-from tests.bench.commands import (
+from scripts.programs.bench.commands import (
     KINDS,
     commands_of,
     large_undo_merge,
@@ -50,8 +50,8 @@ from tests.bench.commands import (
     undone,
     write_log,
 )
-from tests.commands_in_logs import command
-from tests.corrected_logs import write_rooms
+from tests.support.commands_in_logs import command
+from tests.support.corrected_logs import write_rooms
 
 SAMPLE = Path("logs/sample")
 EVERY = {**KINDS, "mixed": mixed}

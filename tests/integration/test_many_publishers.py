@@ -15,9 +15,9 @@ import pytest
 from eventsrc.log import LogReader
 from eventsrc.record.robot.acks import ack_key
 from eventsrc.record.transport.session import Received, Session, ZenohOptions, open_session
-from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.thorough import mostly_slow
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.thorough import mostly_slow
 
 Start = Callable[..., Program]
 KEY = "tb/detections"

@@ -21,13 +21,13 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.queries.relocalize import CandidateReader
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY
-from tests.live_rows import followed_and_rebuilt
-from tests.maps import drawn_map
-from tests.rows import all_rows, map_rows
-from tests.thorough import every_other, mostly_slow, rounds, stride
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY
+from tests.support.live_rows import followed_and_rebuilt
+from tests.support.maps import drawn_map
+from tests.support.rows import all_rows, map_rows
+from tests.support.thorough import every_other, mostly_slow, rounds, stride
 
 ROOMS = drawn_map("########## #...#....# #...#....# #........# ##########", 1.0, (-2.0, -2.0, 0.0))
 EAST = [envelope(k, 4.0 - 0.25 * (k % 4), 0.0) for k in range(8)]

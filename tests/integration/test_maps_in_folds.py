@@ -18,12 +18,12 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
 from projections.map.one_floor import view_of_floor
 from projections.map.view import MapView
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY
-from tests.folds import Folded, resumed
-from tests.maps import drawn_map
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY
+from tests.support.folds import Folded, resumed
+from tests.support.maps import drawn_map
+from tests.support.thorough import mostly_slow
 
 HALL = drawn_map("########## #........# #........# #........# ##########", 1.0, (-2.0, -2.0, 0.0))
 ROOMS = drawn_map("########## #...#....# #...#....# #........# ##########", 1.0, (-2.0, -2.0, 0.0))

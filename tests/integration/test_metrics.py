@@ -9,9 +9,9 @@ import pytest
 from eventsrc.base.errors import TransportError
 from eventsrc.record.metrics import MAX_CONNECTIONS, serving_metrics
 from eventsrc.record.recorder import RecorderReport
-from tests.envelopes import envelope, payload
-from tests.fixtures_zenoh import Program, scrape
-from tests.http_attacks import answer, ask, connect
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_zenoh import Program, scrape
+from tests.support.http_attacks import answer, ask, connect
 
 REPORT = RecorderReport(
     *(12, 3, 4, 5, 6, 0, 7, 100, 15),

@@ -25,8 +25,8 @@ from projections.postgres.queries.map_queries import (
 )
 from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
 from projections.surfaces.serve import Answerer, Pools
-from tests.commands_in_logs import append_command, name_place
-from tests.logs import walk, write_log
+from tests.support.commands_in_logs import append_command, name_place
+from tests.support.logs import walk, write_log
 
 SETTINGS = Settings()
 NAME = 'Küche "1"'

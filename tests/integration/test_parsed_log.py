@@ -22,11 +22,11 @@ from eventsrc.log import LogReader, LogWriter
 from projections.map import parsed_log, parsing_process
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import parsed_stretches
-from tests.envelopes import detection, envelope, payload
-from tests.fixtures_log import BY_HAND, KEY, flip
 from tests.property.test_parsed_bytes import comparable
-from tests.random_logs import write_random_log
-from tests.thorough import mostly_slow, rounds
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.fixtures_log import BY_HAND, KEY, flip
+from tests.support.random_logs import write_random_log
+from tests.support.thorough import mostly_slow, rounds
 
 COUNT = 400
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from projections.fold.settings import PRESETS, Settings
-from tests.commands import Commands
 from tests.docs.commands_page import commands
-from tests.envelopes import envelope
-from tests.logs import write_log
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope
+from tests.support.logs import write_log
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from eventsrc.log import LogWriter
 from eventsrc.record.robot.acks import Ack, Sent, ack_key, payload_sha256, sent_key
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Router, Session, ZenohOptions
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY
-from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
-from tests.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
-from tests.thorough import rounds
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY
+from tests.support.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+from tests.support.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
+from tests.support.thorough import rounds
 
 KEYFRAMES = rounds(6_000, 2_500)
 

@@ -14,10 +14,10 @@ from eventsrc.record.robot.acks import Refusal, Refusals, ack_key, refusal_key
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.robot.sender import Sender
 from eventsrc.record.transport.session import Session, ZenohOptions
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
 
 Sessions = Callable[[], Session]
 Start = Callable[..., Program]

@@ -21,8 +21,8 @@ from projections.postgres.queries.map_queries import (
     where_is,
 )
 from projections.postgres.queries.relocalize import prepare_graph
-from tests.commands import Commands
-from tests.logs import walk, write_log
+from tests.support.commands import Commands
+from tests.support.logs import walk, write_log
 
 
 @pytest.fixture

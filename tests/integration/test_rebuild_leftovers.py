@@ -15,9 +15,9 @@ from projections.postgres.check import check
 from projections.postgres.connection import Connection, Targets, connect
 from projections.postgres.replaced_tables import try_drop_lock
 from projections.postgres.vector_table import build_hnsw
-from tests.drops import wait_for_drops
-from tests.logs import walk, write_log
-from tests.rows import all_rows
+from tests.support.drops import wait_for_drops
+from tests.support.logs import walk, write_log
+from tests.support.rows import all_rows
 
 SETTINGS = Settings()
 

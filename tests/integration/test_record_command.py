@@ -18,10 +18,10 @@ from eventsrc.record.append import append_payload
 from eventsrc.record.gap_history import unread_events
 from eventsrc.record.robot.acks import ack_key
 from eventsrc.record.transport.session import Router, Session
-from tests.commands import PROGRAM
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY, read_log
-from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program
+from tests.support.commands import PROGRAM
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY, read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, LOOPBACK, PUBLISHER, Program
 
 Start = Callable[..., Program]
 

@@ -17,9 +17,9 @@ from eventsrc.record.append import append_payload
 from eventsrc.record.robot.acks import Ack, ack_key, payload_sha256
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Session, ZenohOptions
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import KEY, read_log
-from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY, read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
 
 Start = Callable[..., Program]
 

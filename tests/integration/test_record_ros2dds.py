@@ -19,11 +19,11 @@ from eventsrc.ros.bridge_keys import topic_of
 from eventsrc.ros.derivation import read_recording
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from tests import ros2dds
-from tests.fixtures_log import read_log
-from tests.fixtures_zenoh import LONG_LEASE
-from tests.ros2dds_drive import BOXES, KINDS, Sent, drive
-from tests.ros2dds_recordings import (
+from tests.support import ros2dds
+from tests.support.fixtures_log import read_log
+from tests.support.fixtures_zenoh import LONG_LEASE
+from tests.support.ros2dds_drive import BOXES, KINDS, Sent, drive
+from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,
     digest,
@@ -35,8 +35,8 @@ from tests.ros2dds_recordings import (
     verbatim,
     wait_for_recorder,
 )
-from tests.ros_bags import write_bag
-from tests.ros_messages import (
+from tests.support.ros_bags import write_bag
+from tests.support.ros_messages import (
     START,
     TYPES,
     box,

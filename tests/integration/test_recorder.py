@@ -29,10 +29,10 @@ from eventsrc.record.robot.acks import (
     refusal_key,
 )
 from eventsrc.record.transport.session import Received, Router, Session, ZenohOptions, open_session
-from tests.envelopes import detection, envelope, keyframe_payloads, payload
-from tests.fixtures_log import KEY, flip, read_log
-from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
-from tests.recorders import Running, recording
+from tests.support.envelopes import detection, envelope, keyframe_payloads, payload
+from tests.support.fixtures_log import KEY, flip, read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
+from tests.support.recorders import Running, recording
 
 Sessions = Callable[[], Session]
 

@@ -16,11 +16,11 @@ from eventsrc.record.recorder import Recorder, RecorderReport
 from eventsrc.record.recorder.queue import SequenceGaps
 from eventsrc.record.robot.acks import MAX_SENT_BYTES, Sent, sent_key
 from eventsrc.record.transport.session import Session
-from tests.envelopes import envelope, keyframe_payloads, payload
-from tests.fixtures_log import KEY, read_log
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.recorders import Running, recording
-from tests.thorough import rounds
+from tests.support.envelopes import envelope, keyframe_payloads, payload
+from tests.support.fixtures_log import KEY, read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.recorders import Running, recording
+from tests.support.thorough import rounds
 
 Sessions = Callable[[], Session]
 

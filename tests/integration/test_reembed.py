@@ -29,11 +29,11 @@ from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from tests.commands import Commands
-from tests.commands_in_logs import append_command, command
-from tests.crops import Encoder, add_crop, drive, jpeg, write
-from tests.rows import all_rows
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands import Commands
+from tests.support.commands_in_logs import append_command, command
+from tests.support.crops import Encoder, add_crop, drive, jpeg, write
+from tests.support.rows import all_rows
+from tests.support.thorough import mostly_slow, rounds
 
 A, B = Encoder("A", 6), Encoder("B", 9)
 IN_B = Settings(embedding_model="B")
@@ -119,7 +119,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from eventsrc.adapters.reembedding import reembed
-from tests.crops import Encoder
+from tests.support.crops import Encoder
 class Dies(Encoder):
     def encode(self, jpegs):
         if self.calls == int(sys.argv[2]):

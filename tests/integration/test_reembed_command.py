@@ -27,12 +27,12 @@ from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import MessageTypes
 from projections.surfaces.cli.reembed import CropModel, weight_files
-from tests.commands import Commands
-from tests.crops import FORMAT
-from tests.envelopes import detection, envelope
-from tests.fixtures_zenoh import Program
-from tests.thorough import examples
-from tests.tiny_models import fixed_answer, mean_colour_encoder
+from tests.support.commands import Commands
+from tests.support.crops import FORMAT
+from tests.support.envelopes import detection, envelope
+from tests.support.fixtures_zenoh import Program
+from tests.support.thorough import examples
+from tests.support.tiny_models import fixed_answer, mean_colour_encoder
 
 WEIGHTS = "clip.onnx.data"
 NAMES = st.characters(codec="utf-8", exclude_characters="\0")

@@ -22,8 +22,8 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.status import SinkStatus, projection_status
 from projections.surfaces.cli.db import _sink_line
-from tests.commands import Commands
-from tests.commands_in_logs import (
+from tests.support.commands import Commands
+from tests.support.commands_in_logs import (
     append_command,
     command,
     forget_keyframes,
@@ -32,10 +32,10 @@ from tests.commands_in_logs import (
     name_place,
     undo,
 )
-from tests.logs import walk, write_log
-from tests.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
-from tests.rows import all_rows, graph_rows, parsed
-from tests.thorough import rounds
+from tests.support.logs import walk, write_log
+from tests.support.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
+from tests.support.rows import all_rows, graph_rows, parsed
+from tests.support.thorough import rounds
 
 
 @pytest.fixture

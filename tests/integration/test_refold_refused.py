@@ -15,15 +15,15 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.statements import statements
 from projections.postgres.status import projection_status
-from tests.commands_in_logs import (
+from tests.support.commands_in_logs import (
     append_command,
     command,
     forget_run,
     undo,
 )
-from tests.logs import append_raw, walk, write_log
-from tests.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
-from tests.rows import all_rows
+from tests.support.logs import append_raw, walk, write_log
+from tests.support.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
+from tests.support.rows import all_rows
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from projections.postgres import TailProgress, rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
 from projections.surfaces.serve import Answerer, Pools
-from tests.commands_in_logs import append_command, forget_keyframes, keep_apart, name_place, undo
 from tests.integration.test_rebuild_under_readers import (
     COUNT_LABELS,
     COUNT_PATHS,
@@ -25,8 +24,15 @@ from tests.integration.test_rebuild_under_readers import (
     Reader,
     single_answer,
 )
-from tests.logs import bridge, walk, write_log
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands_in_logs import (
+    append_command,
+    forget_keyframes,
+    keep_apart,
+    name_place,
+    undo,
+)
+from tests.support.logs import bridge, walk, write_log
+from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
 WAIT_S = 60.0

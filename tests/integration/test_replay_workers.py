@@ -17,12 +17,12 @@ from projections.map.parsed_log import ParsedLog
 from projections.postgres import RebuildReport, rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.rebuild import RebuildProgress
-from tests.fixtures_log import flip
 from tests.integration.test_parsed_log import pids
-from tests.logs import append_raw, walk, write_log
-from tests.random_logs import write_random_log
-from tests.rows import all_rows
-from tests.thorough import THOROUGH, rounds
+from tests.support.fixtures_log import flip
+from tests.support.logs import append_raw, walk, write_log
+from tests.support.random_logs import write_random_log
+from tests.support.rows import all_rows
+from tests.support.thorough import THOROUGH, rounds
 
 SETTINGS = Settings(embedding_dim=8)
 EVIDENCE = Settings(embedding_dim=8, fusion="evidence", places="rooms")

@@ -16,10 +16,10 @@ from projections.adapters.palette import place_colour
 from projections.fold.settings import Settings
 from projections.map.scenes import RecordedFold
 from projections.surfaces.cli.export import _recorder
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.logs import write_log
-from tests.maps import write_map_yaml
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
+from tests.support.maps import write_map_yaml
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 SETTINGS = Settings(eps_m=0.75, min_samples=8)

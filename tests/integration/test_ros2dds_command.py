@@ -18,12 +18,12 @@ from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.bridge_keys import token_selectors, topic_of, type_of_token
 from projections.surfaces.cli.bridged import recording_of
-from tests import ros2dds
-from tests.commands import Commands
-from tests.fixtures_log import read_log
-from tests.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
-from tests.ros2dds_drive import TF, drive
-from tests.ros2dds_recordings import (
+from tests.support import ros2dds
+from tests.support.commands import Commands
+from tests.support.fixtures_log import read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.ros2dds_drive import TF, drive
+from tests.support.ros2dds_recordings import (
     announce_all,
     choice,
     new_bridge,
@@ -31,12 +31,12 @@ from tests.ros2dds_recordings import (
     send_all,
     wait_for_recorder,
 )
-from tests.ros_messages import (
+from tests.support.ros_messages import (
     SECOND,
     START,
     TYPES,
 )
-from tests.thorough import every_other
+from tests.support.thorough import every_other
 
 Sessions = Callable[[], Session]
 

@@ -19,11 +19,11 @@ from eventsrc.record.recorder.unfinished import append_missing, message_of
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording, derive, read_recording
 from projections.surfaces.cli.bridged import recording_of
-from tests import ros2dds
-from tests.fixtures_log import KEY, read_log
-from tests.recorders import Running
-from tests.ros2dds_drive import BOXES, KINDS, drive
-from tests.ros2dds_recordings import (
+from tests.support import ros2dds
+from tests.support.fixtures_log import KEY, read_log
+from tests.support.recorders import Running
+from tests.support.ros2dds_drive import BOXES, KINDS, drive
+from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,
     choice,
@@ -33,7 +33,7 @@ from tests.ros2dds_recordings import (
     send_all,
     verbatim,
 )
-from tests.ros_messages import (
+from tests.support.ros_messages import (
     START,
     TYPES,
 )

@@ -8,11 +8,11 @@ import pytest
 
 from eventsrc.log import VerbatimEvent
 from eventsrc.record.transport.session import Session
-from tests import ros2dds
-from tests.fixtures_log import read_log
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.ros2dds_drive import KINDS, drive
-from tests.ros2dds_recordings import (
+from tests.support import ros2dds
+from tests.support.fixtures_log import read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.ros2dds_drive import KINDS, drive
+from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,
     envelopes,
@@ -21,15 +21,15 @@ from tests.ros2dds_recordings import (
     recording,
     wait_for_recorder,
 )
-from tests.ros_messages import TYPES
+from tests.support.ros_messages import TYPES
 
 KEYFRAMES = 12
-WRITER = "from tests.dds import main; main()"
+WRITER = "from tests.support.dds import main; main()"
 
 
 @pytest.mark.parametrize("number", range(4))
 def test_cyclone_and_rosbags_make_the_same_cdr(number: int) -> None:
-    from tests import dds
+    from tests.support import dds
 
     for _, message in drive(number + 1):
         own = TYPES.encode(message, message.__msgtype__)
@@ -49,7 +49,7 @@ def test_a_drive_over_dds_and_a_bridge(
     from cyclonedds.sub import DataReader
     from cyclonedds.util import duration
 
-    from tests import dds
+    from tests.support import dds
 
     sent = drive(KEYFRAMES)
     tag = uuid.uuid4().hex

@@ -9,7 +9,7 @@ import pytest
 
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.docs.console import ROOT
-from tests.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
 
 Start = Callable[..., Program]
 

@@ -21,8 +21,8 @@ from projections.postgres.connection import connect as connect_database
 from projections.postgres.embedded import EmbeddedServer
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.answering import encode
-from tests.http_attacks import DEADLINE_S, Served, ask, connect, request, served, status
-from tests.logs import walk, write_log
+from tests.support.http_attacks import DEADLINE_S, Served, ask, connect, request, served, status
+from tests.support.logs import walk, write_log
 
 OPEN_FILES = 256
 HALF_OPEN = 400

@@ -19,8 +19,8 @@ from starlette.types import Receive, Scope, Send
 
 from projections.surfaces.serve import connections
 from projections.surfaces.serve.listening import accept_pending, bind, serving, tls_context
-from tests.fixtures_tls import Certificate
-from tests.http_attacks import DEADLINE_S, answer, ask, connect, request, status
+from tests.support.fixtures_tls import Certificate
+from tests.support.http_attacks import DEADLINE_S, answer, ask, connect, request, status
 
 LONG = 16 * 1024 * 1024
 SECONDS = 0.5

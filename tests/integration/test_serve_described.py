@@ -15,10 +15,10 @@ from pydantic import TypeAdapter
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve import Answerer, Pools, models
-from tests import described_maps
-from tests.described_maps import documents
-from tests.described_service import Service
-from tests.logs import write_log
+from tests.support import described_maps
+from tests.support.described_maps import documents
+from tests.support.described_service import Service
+from tests.support.logs import write_log
 
 CROPS = [crop for document in documents(4) for crop in document["detections"]]
 CLASS = {"crops": [{"class": "toilet"}]}

@@ -14,10 +14,10 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve.guard import read_origin, read_token
-from tests.commands import Commands
-from tests.fixtures_tls import Certificate
-from tests.http_attacks import answer, ask, connect, request, served, status
-from tests.logs import walk, write_log
+from tests.support.commands import Commands
+from tests.support.fixtures_tls import Certificate
+from tests.support.http_attacks import answer, ask, connect, request, served, status
+from tests.support.logs import walk, write_log
 
 TOKEN = "0123456789abcdef-not-a-secret"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}

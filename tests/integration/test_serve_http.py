@@ -16,7 +16,14 @@ from projections.localize.relocalize import parse_question, question_schema
 from projections.postgres.connection import Targets
 from projections.postgres.queries.relocalize import relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools
-from tests.serve_questions import DEADLINE_S, FORMS, fetch, http_at, question, tracked_question
+from tests.support.serve_questions import (
+    DEADLINE_S,
+    FORMS,
+    fetch,
+    http_at,
+    question,
+    tracked_question,
+)
 
 
 @pytest.fixture

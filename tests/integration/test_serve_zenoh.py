@@ -11,7 +11,7 @@ from projections.localize.relocalize import Track, parse_question
 from projections.postgres.connection import Targets, connect
 from projections.postgres.queries.relocalize import relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
-from tests.serve_questions import (
+from tests.support.serve_questions import (
     DEADLINE_S,
     FORMS,
     OTHER_SPACE,
@@ -19,7 +19,7 @@ from tests.serve_questions import (
     question,
     tracked_question,
 )
-from tests.thorough import rounds
+from tests.support.thorough import rounds
 
 
 @pytest.fixture

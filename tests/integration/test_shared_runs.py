@@ -6,8 +6,8 @@ from eventsrc.envelope.ingest import Accepted, ingest
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.view import MapView
-from tests.folds import recounted_adjacency, recounted_locations, recounted_places
-from tests.shared_data import shared_run
+from tests.support.folds import recounted_adjacency, recounted_locations, recounted_places
+from tests.support.shared_data import shared_run
 
 
 def _fold(*names: str, **settings: float) -> MapView:

@@ -10,9 +10,9 @@ from typer.main import get_command
 
 from projections.surfaces.cli import SECTIONS, command_line
 from projections.surfaces.cli.program import Program, _needed
-from tests.commands import Commands
-from tests.prefork import folder_with_mapfold
-from tests.thorough import rounds
+from tests.support.commands import Commands
+from tests.support.prefork import folder_with_mapfold
+from tests.support.thorough import rounds
 
 
 @pytest.fixture

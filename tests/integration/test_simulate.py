@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.record.transport.session import Received, Session
-from tests.commands import Commands, Said
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.simulated import simulated
+from tests.support.commands import Commands, Said
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.simulated import simulated
 
 
 def _mapfold(*arguments: str) -> Said:

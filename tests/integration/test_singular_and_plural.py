@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.fixtures_timetravel import write_log
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.fixtures_timetravel import write_log
 
 _LONE = ("--set", "min_samples=1", "--set", "eps_m=0.5")
 _ONES = re.compile(

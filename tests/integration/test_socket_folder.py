@@ -19,7 +19,7 @@ import pytest
 from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
 from projections.postgres.connection import connect
 from projections.postgres.embedded import EmbeddedServer
-from tests.servers import furnish
+from tests.support.servers import furnish
 
 NOBODY = 65534
 SOCKET = ".s.PGSQL.5432"

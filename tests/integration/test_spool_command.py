@@ -9,8 +9,8 @@ import pytest
 from eventsrc.envelope.model import KeyframeId, RunId
 from eventsrc.record.robot.acks import Refusal, Refusals
 from eventsrc.record.robot.spool import Spool
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
 
 PAYLOADS = [payload(envelope(number, 0.0)) for number in (1, 2, 3)]
 

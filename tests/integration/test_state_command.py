@@ -9,9 +9,9 @@ from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import LogWriter
 from projections.fold.place_types import place_type
 from projections.fold.settings import Settings
-from tests.commands import Commands
-from tests.envelopes import detection, envelope, payload
-from tests.folds import fold
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.folds import fold
 
 KEY = "tb/detections"
 DOCUMENTS = [

@@ -19,9 +19,9 @@ from projections.postgres.connection import Targets
 from projections.postgres.retry import retry
 from projections.postgres.status import projection_status
 from projections.postgres.tail_metrics import serving_tail_metrics
-from tests.envelopes import envelope, payload
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.rows import all_rows
+from tests.support.envelopes import envelope, payload
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.rows import all_rows
 
 SETTINGS = Settings()
 WAIT_S = 60.0

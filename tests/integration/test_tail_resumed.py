@@ -18,10 +18,10 @@ from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.live_fold import LiveFold
 from projections.store.history_recorder import map_after
-from tests.commands_in_logs import append_command, name_place
-from tests.logs import append_raw, bridge, walk, write_log
 from tests.property.test_timeline_cache import kept_early
-from tests.rows import all_rows
+from tests.support.commands_in_logs import append_command, name_place
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.rows import all_rows
 
 SETTINGS = Settings()
 

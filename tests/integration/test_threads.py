@@ -12,12 +12,12 @@ import pytest
 from mapfold import Map, Settings, Timeline, fold, open_log, relocalize
 
 from eventsrc.log import GROUP_COMMIT, LogReader, LogWriter
-from tests.commands_in_logs import append_command, name_place
-from tests.evidence_folds import EVIDENCE
-from tests.history_answers import whole
-from tests.logs import append_raw, bridge, walk, write_log
 from tests.property.test_timeline_cache import kept_early
-from tests.thorough import mostly_slow, rounds
+from tests.support.commands_in_logs import append_command, name_place
+from tests.support.evidence_folds import EVIDENCE
+from tests.support.history_answers import whole
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.thorough import mostly_slow, rounds
 
 THREADS = 5
 CLASSIC = Settings(eps_m=0.8, min_samples=3)

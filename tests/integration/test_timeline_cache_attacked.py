@@ -22,13 +22,13 @@ from projections.history import Timeline
 from projections.map.fold import fold_log
 from projections.store.history_recorder import map_after
 from projections.store.timeline_cache import TimelineCache
-from tests import prefork
-from tests.envelopes import detection, envelope
-from tests.fixtures_timetravel import VECTORS, write_log
-from tests.history_answers import expected, told
-from tests.history_process import RULES, answers
 from tests.property.test_timeline_cache import kept_early
-from tests.thorough import rounds
+from tests.support import prefork
+from tests.support.envelopes import detection, envelope
+from tests.support.fixtures_timetravel import VECTORS, write_log
+from tests.support.history_answers import expected, told
+from tests.support.history_process import RULES, answers
+from tests.support.thorough import rounds
 
 EVENTS = 240
 
@@ -67,7 +67,7 @@ def kept(log: Path) -> list[Path]:
 
 def run(log: Path, *how: str) -> "subprocess.CompletedProcess[bytes]":
     return prefork.run(
-        "tests.history_process:main",
+        "tests.support.history_process:main",
         ["history", str(log), *how],
         env=os.environ,
         cwd=Path.cwd(),

@@ -10,12 +10,12 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
 from tests.integration.test_projections import parsed
-from tests.logs import write_log
-from tests.rows import expected_graph, graph_rows
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
+from tests.support.rows import expected_graph, graph_rows
+from tests.support.thorough import mostly_slow
 
 LOOKS = {
     "refrigerator": [1, 0, 0, 0],

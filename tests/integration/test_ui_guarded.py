@@ -13,12 +13,12 @@ import pytest
 from eventsrc.base.text import visible
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from projections.surfaces.ui.live import MOST_STREAMS
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.http_attacks import answer, request, status
-from tests.logs import append_raw, walk, write_log
-from tests.ui_client import read_arrays
-from tests.ui_server import UiServer, showing
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.http_attacks import answer, request, status
+from tests.support.logs import append_raw, walk, write_log
+from tests.support.ui_client import read_arrays
+from tests.support.ui_server import UiServer, showing
 
 CSP = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none';"

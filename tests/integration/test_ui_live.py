@@ -6,14 +6,14 @@ import time
 from pathlib import Path
 
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
-from tests.commands import Commands
-from tests.envelopes import payload
-from tests.http_attacks import connect, request
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.shared_data import ROOT
-from tests.thorough import rounds
-from tests.ui_client import read_arrays, replay
-from tests.ui_server import UiServer, digest, showing, until
+from tests.support.commands import Commands
+from tests.support.envelopes import payload
+from tests.support.http_attacks import connect, request
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.shared_data import ROOT
+from tests.support.thorough import rounds
+from tests.support.ui_client import read_arrays, replay
+from tests.support.ui_server import UiServer, digest, showing, until
 
 
 class TestGrowing:

@@ -9,13 +9,13 @@ import pytest
 
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from tests.commands import Commands
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import BY_HAND, KEY, flip
-from tests.logs import append_raw, walk, write_log
-from tests.thorough import mostly_slow
-from tests.ui_client import read_arrays, replay
-from tests.ui_server import UiServer, digest, showing, until
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import BY_HAND, KEY, flip
+from tests.support.logs import append_raw, walk, write_log
+from tests.support.thorough import mostly_slow
+from tests.support.ui_client import read_arrays, replay
+from tests.support.ui_server import UiServer, digest, showing, until
 
 
 def problems(server: UiServer) -> list[str]:

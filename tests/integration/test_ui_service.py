@@ -30,7 +30,7 @@ from projections.surfaces.ui.live import LiveWatch
 from projections.surfaces.ui.log_map import MOST_ALTERNATIVES, LogMap
 from projections.surfaces.ui.opened import Opened
 from projections.surfaces.ui.service import GivenUp, UiService
-from tests.logs import walk, write_log
+from tests.support.logs import walk, write_log
 
 WAIT_S = 60.0
 

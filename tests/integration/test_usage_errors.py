@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import Commands
-from tests.fixtures_timetravel import write_log
-from tests.hostile_options import hostile_lines, prepared
-from tests.logs import walk
-from tests.thorough import rounds
+from tests.support.commands import Commands
+from tests.support.fixtures_timetravel import write_log
+from tests.support.hostile_options import hostile_lines, prepared
+from tests.support.logs import walk
+from tests.support.thorough import rounds
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_a_recording_for_foxglove_goes_into_no_pipe(mapfold: Commands) -> None:
 
 @pytest.mark.seconds
 def test_hostile_values_of_any_option_end_without_a_traceback(mapfold: Commands) -> None:
-    """A sample of what `tests.attack` tries."""
+    """A sample of what `scripts.programs.attack` tries."""
     lines = [*hostile_lines()]
     with prepared(mapfold.folder):
         for line in lines[:: rounds(31, 997)]:

@@ -30,10 +30,10 @@ from eventsrc.record.log_info import log_info
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from tests.commands import Commands
-from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
-from tests.thorough import rounds
-from tests.verbatim import BOXES, JPEG, TF, mixed_event, mixed_events
+from tests.support.commands import Commands
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log
+from tests.support.thorough import rounds
+from tests.support.verbatim import BOXES, JPEG, TF, mixed_event, mixed_events
 
 COUNT = 240
 

@@ -21,7 +21,7 @@ from eventsrc.record.transport.session import (
     ZenohOptions,
     open_session,
 )
-from tests.fixtures_zenoh import DEADLINE_S, LOOPBACK
+from tests.support.fixtures_zenoh import DEADLINE_S, LOOPBACK
 
 Sessions = Callable[[], Session]
 

@@ -18,10 +18,10 @@ from eventsrc.record.robot.acks import ACK_PREFIX, sent_key
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Session, ZenohOptions, open_session
 from tests.docs.console import ROOT
-from tests.envelopes import envelope, payload
-from tests.fixtures_log import read_log
-from tests.fixtures_zenoh import DEADLINE_S, Program
-from tests.thorough import mostly_slow
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import read_log
+from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.thorough import mostly_slow
 
 PAGE = (ROOT / "docs" / "security.md").read_text()
 NAMES = ("router", "recorder", "robot-1", "robot-2", "stranger")

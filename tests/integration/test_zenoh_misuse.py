@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import Commands
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.thorough import mostly_slow
 
 _SPEAKING = (("record", "log"), ("router",), ("simulate",))
 

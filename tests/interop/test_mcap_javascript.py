@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader
-from tests.commands import Commands
-from tests.logs import walk, write_log
-from tests.maps import write_map_yaml
+from tests.support.commands import Commands
+from tests.support.logs import walk, write_log
+from tests.support.maps import write_map_yaml
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 PACKAGES = ("@mcap/core@2.2.2", "@mcap/nodejs@1.0.2", "@mcap/support@1.1.0")

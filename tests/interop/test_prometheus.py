@@ -12,8 +12,8 @@ from projections.postgres.connection import Targets
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
-from tests.described_maps import build
 from tests.integration.test_metrics import REPORT
+from tests.support.described_maps import build
 
 pytestmark = pytest.mark.slow
 

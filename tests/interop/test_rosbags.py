@@ -13,9 +13,9 @@ from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
-from tests.logs import walk, write_log
-from tests.ros2dds_drive import KINDS, drive
-from tests.ros_messages import TYPES
+from tests.support.logs import walk, write_log
+from tests.support.ros2dds_drive import KINDS, drive
+from tests.support.ros_messages import TYPES
 
 pytestmark = pytest.mark.slow
 

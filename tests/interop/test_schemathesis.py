@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from projections.postgres.connection import Targets
-from tests.described_maps import MODEL
-from tests.http_attacks import served
+from tests.support.described_maps import MODEL
+from tests.support.http_attacks import served
 
 pytestmark = pytest.mark.slow
 

@@ -25,8 +25,8 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
-from tests.envelopes import payload
-from tests.logs import walk, write_log
+from tests.support.envelopes import payload
+from tests.support.logs import walk, write_log
 
 ROOT = Path(__file__).resolve().parents[2]
 UV = Path(sys.executable).with_name("uv")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from projections.postgres import graph_render as agtype
 from projections.postgres.loader import CopyLoader, InsertLoader, Loader
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 ODD = ["\\", "\\\\n", '"', "'", "\t", "\\.", "\\N", "$$", "\u2028", "\x7f", "\x85", "😀"]
 finite = st.floats(allow_nan=False, allow_infinity=False)

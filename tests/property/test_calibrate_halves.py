@@ -13,8 +13,8 @@ from projections.localize.calibrate.halves import inflation
 from projections.localize.calibrate.rounds import read
 from projections.localize.calibrate.sightings import Row, sightings_of
 from projections.localize.calibrate.things import qualified
-from tests.known_worlds import Known, rows_of
-from tests.thorough import stride
+from tests.support.known_worlds import Known, rows_of
+from tests.support.thorough import stride
 
 KNOWN = Known()
 ERRORS = (KNOWN.bearing_rad, 0.12, KNOWN.pose_m)

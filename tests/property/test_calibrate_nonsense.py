@@ -15,7 +15,7 @@ from projections.fold.settings import Camera
 from projections.localize.calibrate.rounds import _bounded, read
 from projections.localize.calibrate.shrinking import Reading
 from projections.localize.calibrate.sightings import Row, sightings_of
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 FAR_UM = 10**13
 PIXELS = st.one_of(

@@ -11,8 +11,8 @@ from projections.fold.settings import Camera
 from projections.localize.calibrate.rounds import Round, read
 from projections.localize.calibrate.shrinking import Reading
 from projections.localize.calibrate.sightings import sightings_of
-from tests.known_worlds import CAMERA, Known, rows_of
-from tests.thorough import mostly_slow, rounds
+from tests.support.known_worlds import CAMERA, Known, rows_of
+from tests.support.thorough import mostly_slow, rounds
 
 PRIOR = EvidenceConstants()
 WORLDS = {

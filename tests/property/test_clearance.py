@@ -16,7 +16,7 @@ from projections.fold.clearance import (
     clearance,
     regions,
 )
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 grids = st.builds(
     lambda rows, columns, share, seed: np.random.default_rng(seed).random((rows, columns)) < share,

@@ -15,10 +15,10 @@ from projections.fold.deltas import MergeRefused, PlaceFormed, PlacesMerged
 from projections.fold.pair_groups import ApartPairs, PairGroups, without_contradictions
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
-from tests.folds import near_matrix
-from tests.naive_constrained import NaiveConstrainedPlaces
 from tests.property.test_places_are_dbscan import EPS_UM, Point
-from tests.thorough import rounds
+from tests.support.folds import near_matrix
+from tests.support.naive_constrained import NaiveConstrainedPlaces
+from tests.support.thorough import rounds
 
 Statements = list[tuple[tuple[int, int], bool]]
 

@@ -17,9 +17,9 @@ from eventsrc.base.errors import MapfoldError
 from projections.fold.settings import Settings
 from projections.postgres.connection import Targets, connect, describe_target, open_targets
 from projections.postgres.status import projection_status
-from tests.commands import Commands
-from tests.logs import walk, write_log
-from tests.thorough import examples
+from tests.support.commands import Commands
+from tests.support.logs import walk, write_log
+from tests.support.thorough import examples
 
 SECRET = "Zq7SECRETx"
 PARTS = st.sampled_from(

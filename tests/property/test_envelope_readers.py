@@ -27,8 +27,8 @@ from eventsrc.envelope.readers import (
     read_plain,
 )
 from projections.fold.folded_ids import content_digest
-from tests.envelopes import detection, envelope, fields_of, payload
-from tests.thorough import examples
+from tests.support.envelopes import detection, envelope, fields_of, payload
+from tests.support.thorough import examples
 
 EDGE_TEXTS = r"""
 0 -0 0.0 -0.0 1 1.0 1e0 1e2 01 1. .5 +1 0x1 1_0 1E+2 1e-400 5e-324 1e308 1e309 1e400 -1e400 1e23

@@ -19,7 +19,7 @@ from projections.fold.spots import (
     Solver,
     Spots,
 )
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 RANGE_M, RANGE_SPREAD = 3.0, 0.55
 

@@ -22,9 +22,9 @@ from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
 from projections.map.records import Estimate, ObjectRecord, Relocation
 from projections.map.view import MapView
-from tests.memory_history import MemoryHistory
-from tests.past_view import view_at
-from tests.synthetic_objects import STEPS, Step, SyntheticDeltas, random_steps
+from tests.support.memory_history import MemoryHistory
+from tests.support.past_view import view_at
+from tests.support.synthetic_objects import STEPS, Step, SyntheticDeltas, random_steps
 
 EVIDENCE = Settings(fusion="evidence")
 SLOW = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -13,7 +13,7 @@ import pytest
 
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects
-from tests.evidence_pictures import a_room, fold_all, fold_one, pictures_of
+from tests.support.evidence_pictures import a_room, fold_all, fold_one, pictures_of
 
 _OF_MATH = (
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "exp", "exp2", "expm1", "log"),

@@ -25,7 +25,7 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
 from projections.fold.pair_groups import ApartPairs, PairGroups
 from projections.fold.thing_index import ThingIndex
-from tests.evidence_pictures import (
+from tests.support.evidence_pictures import (
     DIM,
     Picture,
     a_room,
@@ -34,7 +34,7 @@ from tests.evidence_pictures import (
     fold_one,
     pictures_of,
 )
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 _SEEDS = st.integers(0, 10_000)
 

@@ -15,8 +15,8 @@ from projections.fold.label_counts import LabelCounts
 from projections.fold.looks import LookRatios
 from projections.fold.spots import Spots
 from projections.fold.things import Thing
-from tests.evidence_pictures import a_room, fold_one, pictures_of
-from tests.thorough import examples
+from tests.support.evidence_pictures import a_room, fold_one, pictures_of
+from tests.support.thorough import examples
 
 LABELS = st.sampled_from(["chair", "table", "bed", "lamp"])
 POSITIVE = st.floats(1e-12, 1e12)

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from projections.adapters.export import Origin, dot, geojson, graphml, nav2_waypoints, tables
 from projections.adapters.export.waypoints import NEAR_M
 from projections.map.view import MapView
-from tests.envelopes import detection, envelope
-from tests.folds import fold
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import fold
 
 TEXTS = st.text(
     st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=8

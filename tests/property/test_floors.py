@@ -12,13 +12,20 @@ from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.view import MapView
-from tests.envelopes import detection, envelope
-from tests.evidence_folds import recounted_votes
-from tests.folds import Folded, fold, near_matrix, recounted_adjacency, recounted_places, resumed
-from tests.memory_history import MemoryHistory
-from tests.naive_map import NaiveMap, micrometres
 from tests.property.test_whole_fold import worlds
-from tests.rooms_with_things import drives
+from tests.support.envelopes import detection, envelope
+from tests.support.evidence_folds import recounted_votes
+from tests.support.folds import (
+    Folded,
+    fold,
+    near_matrix,
+    recounted_adjacency,
+    recounted_places,
+    resumed,
+)
+from tests.support.memory_history import MemoryHistory
+from tests.support.naive_map import NaiveMap, micrometres
+from tests.support.rooms_with_things import drives
 
 FLOORS: list[dict[str, Any]] = [
     {},

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from projections.fold.deltas import KeyframeAdded, ObjectFound, ObjectSeen, ObservationAdded
 from projections.map.digest import map_digest
 from projections.map.view import MapView
-from tests.envelopes import detection, envelope
-from tests.folds import (
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import (
     Folded,
     fold,
     recounted_adjacency,

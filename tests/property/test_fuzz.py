@@ -1,4 +1,4 @@
-"""Every reader of other people's bytes, fed with bytes that are almost right (`tests.fuzz`).
+"""Every reader of other people's bytes, fed with bytes that are almost right (`scripts/fuzz`).
 
 `scripts/fuzz` goes on for as long as one likes, guided by coverage.
 """
@@ -9,9 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.target import Target
-from tests.fuzz.targets import TARGETS
-from tests.thorough import examples
+from scripts.programs.fuzz.target import Target
+from scripts.programs.fuzz.targets import TARGETS
+from tests.support.thorough import examples
 
 EXAMPLES = examples(300)
 

@@ -24,8 +24,8 @@ from eventsrc.log.format import (
     mark_seed,
     read_head,
 )
-from tests.fixtures_log import BY_HAND, KEY, MEMORY_DISK, read_log
-from tests.thorough import examples
+from tests.support.fixtures_log import BY_HAND, KEY, MEMORY_DISK, read_log
+from tests.support.thorough import examples
 
 SYNCED = 3
 """Commits that are complete before the one that is damaged."""

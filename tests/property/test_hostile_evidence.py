@@ -19,9 +19,9 @@ from projections.fold.spots import Spots
 from projections.fold.things import Thing
 from projections.map.digest import map_digest
 from projections.map.export import state_document
-from tests.envelopes import detection, envelope, payload
-from tests.folds import Folded, resumed, state_bytes
-from tests.thorough import examples
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.folds import Folded, resumed, state_bytes
+from tests.support.thorough import examples
 
 EVIDENCE = Settings(fusion="evidence", eps_m=1.0)
 _ODD = (0.0, -0.0, 1e308, -1e308, 5e-324, 1e-300, 1e6, -1e6, 1e9, -50.0, 320.0, 200.0, 639.9999)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eventsrc.base.text import visible
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest, ingest_all
-from tests.envelopes import detection, envelope, payload
+from tests.support.envelopes import detection, envelope, payload
 
 TEXT = st.text(st.characters(exclude_categories=["Cc", "Cs"]), min_size=1, max_size=256)
 JSON = st.recursive(

@@ -10,8 +10,8 @@ from projections.fold.adjacency import Adjacency
 from projections.fold.deltas import Delta
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from tests.folds import Folded, fold, resumed, state_bytes
 from tests.property.test_fold_recounts import SETTINGS, runs
+from tests.support.folds import Folded, fold, resumed, state_bytes
 
 
 def _plain(delta: Delta) -> tuple[Any, ...]:

@@ -21,7 +21,7 @@ from projections.localize.relocalize.likelihood import (
     terms_at,
 )
 from projections.localize.relocalize.model import MODEL, Model
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 TURN = 2.0 * math.pi
 seeds = st.integers(0, 2**32 - 1)

@@ -16,8 +16,8 @@ from projections.localize.relocalize.likelihood import log_likelihood, terms_at
 from projections.localize.relocalize.model import MODEL
 from projections.localize.relocalize.movements import poses_at_views
 from projections.localize.relocalize.pose import CELL_M, Posterior, _sighted, locate
-from tests.relocalization.scenes import CONSTANTS, Pose, Scene, Thing, around, movement
-from tests.thorough import examples, rounds
+from tests.support.scenes import CONSTANTS, Pose, Scene, Thing, around, movement
+from tests.support.thorough import examples, rounds
 
 HEADINGS = np.arange(72) * (math.pi / 36)
 

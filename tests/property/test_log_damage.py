@@ -9,8 +9,8 @@ from eventsrc.log import Event, LogWriter
 from eventsrc.log.durable_files import ALWAYS
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.log.scan import scan_active
-from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
-from tests.thorough import stride
+from tests.support.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
+from tests.support.thorough import stride
 
 MEMORY_DISK = Path("/dev/shm")
 

@@ -14,8 +14,8 @@ import pytest
 from eventsrc.base.errors import MapfoldError
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
-from tests.fixtures_log import KEY, envelope, read_log
-from tests.thorough import stride
+from tests.support.fixtures_log import KEY, envelope, read_log
+from tests.support.thorough import stride
 
 CALLS = ("open", "write", "fdatasync", "fsync", "pwrite", "ftruncate", "rename", "replace", "link")
 EVENTS = 12

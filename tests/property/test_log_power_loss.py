@@ -10,9 +10,9 @@ import pytest
 from eventsrc.base.errors import LogError
 from eventsrc.log import LogReader, LogWriter, recover_log
 from eventsrc.log.durable_files import ALWAYS, FsyncPolicy
-from tests.fixtures_log import BY_HAND, KEY, read_log
-from tests.power_loss import Call, Tracer, power_cuts
-from tests.thorough import mostly_slow, stride
+from tests.support.fixtures_log import BY_HAND, KEY, read_log
+from tests.support.power_loss import Call, Tracer, power_cuts
+from tests.support.thorough import mostly_slow, stride
 
 THREE = FsyncPolicy(interval_ns=10**18, max_events=3)
 

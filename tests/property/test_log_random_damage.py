@@ -14,9 +14,9 @@ import pytest
 from eventsrc.base.errors import LogError
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
-from tests.attack.corruption import corrupt_log
-from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
-from tests.thorough import stride
+from scripts.programs.attack.corruption import corrupt_log
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log, read_with_gaps
+from tests.support.thorough import stride
 
 EVENTS = 25
 PAYLOADS = [envelope(i, note="x" * random.Random(i).randrange(400)) for i in range(EVENTS)]

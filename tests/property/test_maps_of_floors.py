@@ -17,9 +17,9 @@ from projections.localize.relocalize import CandidatePlace, Candidates, Match
 from projections.localize.relocalize.floors import STEP_M, Layout
 from projections.localize.relocalize.walls import WallMap
 from projections.map.digest import map_digest
-from tests.envelopes import envelope
-from tests.folds import Folded, resumed
-from tests.thorough import examples
+from tests.support.envelopes import envelope
+from tests.support.folds import Folded, resumed
+from tests.support.thorough import examples
 
 ROOMS = Settings(places="rooms")
 Item = dict[str, Any] | OccupancyMap

@@ -17,9 +17,9 @@ from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, file_head, head_metadata, segment_path
 from eventsrc.log.mcap_records import encode_mark, encode_message_head, encode_plain_chunk_head
 from eventsrc.log.recover import TooManyLosses
-from tests.commands import Commands
-from tests.fixtures_log import KEY, envelope, read_log, read_with_gaps, write_log
-from tests.thorough import stride
+from tests.support.commands import Commands
+from tests.support.fixtures_log import KEY, envelope, read_log, read_with_gaps, write_log
+from tests.support.thorough import stride
 
 EACH = 3
 COUNT = 5

@@ -6,10 +6,10 @@ from functools import cache
 import pytest
 
 from projections.localize.relocalize import Answer, rank
-from tests.relocalization.buildings import Building, Keyframe
-from tests.relocalization.drives import drive
-from tests.relocalization.rooms import RoomMap, crops_of
-from tests.thorough import mostly_slow
+from tests.support.buildings import Building, Keyframe
+from tests.support.drives import drive
+from tests.support.rooms import RoomMap, crops_of
+from tests.support.thorough import mostly_slow
 
 SEEDS = (20, 21, 22)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.occupancy import OccupancyGrid, Point
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 ROWS, COLUMNS, SIDE_UM = 7, 9, 100_000
 

@@ -15,9 +15,9 @@ from eventsrc.log import Event, LogReader
 from projections.fold.folded_ids import content_digest
 from projections.map.parsed_bytes import NoRoom, pack, unpack
 from projections.map.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
-from tests.envelopes import fields_of
-from tests.random_logs import write_random_log
-from tests.thorough import examples
+from tests.support.envelopes import fields_of
+from tests.support.random_logs import write_random_log
+from tests.support.thorough import examples
 
 ROOM = 1 << 20
 

@@ -11,11 +11,11 @@ from eventsrc.envelope.model import Offset
 from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.map.view import MapView
-from tests.folds import Folded
-from tests.logs import write_log
 from tests.property.test_floors import buildings
-from tests.rooms_with_things import drives
-from tests.rows import recounted_contents
+from tests.support.folds import Folded
+from tests.support.logs import write_log
+from tests.support.rooms_with_things import drives
+from tests.support.rows import recounted_contents
 
 
 def check(view: MapView) -> None:

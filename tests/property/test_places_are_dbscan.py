@@ -10,7 +10,7 @@ from projections.fold.core_index import CoreIndex
 from projections.fold.deltas import PlacesMerged
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
-from tests.folds import NaivePlaces, batch_dbscan, near_matrix
+from tests.support.folds import NaivePlaces, batch_dbscan, near_matrix
 
 Point = tuple[int, int, float]
 EPS_UM = 1_500_000

@@ -15,10 +15,10 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Settings
 from projections.fold.sights import PoseError, Sights
 from projections.map.digest import map_digest
-from tests.envelopes import detection, envelope
-from tests.evidence_pictures import CAMERA, DIM, FOCAL, a_sighting
-from tests.folds import Folded, accepted
-from tests.thorough import examples
+from tests.support.envelopes import detection, envelope
+from tests.support.evidence_pictures import CAMERA, DIM, FOCAL, a_sighting
+from tests.support.folds import Folded, accepted
+from tests.support.thorough import examples
 
 _ANGLE = st.floats(-7.0, 7.0)
 _ROOM = (4.0, 3.0)

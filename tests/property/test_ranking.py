@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.localize.relocalize import Answer, Candidates, Crop, rank
-from tests.relocalization.buildings import Building, Keyframe
-from tests.relocalization.drives import drive
-from tests.relocalization.rooms import RoomMap, crops_of
-from tests.thorough import examples, mostly_slow
+from tests.support.buildings import Building, Keyframe
+from tests.support.drives import drive
+from tests.support.rooms import RoomMap, crops_of
+from tests.support.thorough import examples, mostly_slow
 
 SEEDS = (20, 21)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from projections.fold.core_index import NEIGHBOUR_CELLS, cell_side_um
 from projections.fold.reach_index import ReachIndex, from_side
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 EPS_UM = 1_500_000
 EPS = st.sampled_from([0, 1, 2, 3, 5, 7, 13, 50, 1000, 1_500_000, 10**9])

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from projections.localize.relocalize import rank
-from tests.relocalization.recorded import FILE, numbers, questions
+from tests.support.recorded import FILE, numbers, questions
 
 
 def test_answers_are_those_recorded_of_the_ranking_crop_by_crop() -> None:

@@ -13,10 +13,10 @@ from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, head_metadata, segment_path
 from eventsrc.record.importers import import_files
-from tests.commands import Commands
-from tests.fixtures_log import KEY, envelope, read_log
-from tests.rewriting import plainly_read, rewrite
-from tests.thorough import mostly_slow
+from tests.support.commands import Commands
+from tests.support.fixtures_log import KEY, envelope, read_log
+from tests.support.rewriting import plainly_read, rewrite
+from tests.support.thorough import mostly_slow
 
 EACH = 20
 COUNT = 3

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from eventsrc.ros.derivation import Derivation, RosRecording
 from eventsrc.ros.stream import Stream
-from tests import ros_messages as ros
-from tests.ros_messages import OPTICAL, SECOND, START, flat
-from tests.ros_streams import stream
-from tests.thorough import examples
+from tests.support import ros_messages as ros
+from tests.support.ros_messages import OPTICAL, SECOND, START, flat
+from tests.support.ros_streams import stream
+from tests.support.thorough import examples
 
 GRID, POSE, ODOMETRY = "/map", "/pose", "/odom"
 STREAMS = (

@@ -17,8 +17,8 @@ from projections.map.view import MapView
 from projections.postgres.graph_render import object_rows
 from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
 from projections.postgres.memory_sink import MemorySink, MemoryTables
-from tests.rows import memory_rows
-from tests.synthetic_objects import (
+from tests.support.rows import memory_rows
+from tests.support.synthetic_objects import (
     STEPS,
     Step,
     SyntheticDeltas,
@@ -26,7 +26,7 @@ from tests.synthetic_objects import (
     random_steps,
     without_sigma,
 )
-from tests.thorough import examples, stride
+from tests.support.thorough import examples, stride
 
 EVIDENCE = Settings(fusion="evidence")
 Events = Sequence[Sequence[d.Delta]]

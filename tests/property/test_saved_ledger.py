@@ -20,7 +20,7 @@ from eventsrc.log.format import LEDGER
 from eventsrc.record import gap_history as _ledger_cache
 from eventsrc.record.append import append_payload
 from eventsrc.record.gap_history import MAX_BYTES, encode, fold_and_save_ledger, ledger_of
-from tests.envelopes import envelope, payload
+from tests.support.envelopes import envelope, payload
 
 KEYFRAMES = (1, 2, 5, 6, 9)
 """Of run-a; 3, 4, 7 and 8 are missing."""

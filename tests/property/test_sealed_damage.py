@@ -18,7 +18,7 @@ from eventsrc.log import seal as _parts
 from eventsrc.log.format import SEALED_END
 from eventsrc.log.sealed_segment import SealedFile
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import (
+from tests.support.fixtures_log import (
     BY_HAND,
     KEY,
     envelope,
@@ -27,7 +27,7 @@ from tests.fixtures_log import (
     read_with_gaps,
     write_log,
 )
-from tests.thorough import stride
+from tests.support.thorough import stride
 
 MEMORY_DISK = Path("/dev/shm")
 EVENTS = 6

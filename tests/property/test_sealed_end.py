@@ -17,8 +17,8 @@ from eventsrc.log.format import SEALED_END
 from eventsrc.log.sealed_end import sealed_end
 from eventsrc.log.sealed_segment import SealedFile
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import envelope, read_log, write_log
-from tests.thorough import stride
+from tests.support.fixtures_log import envelope, read_log, write_log
+from tests.support.thorough import stride
 
 EACH = 4
 

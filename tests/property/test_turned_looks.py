@@ -12,7 +12,7 @@ from projections.fold.looks import LookRatios, LookScale, looks_of
 from projections.fold.spots import Spots
 from projections.fold.things import Thing
 from projections.fold.turned_looks import turned_looks
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 DIM = 48
 RATIOS = LookRatios(EvidenceConstants())

@@ -14,9 +14,9 @@ from projections.history.whatif import what_if
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.view import MapView
-from tests.envelopes import envelope
-from tests.fixtures_timetravel import walks, write_log
-from tests.thorough import examples, rounds
+from tests.support.envelopes import envelope
+from tests.support.fixtures_timetravel import walks, write_log
+from tests.support.thorough import examples, rounds
 
 BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 OTHERS = st.lists(

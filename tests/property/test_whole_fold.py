@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, resumed
-from tests.naive_map import NaiveMap
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, resumed
+from tests.support.naive_map import NaiveMap
 
 LOOKS = [[1, 0, 0], [1, 1, 0], [3, 4, 0], [0, 1, 2], [-1, 0.3, 1e-3], [1e-30, 2e-30, 0]]
 LOOKS += [[-1, 0, 0], [1, 2]]

@@ -28,10 +28,10 @@ from projections.fold.corrections import Corrections, RecordedCommand, compile_c
 from projections.fold.deltas import MergeRefused, ObjectsMerged, PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, resumed
-from tests.naive_corrected import NaiveCorrectedMap, corrected
 from tests.property.test_whole_fold import LOOKS, worlds
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, resumed
+from tests.support.naive_corrected import NaiveCorrectedMap, corrected
 
 World = tuple[dict[str, Any], list[dict[str, Any]], list[Command]]
 

@@ -24,8 +24,8 @@ from eventsrc.base.errors import LogError
 from eventsrc.log import Event, FsyncPolicy, LogReader, LogWriter, follow, recover_log, verify_log
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import BY_HAND, MEMORY_DISK
-from tests.thorough import examples
+from tests.support.fixtures_log import BY_HAND, MEMORY_DISK
+from tests.support.thorough import examples
 
 KEYS = ["tb/detections", "other/key", "mapfold/loss"]
 PAYLOADS = st.binary(max_size=40)

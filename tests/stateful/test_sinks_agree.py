@@ -40,7 +40,7 @@ from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.loader import LoaderName
 from projections.postgres.memory_sink import MemorySink, MemoryTables
-from tests.commands_in_logs import (
+from tests.support.commands_in_logs import (
     append_command,
     command,
     forget_keyframes,
@@ -48,11 +48,11 @@ from tests.commands_in_logs import (
     name_place,
     undo,
 )
-from tests.drops import wait_for_drops
-from tests.envelopes import envelope
-from tests.logs import append_raw, bridge, walk, write_log
-from tests.rows import ORDER, graph_rows, vector_rows
-from tests.thorough import THOROUGH
+from tests.support.drops import wait_for_drops
+from tests.support.envelopes import envelope
+from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.rows import ORDER, graph_rows, vector_rows
+from tests.support.thorough import THOROUGH
 
 EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8" if THOROUGH else "4"))
 PLACES = st.sampled_from(["one", "two"])

@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from eventsrc.base.errors import SpoolFull
 from eventsrc.record.robot.acks import Ack, Refusal, Refusals, payload_sha256
 from eventsrc.record.robot.spool import Refused, Spool, Spooled
-from tests.thorough import examples
+from tests.support.thorough import examples
 
 MAX_BYTES = 60
 runs = st.sampled_from(["run-a", "run-b"])

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.commands import Commands
-from tests.shared_data import ROOT
-from tests.ui_server import UiServer, showing
+from tests.support.commands import Commands
+from tests.support.shared_data import ROOT
+from tests.support.ui_server import UiServer, showing
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -18,14 +18,14 @@ from eventsrc.adapters.sim.house import occupancy_map
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import NEVER, LogWriter
-from tests.commands import Commands
-from tests.envelopes import payload
-from tests.logs import KEY, write_log
 from tests.property.test_floors import drive
+from tests.support.commands import Commands
+from tests.support.envelopes import payload
+from tests.support.logs import KEY, write_log
+from tests.support.ui_server import UiServer, showing
 from tests.ui.browser import digest, pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
-from tests.ui_server import UiServer, showing
 
 ROOMS = ("--set", "places=rooms")
 RUN_A = 445

@@ -11,12 +11,12 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from eventsrc.log import LogReader
-from tests.commands import Commands
-from tests.logs import append_raw
+from tests.support.commands import Commands
+from tests.support.logs import append_raw
+from tests.support.ui_server import UiServer, showing
 from tests.ui.browser import point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
-from tests.ui_server import UiServer, showing
 
 
 @pytest.fixture

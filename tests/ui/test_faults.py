@@ -8,11 +8,11 @@ from pathlib import Path
 from playwright.sync_api import Page, Route, expect
 
 from projections.surfaces.ui.live import MOST_STREAMS
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.logs import write_log
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import write_log
+from tests.support.ui_server import UiServer, showing
 from tests.ui.conftest import Visit
-from tests.ui_server import UiServer, showing
 
 BUSY = json.dumps({"error": {"kind": "too_much", "message": "too many questions are waiting"}})
 

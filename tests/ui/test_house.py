@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import expect
 
-from tests.commands import Commands
-from tests.shared_data import shared_run
+from tests.support.commands import Commands
+from tests.support.shared_data import shared_run
+from tests.support.ui_server import UiServer, showing
 from tests.ui.conftest import Visit
 from tests.ui.test_moments import check_digests, moment
-from tests.ui_server import UiServer, showing
 
 SETTINGS = ("--set", "eps_m=0.75", "--set", "min_samples=8", "--set", "fusion=evidence")
 House = tuple[Path, UiServer]

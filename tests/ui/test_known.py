@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.commands import Commands
+from tests.support.commands import Commands
+from tests.support.ui_server import UiServer, showing
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
-from tests.ui_server import UiServer, showing
 
 MERGE = 348
 Corrected = tuple[Path, UiServer]

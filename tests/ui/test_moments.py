@@ -14,10 +14,10 @@ from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events
 from projections.map.view import MapView
-from tests.commands import Commands
+from tests.support.commands import Commands
+from tests.support.ui_server import UiServer
 from tests.ui.browser import digest, pixels, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
-from tests.ui_server import UiServer
 
 
 def state(mapfold: Commands, at: int) -> dict[str, Any]:

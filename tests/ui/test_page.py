@@ -14,12 +14,12 @@ from playwright.sync_api import expect
 from eventsrc.envelope.commands import Anchor, NamePlace, encode_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogWriter
-from tests.commands import Commands
-from tests.envelopes import detection, envelope
-from tests.logs import append_raw, write_log
-from tests.shared_data import ROOT, shared_run
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
+from tests.support.logs import append_raw, write_log
+from tests.support.shared_data import ROOT, shared_run
+from tests.support.ui_server import UiServer, showing
 from tests.ui.conftest import ALL, SAMPLE, WIDE, Visit
-from tests.ui_server import UiServer, showing
 
 WEB = ROOT / "projections" / "surfaces" / "ui" / "web"
 STATIC = ROOT / "projections" / "surfaces" / "ui" / "static"

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.support.ui_server import UiServer
 from tests.ui.browser import digest
 from tests.ui.conftest import Visit
-from tests.ui_server import UiServer
 
 STATES = {
     "whole": "",

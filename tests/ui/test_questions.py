@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.commands import Commands
+from tests.support.commands import Commands
+from tests.support.ui_server import UiServer, showing
 from tests.ui.browser import pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
-from tests.ui_server import UiServer, showing
 
 
 def run_shown(page: Page, mapfold: Commands, *more: str) -> str:

@@ -10,7 +10,7 @@ from projections.localize.relocalize import parse_question, rank
 from projections.localize.relocalize.candidates import ExactIndex
 from projections.localize.relocalize.ranking import Method, _place_shares
 from projections.surfaces.cli.relocalize import answer_text
-from tests.envelopes import payload
+from tests.support.envelopes import payload
 from tests.unit.test_floors_in_answers import LOOKS, ask, building
 
 

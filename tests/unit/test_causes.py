@@ -18,7 +18,7 @@ from projections.history.merges import merge_document
 from projections.history.rendering import explanation_text, merge_row, merge_text
 from projections.history.same_place import explain_same_place
 from projections.store.records import Cause, cause_of
-from tests.memory_history import MemoryHistory
+from tests.support.memory_history import MemoryHistory
 
 
 def keyframe(number: int) -> list[Delta]:

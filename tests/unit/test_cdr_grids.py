@@ -17,9 +17,9 @@ from eventsrc.envelope.ingest import Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.record.append import NewMap, check_payloads
-from tests.envelopes import payload
-from tests.maps import cdr_message, drawn_map, grid_message
-from tests.thorough import examples, rounds
+from tests.support.envelopes import payload
+from tests.support.maps import cdr_message, drawn_map, grid_message
+from tests.support.thorough import examples, rounds
 
 # Made by rosbags 0.11.9, `serialize_cdr` of ROS 2 Humble's types: 3 × 2 cells of 0.05 m from
 # (1.5, -2.25) turned by -0.7 rad, in the frame "map"; one cell of 0.1 m in a frame without name; a

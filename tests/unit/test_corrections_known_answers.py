@@ -24,8 +24,8 @@ from projections.fold.errors import ImpossibleCommand
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, accepted
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, accepted
 
 HEAD = {"issued_by": "ann@lab"}
 

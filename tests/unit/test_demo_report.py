@@ -17,8 +17,8 @@ from projections.surfaces.demo.correcting import Corrected
 from projections.surfaces.demo.mapping import Folded, Part, RoomMerge, most_telling
 from projections.surfaces.demo.recording import Followed, Recorded
 from projections.surfaces.demo.report import DemoResult, type_lines
-from tests.envelopes import detection, envelope
-from tests.folds import fold
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import fold
 
 RECORDED = Recorded(
     run_id="sim-1-a",

@@ -16,7 +16,13 @@ from eventsrc.adapters.detector.finder import COCO, Finder, FinderOptions, read_
 from eventsrc.adapters.detector.onnx_model import ModelError, OnnxModel
 from eventsrc.adapters.detector.vision import Scaling, planes
 from eventsrc.base.errors import MisuseError
-from tests.tiny_models import DIMENSION, Graph, colour_detector, fixed_answer, mean_colour_encoder
+from tests.support.tiny_models import (
+    DIMENSION,
+    Graph,
+    colour_detector,
+    fixed_answer,
+    mean_colour_encoder,
+)
 
 RED, BLUE = (255, 0, 0), (0, 64, 255)
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from projections.map.digest import map_digest
 from projections.map.view import MapView
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, fold
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, fold
 
 
 def by_encoder(view: MapView) -> str:

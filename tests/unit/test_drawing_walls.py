@@ -10,9 +10,9 @@ from projections.adapters.drawing.picture import compose
 from projections.fold.deltas import MapGiven
 from projections.fold.settings import Settings
 from projections.map.view import MapView
-from tests.envelopes import envelope
-from tests.folds import fold
-from tests.maps import drawn_map
+from tests.support.envelopes import envelope
+from tests.support.folds import fold
+from tests.support.maps import drawn_map
 
 pytestmark = pytest.mark.seconds
 

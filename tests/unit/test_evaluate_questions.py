@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from eventsrc.envelope.ingest import Accepted, ingest_all
 from projections.localize.evaluate.questions import VIEW_CROPS, make_questions, make_view_questions
 from projections.localize.evaluate.truth import TrueKeyframe, Truth
-from tests.envelopes import detection, envelope, payload
+from tests.support.envelopes import detection, envelope, payload
 
 
 def _accepted(documents: list[dict[str, Any]]) -> list[Accepted]:

@@ -13,7 +13,7 @@ from projections.history.explanation import Explanation, explain_object
 from projections.history.merges import object_merge_document
 from projections.history.rendering import difference_text, explanation_text, object_merges_text
 from projections.map.view import MapView
-from tests.memory_history import MemoryHistory
+from tests.support.memory_history import MemoryHistory
 
 EVIDENCE = Settings(fusion="evidence")
 

@@ -5,8 +5,8 @@ import pytest
 
 from projections.fold.exact import to_float32
 from projections.localize.relocalize import Crop, ExactIndex
-from tests.folds import fold
-from tests.logs import walk
+from tests.support.folds import fold
+from tests.support.logs import walk
 
 
 def test_similarities_are_cosines_and_none_is_above_one() -> None:

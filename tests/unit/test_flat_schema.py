@@ -14,8 +14,8 @@ from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.log.format import schema_of
-from tests.envelopes import detection, envelope, payload
-from tests.viewers import NotRead, parse_json_schema
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.viewers import NotRead, parse_json_schema
 
 SYSTEM_KEYS = sorted(value for name, value in vars(system_events).items() if name.endswith("_KEY"))
 KEYS = ["tb/detections", "robots/7/seen", *SYSTEM_KEYS, "mapfold/of-a-later-version"]

@@ -13,7 +13,7 @@ from eventsrc.base.errors import MisuseError
 from projections.adapters.fleet.engine import RETRIES, Ended
 from projections.adapters.fleet.local_pool import LocalPool
 from projections.surfaces.cli.fleet_options import open_engine
-from tests.fleet_tasks import double, fails, killed
+from tests.support.fleet_tasks import double, fails, killed
 
 WAIT_S = 60.0
 
@@ -54,7 +54,7 @@ _PARENT = """
 import sys
 from pathlib import Path
 from projections.adapters.fleet.local_pool import LocalPool
-from tests.fleet_tasks import wait
+from tests.support.fleet_tasks import wait
 if __name__ == "__main__":
     with LocalPool(1) as pool:
         list(pool.run(wait, [Path(sys.argv[1])]))

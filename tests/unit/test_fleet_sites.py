@@ -11,8 +11,8 @@ from psycopg.conninfo import conninfo_to_dict
 from eventsrc.base.errors import MisuseError
 from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import MAX_LIST_BYTES, Site, find_sites
-from tests.envelopes import envelope
-from tests.logs import write_log
+from tests.support.envelopes import envelope
+from tests.support.logs import write_log
 
 
 def _sites(place: Path) -> tuple[list[tuple[str, Path]], list[str]]:

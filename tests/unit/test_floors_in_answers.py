@@ -9,8 +9,8 @@ from projections.localize.relocalize.candidates import ExactIndex
 from projections.localize.relocalize.ranking import Answer, Method
 from projections.map.view import MapView
 from projections.surfaces.cli.relocalize import answer_text
-from tests.envelopes import detection, envelope, payload
-from tests.folds import fold
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.folds import fold
 
 LOOKS = {
     ("ground", "chair"): [1.0, 0.0, 0.0, 0.2],

@@ -12,7 +12,7 @@ from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_event, fold_events
-from tests.envelopes import detection, envelope, payload
+from tests.support.envelopes import detection, envelope, payload
 
 
 def _event(offset: int, content: bytes, key: str = "tb/detections") -> Event:

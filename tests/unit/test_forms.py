@@ -15,7 +15,7 @@ from eventsrc.record.append import append_payload
 from eventsrc.record.importers.run import import_files
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from tests.fixtures_log import KEY, envelope, read_log
+from tests.support.fixtures_log import KEY, envelope, read_log
 
 BARE = json.dumps(
     [

@@ -9,8 +9,8 @@ import pytest
 
 from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
 from eventsrc.envelope.occupancy_map import InvalidMap
-from tests.envelopes import envelope, payload
-from tests.maps import drawn_map, grid_message
+from tests.support.envelopes import envelope, payload
+from tests.support.maps import drawn_map, grid_message
 
 MAP = drawn_map("#.? .##", 0.25, (1.5, -2.0, -0.7))
 

@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest
 from eventsrc.envelope.model import Envelope, has_evidence
-from tests.envelopes import detection, embedding, envelope, payload
+from tests.support.envelopes import detection, embedding, envelope, payload
 
 VECTOR = [0.6, 0.8, 0.0, 0.0]
 

@@ -12,8 +12,8 @@ import pytest
 from eventsrc.envelope.forms import PendingEvent, read_envelope
 from eventsrc.envelope.ingest import MAX_JSON_VALUES, Accepted, Rejected, ingest
 from eventsrc.envelope.model import MAX_DETECTIONS
-from tests.envelopes import detection, envelope, payload
-from tests.thorough import mostly_slow
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.thorough import mostly_slow
 
 CPU_S = 60
 """For all shapes together; they take about five. The slowest alone took longer before."""

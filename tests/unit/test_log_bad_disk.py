@@ -7,7 +7,7 @@ import pytest
 
 from eventsrc.base.errors import LogDamaged
 from eventsrc.log import FsyncPolicy, LogWriter, recover_log, verify_log
-from tests.fixtures_log import KEY, read_log, read_with_gaps
+from tests.support.fixtures_log import KEY, read_log, read_with_gaps
 
 BAD = range(1_500_000, 1_504_096)
 """The bytes of the segment that cannot be read: one page, in its second chunk."""

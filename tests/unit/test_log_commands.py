@@ -17,8 +17,8 @@ from projections.map.fold import fold_log
 from projections.map.log_commands import read_commands, read_corrections
 from projections.postgres.live_fold import LiveFold
 from projections.store.history_recorder import map_after
-from tests.envelopes import envelope, payload
-from tests.folds import Folded
+from tests.support.envelopes import envelope, payload
+from tests.support.folds import Folded
 
 FORGET = ForgetRun(command_id="c1", issued_by="ann@lab", run_id=RunId("b"))
 

@@ -30,8 +30,8 @@ from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.seal import SegmentPlan, seal
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import BY_HAND, KEY, read_log
-from tests.thorough import examples
+from tests.support.fixtures_log import BY_HAND, KEY, read_log
+from tests.support.thorough import examples
 
 TIMEOUT_S = 30
 FOUR = FsyncPolicy(interval_ns=10**18, max_events=4)

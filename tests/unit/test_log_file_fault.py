@@ -14,7 +14,7 @@ from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import active_segment as _active
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.format import ACTIVE, SEALED, head_of, mark_seed, schema_of, segment_path
-from tests.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
+from tests.support.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
 BEFORE = 3
 """Events recorded before the file is tampered with."""

@@ -8,7 +8,7 @@ from mcap.reader import SeekingReader
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log.durable_files import GROUP_BYTES
 from eventsrc.log.seal import CHUNK_BYTES
-from tests.fixtures_log import KEY, envelope, flip, read_log
+from tests.support.fixtures_log import KEY, envelope, flip, read_log
 
 SIZE = 8_000_000
 COUNT = 5

@@ -16,8 +16,8 @@ from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.record.importers import import_files
-from tests.fixtures_log import BY_HAND, KEY, envelope, read_log
-from tests.rewriting import DuplicateMetadata, merge
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log
+from tests.support.rewriting import DuplicateMetadata, merge
 
 MAGIC = bytes([0x89, 0x4D, 0x43, 0x41, 0x50, 0x30, 0x0D, 0x0A])
 NAME = "00000000000000000500.mcap.active"

@@ -12,7 +12,7 @@ from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogWriter, recover_log, verify_log
 from eventsrc.log.format import LOCK
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import envelope, read_log, write_log
+from tests.support.fixtures_log import envelope, read_log, write_log
 
 EACH = 2
 

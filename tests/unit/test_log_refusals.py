@@ -11,7 +11,7 @@ from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import LogReader, LogWriter, recover_log
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.mcap_records import MARK_BYTES
-from tests.fixtures_log import KEY, read_log
+from tests.support.fixtures_log import KEY, read_log
 
 NEVER_ONE_BY_ONE = FsyncPolicy(interval_ns=0, max_events=1, syncs=False)
 PAGE = bytes(4096)

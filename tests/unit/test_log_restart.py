@@ -13,7 +13,7 @@ from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.format import ACTIVE, SEALED, segment_path
-from tests.fixtures_log import BY_HAND, KEY, read_log
+from tests.support.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30
 

@@ -15,7 +15,7 @@ from eventsrc.log import seal as _seal
 from eventsrc.log import seal_worker as _sealer
 from eventsrc.log.format import ACTIVE, HEAD_BYTES, SEALED, read_head, segment_path
 from eventsrc.log.seal_worker import Sealer
-from tests.fixtures_log import KEY, flip, read_log
+from tests.support.fixtures_log import KEY, flip, read_log
 
 
 class Disk:

@@ -9,7 +9,7 @@ import pytest
 
 from eventsrc.base.errors import LogError
 from eventsrc.log import ALWAYS, LogWriter, active_segment
-from tests.fixtures_log import BY_HAND, KEY, read_log
+from tests.support.fixtures_log import BY_HAND, KEY, read_log
 
 TIMEOUT_S = 30
 

@@ -14,7 +14,7 @@ from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log.lock import is_held
 from eventsrc.log.sealed_segment import SealedFile
 from eventsrc.record.log_info import log_info
-from tests.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log, write_log
 
 ODD_PAYLOADS = [b"", b"\x00", b"\xff\xfe not utf-8", "ε🙂".encode(), b"x" * 100_000]
 

@@ -13,8 +13,8 @@ from projections.fold.settings import Settings
 from projections.localize.relocalize import Crop, ExactIndex, MapConstants
 from projections.localize.relocalize.constants import FOLLOWERS, SAMPLED, Cosines, Sample
 from projections.map.view import MapView
-from tests.folds import fold
-from tests.logs import walk
+from tests.support.folds import fold
+from tests.support.logs import walk
 
 CALIBRATED = {"camera": {"hfov_deg": 90.0, "yaw_rad": 0.5}, "evidence": {"range_m": 1.3}}
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.record.importers.map_yaml import MAX_YAML_BYTES, read_map_yaml
-from tests.maps import cells, write_map_yaml
-from tests.thorough import rounds
+from tests.support.maps import cells, write_map_yaml
+from tests.support.thorough import rounds
 
 DRAWING = """
     #####

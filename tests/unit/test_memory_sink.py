@@ -11,7 +11,7 @@ from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
 from projections.postgres.live_fold import LiveFold, batches
 from projections.postgres.memory_sink import MemorySink, MemoryTables
 from projections.postgres.sink import LiveSink, RebuildSink
-from tests.logs import bridge, walk, write_log
+from tests.support.logs import bridge, walk, write_log
 
 SETTINGS = Settings()
 

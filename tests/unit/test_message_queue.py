@@ -9,7 +9,7 @@ from eventsrc.record.recorder import queue as queue_module
 from eventsrc.record.recorder.queue import MAX_KEYS, OTHER_KEYS, MessageQueue
 from eventsrc.record.robot.acks import sent_key
 from eventsrc.record.transport.session import Received, SequenceNumber
-from tests.fixtures_zenoh import DEADLINE_S
+from tests.support.fixtures_zenoh import DEADLINE_S
 
 
 def _message(text: str, key: str = "tb/detections") -> Received:

@@ -10,9 +10,9 @@ from projections.fold.deltas import ObjectMissing, ObjectRelocated, ObjectsMerge
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.records import ObjectRecord
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, resumed
-from tests.thorough import mostly_slow
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, resumed
+from tests.support.thorough import mostly_slow
 
 SETTINGS = Settings(fusion="evidence")
 FOCAL = 320 / math.tan(math.radians(69.4 / 2))

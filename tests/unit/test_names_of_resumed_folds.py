@@ -5,8 +5,8 @@ from eventsrc.envelope.model import Offset
 from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from tests.envelopes import envelope
-from tests.folds import Folded, resumed
+from tests.support.envelopes import envelope
+from tests.support.folds import Folded, resumed
 
 
 def test_a_resumed_fold_names_a_place_that_a_later_merge_joins() -> None:

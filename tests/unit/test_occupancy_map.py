@@ -17,7 +17,7 @@ from eventsrc.envelope.occupancy_map import (
     read_map_head,
 )
 from eventsrc.envelope.system_events import MAX_MAP_SIDE
-from tests.maps import drawn_map
+from tests.support.maps import drawn_map
 
 HOUSE = drawn_map("##### #..?# #...#", 0.05, (-1.0, 2.5, 0.3), "house")
 

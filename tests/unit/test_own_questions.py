@@ -14,9 +14,9 @@ from projections.fold.settings import Settings
 from projections.localize.evaluate.questions import spread
 from projections.localize.relocalize import Candidates, Crop, ExactIndex
 from projections.map.view import MapView
-from tests.bench.truth.folding import fold_into
-from tests.envelopes import payload
-from tests.seen_rooms import drive
+from scripts.programs.bench.truth.folding import fold_into
+from tests.support.envelopes import payload
+from tests.support.seen_rooms import drive
 
 
 def _view(*runs: tuple[str, int], seed: int = 3) -> MapView:

@@ -15,8 +15,8 @@ from projections.fold.deltas import (
 )
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
-from tests.envelopes import envelope
-from tests.folds import fold
+from tests.support.envelopes import envelope
+from tests.support.folds import fold
 
 
 def test_the_second_end_makes_the_middle_core() -> None:

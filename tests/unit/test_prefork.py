@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests import prefork
-from tests.commands import Commands
+from tests.support import prefork
+from tests.support.commands import Commands
 
 pytestmark = pytest.mark.seconds  # which the process that forks takes to start
 

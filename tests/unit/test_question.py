@@ -19,7 +19,7 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.question import MAX_CROPS, MAX_VIEWS
 from projections.surfaces.serve import answering, description
-from tests.envelopes import MODEL, detection, embedding, envelope
+from tests.support.envelopes import MODEL, detection, embedding, envelope
 
 VECTOR = [3.0, 4.0, 0.0]
 

@@ -19,9 +19,9 @@ from eventsrc.record.recorder.queue import MessageQueue
 from eventsrc.record.recorder.writer_thread import WriterThread
 from eventsrc.record.robot.acks import Ack, payload_sha256
 from eventsrc.record.transport.session import Received
-from tests.envelopes import detection, envelope, payload
-from tests.fixtures_log import KEY, MEMORY_DISK, read_log
-from tests.thorough import examples
+from tests.support.envelopes import detection, envelope, payload
+from tests.support.fixtures_log import KEY, MEMORY_DISK, read_log
+from tests.support.thorough import examples
 
 DEADLINE_S = 30.0
 GROUP = 256

@@ -11,9 +11,9 @@ from projections.fold.deltas import MapGiven
 from projections.fold.occupancy import wall_blocks
 from projections.localize.relocalize import Crop, ExactIndex, rank
 from projections.localize.relocalize.walls import _AT_POSE_M, _AT_THING_M, WallMap
-from tests.envelopes import detection, envelope
-from tests.folds import fold
-from tests.maps import drawn_map
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import fold
+from tests.support.maps import drawn_map
 
 RNG = np.random.default_rng(3)
 

@@ -11,9 +11,9 @@ from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.stream import Stream
 from eventsrc.ros.transforms import compose
-from tests import ros_messages as ros
-from tests.ros_messages import OPTICAL, SECOND, START, flat
-from tests.ros_streams import (
+from tests.support import ros_messages as ros
+from tests.support.ros_messages import OPTICAL, SECOND, START, flat
+from tests.support.ros_streams import (
     BASE_TO_CAMERA,
     CUP,
     MS,

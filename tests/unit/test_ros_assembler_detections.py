@@ -11,9 +11,9 @@ from eventsrc.envelope.ingest import Accepted, Rejected, ingest
 from eventsrc.ros.assembler import Assembler, RosMessage
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.transforms import Transform
-from tests import ros_messages as ros
-from tests.ros_messages import SECOND, START, flat
-from tests.ros_streams import (
+from tests.support import ros_messages as ros
+from tests.support.ros_messages import SECOND, START, flat
+from tests.support.ros_streams import (
     CUP,
     message,
     picture,

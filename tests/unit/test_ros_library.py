@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from eventsrc.ros.library import MessageTypes, NoRosbags, Undecodable
-from tests import ros_messages as ros
-from tests.ros_messages import START, flat
+from tests.support import ros_messages as ros
+from tests.support.ros_messages import START, flat
 
 LINE = "=" * 80
 NAMES = (

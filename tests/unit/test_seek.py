@@ -9,7 +9,7 @@ from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.log import LogReader, LogWriter, Unreadable
 from eventsrc.log import seal as _parts
 from eventsrc.log.seek import resolve, resolve_start
-from tests.fixtures_log import BY_HAND, KEY, envelope, flip
+from tests.support.fixtures_log import BY_HAND, KEY, envelope, flip
 
 SECOND = 1_000_000_000
 

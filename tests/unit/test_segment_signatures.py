@@ -17,10 +17,10 @@ from eventsrc.log import (
 from eventsrc.record.append import append_payload
 from projections.map.fold import fold_log
 from projections.store.history_recorder import map_after
-from tests.envelopes import envelope, payload
-from tests.fixtures_timetravel import write_log
-from tests.history_process import RULES
 from tests.property.test_timeline_cache import kept_early
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_timetravel import write_log
+from tests.support.history_process import RULES
 
 
 def documents(first: int, last: int, step: float) -> list[dict[str, object]]:

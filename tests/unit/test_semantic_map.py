@@ -27,8 +27,8 @@ from projections.fold.objects import object_id
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, accepted, fold
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, accepted, fold
 
 
 def test_the_same_content_again_is_a_duplicate_however_it_is_written() -> None:

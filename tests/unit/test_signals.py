@@ -13,7 +13,7 @@ from projections.surfaces.cli.signals import (
     stop_on_signals,
     unwind_on_signals,
 )
-from tests import prefork
+from tests.support import prefork
 
 _HANDLER = signal.getsignal(signal.SIGINT)
 

@@ -29,7 +29,7 @@ from eventsrc.adapters.sim.pictures import (
 )
 from eventsrc.adapters.sim.tour import TruePose, drive, plan_tour
 from eventsrc.base.errors import MisuseError
-from tests.thorough import mostly_slow
+from tests.support.thorough import mostly_slow
 
 STEP_M = 0.004
 

@@ -8,8 +8,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from eventsrc.adapters.sim import detector, simulate_run, tour
-from tests.simulated import simulated
-from tests.thorough import stride
+from tests.support.simulated import simulated
+from tests.support.thorough import stride
 
 Function = Callable[..., float]
 

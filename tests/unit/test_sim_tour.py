@@ -15,7 +15,7 @@ from eventsrc.adapters.sim.tour import (
     keyframes,
     plan_tour,
 )
-from tests.thorough import mostly_slow
+from tests.support.thorough import mostly_slow
 
 pytestmark = pytest.mark.seconds
 

@@ -6,7 +6,7 @@ import pytest
 from eventsrc.adapters.sim import build_house, occupancy_map
 from eventsrc.envelope.occupancy_map import OCCUPIED, decode_map
 from projections.fold.occupancy import OccupancyGrid
-from tests.simulated import simulated
+from tests.support.simulated import simulated
 
 
 @pytest.mark.parametrize("seed", [1, 7, 12])

@@ -12,8 +12,8 @@ from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.store.state_file import MAGIC, MalformedState, pack, unpack
 from projections.store.timeline_cache import MISFITS
-from tests.envelopes import detection, envelope
-from tests.folds import Folded, state_bytes
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, state_bytes
 
 
 def _documents(count: int) -> list[dict[str, Any]]:

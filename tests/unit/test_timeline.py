@@ -11,8 +11,8 @@ from projections.fold.errors import LogPointError
 from projections.fold.settings import Settings
 from projections.history import ExpressionError, NoSuchThing, Timeline
 from projections.history.merges import merge_document
-from tests.envelopes import detection, envelope
-from tests.fixtures_timetravel import write_log
+from tests.support.envelopes import detection, envelope
+from tests.support.fixtures_timetravel import write_log
 
 CUP = detection("cup", [1.0, 0.0], det_id="the-cup")
 CUP_AGAIN = detection("cup", [1.0, 0.0], det_id="the-cup-again")

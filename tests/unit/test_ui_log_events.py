@@ -13,8 +13,8 @@ from projections.surfaces.ui.log_events import LogEvents
 from projections.surfaces.ui.log_map import LogMap
 from projections.surfaces.ui.log_prefix import PrefixReader
 from projections.surfaces.ui.opened import Opened
-from tests.envelopes import envelope, payload
-from tests.logs import walk, write_log
+from tests.support.envelopes import envelope, payload
+from tests.support.logs import walk, write_log
 
 LOSS = payload({"publisher": "p", "first": 1, "last": 3, "count": 3, "cause": "queue_full"})
 JUNK = RejectedPayload.encode("k", "no JSON", b"?")

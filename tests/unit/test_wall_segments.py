@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
 from projections.map.wall_segments import MOST_SEGMENTS, wall_segments
-from tests.thorough import stride
+from tests.support.thorough import stride
 
 
 def given(cells: np.ndarray, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyMap:

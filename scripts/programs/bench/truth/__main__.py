@@ -1,0 +1,225 @@
+"""One table: Objects with fusion=page and by evidence, side by side, against the truth.
+
+scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
+    [--moved FRACTION] [--calibrated] [--places [--walls] | --types]
+    [--limit N] [--seed N] [--set NAME=VALUE…]
+    [--worlds DIR] [--cache DIR] [--json FILE]
+scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
+
+With --localise another table: where the robot is, asked of the map of run a.
+
+A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from types import ModuleType
+
+from projections.fold.errors import SettingsError
+from projections.fold.settings import Settings
+
+from . import tables
+from .calibrating import calibrated_settings, calibration_table
+from .folding import fold_timed
+from .localising import MAPS, LocaliseRow, localise, stranger_of
+from .localising_table import localise_table
+from .moving import score_moved
+from .place_types import TypesRow, types_row, types_table
+from .places import RULES, PlacesRow, places_row, places_table
+from .scoring import score_objects
+from .walls import world_names, world_walls
+from .worlds import (
+    CACHE,
+    LIMIT,
+    QUICK_LIMIT,
+    SEED,
+    WORLDS,
+    Case,
+    NoWorldsError,
+    house_case,
+    load_generator,
+    make_case,
+    pairs,
+)
+
+
+def main() -> None:
+    """Run as the command line says."""
+    options = _options()
+    try:
+        generator = load_generator(options.worlds)
+        chosen = pairs(generator, options.half, options.world, options.profile, quick=options.quick)
+        limit = options.limit or (QUICK_LIMIT if options.quick else LIMIT)
+        if options.localise:
+            _localise(generator, chosen, options, limit)
+            return
+        cases = _cases(generator, chosen, options, limit)
+        if options.places:
+            rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
+            places = [
+                places_row(case, rules, world_walls(generator, _world(case)) if walled else None)
+                for case in cases
+                if not (walled := options.walls) or _world(case) in world_names(generator)
+            ]
+        elif options.types:
+            ruled = [RULES["rooms"].model_copy(update={"fusion": f}) for f in ("page", "evidence")]
+            by_rule = [settings.with_assignments(options.set) for settings in ruled]
+            types = [types_row(case, settings) for case in cases for settings in by_rule]
+        else:
+            rows = [_row(case, options) for case in cases]
+    except (NoWorldsError, SettingsError) as error:
+        sys.exit(str(error))
+    print(
+        f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run"
+        + (f", {options.moved:g} of the movable things moved" if options.moved else "")
+    )
+    if options.places:
+        print(places_table(places))
+        _write(options.json, places)
+        return
+    if options.types:
+        print(types_table(types))
+        _write(options.json, types)
+        return
+    if options.calibrated:
+        print(calibration_table(rows))
+    print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
+    _write(options.json, rows)
+
+
+def _world(case: Case) -> str:
+    """The building of a case; house-a, whose walls are not known, is in no generator."""
+    return case.name.rpartition(" ")[2]
+
+
+def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow]) -> None:
+    if path is not None:
+        document = [dataclasses.asdict(row) for row in rows]
+        path.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def _localise(
+    generator: ModuleType, chosen: list[tuple[str, str]], options: argparse.Namespace, limit: int
+) -> None:
+    make = functools.partial(
+        make_case, generator, limit=limit, seed=options.seed, cache=options.cache
+    )
+    rows: list[LocaliseRow] = []
+    cases = [(p, w, stranger_of(generator, options.half, w)) for p, w in chosen]
+    for profile, *worlds in cases:
+        for world in worlds:
+            make(profile, world)  # so that no two processes generate the same
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for found in pool.map(functools.partial(_localised, limit, options), cases):
+            rows += found
+    print(
+        f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run, "
+        f"every {options.every}. question of runs b and c, as many of another building"
+    )
+    print(localise_table(rows, lines=not options.brief))
+    if options.json:
+        options.json.write_text(json.dumps([row.document() for row in rows], indent=1) + "\n")
+
+
+def _localised(
+    limit: int, options: argparse.Namespace, case: tuple[str, str, str]
+) -> list[LocaliseRow]:
+    profile, world, other = case
+    generator = load_generator(options.worlds)
+    own, stranger = (
+        make_case(generator, profile, each, limit=limit, seed=options.seed, cache=options.cache)
+        for each in (world, other)
+    )
+    return localise(own, stranger, options.map, options.every)
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench_truth", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("--half", choices=("develop", "validate"), default="develop")
+    parser.add_argument("--quick", action="store_true", help="each world with one profile")
+    parser.add_argument("--world", nargs="+", default=[], metavar="W")
+    parser.add_argument("--profile", nargs="+", default=[], metavar="P")
+    parser.add_argument(
+        "--moved", type=float, default=0.0, help="share of the movable things moved after run a"
+    )
+    parser.add_argument(
+        "--calibrated", action="store_true", help="the map's own constants beside the priors"
+    )
+    parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
+    parser.add_argument(
+        "--walls", action="store_true", help="with --places: rooms with an occupancy map, too"
+    )
+    parser.add_argument("--types", action="store_true", help="types of places against room names")
+    parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
+    parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")
+    parser.add_argument("--brief", action="store_true", help="with --localise: means only")
+    parser.add_argument("--jobs", type=int, default=1, help="with --localise: processes")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"of the generator ({SEED})")
+    parser.add_argument("--limit", type=int, help=f"most keyframes a run ({LIMIT})")
+    parser.add_argument(
+        "--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the rule measured"
+    )
+    parser.add_argument("--worlds", type=Path, default=WORLDS, help="folder of make_worlds.py")
+    parser.add_argument("--cache", type=Path, default=CACHE, help="where generated runs are kept")
+    parser.add_argument("--json", type=Path, help="write the scores here too")
+    return parser.parse_args()
+
+
+def _cases(
+    generator: object, chosen: list[tuple[str, str]], options: argparse.Namespace, limit: int
+) -> Iterator[Case]:
+    for profile, world in chosen:
+        print(f"\r{profile} {world} …\033[K", end="", file=sys.stderr, flush=True)
+        yield make_case(
+            generator,
+            profile,
+            world,
+            moved=options.moved,
+            limit=limit,
+            seed=options.seed,
+            cache=options.cache,
+        )
+    print("\r\033[K", end="", file=sys.stderr, flush=True)
+    if options.moved or options.world or options.profile:
+        return
+    house = house_case()
+    if house is None:
+        print("house-a is left out: its data is absent; see MAPFOLD_SHARED_DATA", file=sys.stderr)
+    else:
+        yield house
+
+
+def _row(case: Case, options: argparse.Namespace) -> tables.Row:
+    page, page_s = fold_timed(case.events, Settings())
+    settings = Settings(fusion="evidence", camera=case.camera).with_assignments(options.set)
+    evidence, evidence_s = fold_timed(case.events, settings)
+    calibrated, calibrated_s = None, 0.0
+    if options.calibrated:
+        own, calibrated_s = calibrated_settings(case.events, settings)
+        calibrated = score_objects(fold_timed(case.events, own)[0], case.truth, case.things)
+    moved = (case.truth, case.things, case.first_run, case.looks_again)
+    return tables.Row(
+        case.name,
+        len(case.events),
+        score_objects(page, case.truth, case.things),
+        score_objects(evidence, case.truth, case.things),
+        page_s,
+        evidence_s,
+        score_moved(evidence, *moved) if options.moved else None,
+        score_moved(evidence, *moved, least_seen=2, least_looks=3) if options.moved else None,
+        calibrated,
+        calibrated_s,
+    )
+
+
+if __name__ == "__main__":
+    main()
