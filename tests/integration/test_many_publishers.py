@@ -21,7 +21,7 @@ from tests.support.thorough import mostly_slow
 
 Start = Callable[..., Program]
 KEY = "tb/detections"
-PUBLISHERS = Path(__file__).parents[1] / "many_publishers.py"
+PUBLISHERS = Path(__file__).parents[1] / "support" / "many_publishers.py"
 
 
 class Viewer:
