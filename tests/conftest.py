@@ -30,7 +30,7 @@ pytest_plugins = [
     "tests.support.fixtures_postgres",
     "tests.support.fixtures_log",
     "tests.support.fixtures_serve",
-    "tests.support.fixtures_tls",
+    "tests.support.fixtures_zenoh",
     "tests.support.fixtures_zenoh",
 ]
 

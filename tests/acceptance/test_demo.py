@@ -24,9 +24,9 @@ from projections.map.log_commands import read_corrections
 from projections.surfaces.cli.folded_log import settings_from
 from tests.docs.console import ROOT, Command, matches, read
 from tests.support.commands import Commands, Said
+from tests.support.logs import simulated
 from tests.support.prefork import folder_with_mapfold
-from tests.support.simulated import simulated
-from tests.support.ui_server import showing
+from tests.support.ui_page import showing
 
 _SPEED = 300
 _DEADLINE_S = 120.0

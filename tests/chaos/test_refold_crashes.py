@@ -14,15 +14,17 @@ from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
 from tests.support import prefork
-from tests.support.commands_in_logs import (
+from tests.support.logs import (
     append_command,
+    bridge,
     forget_keyframes,
     forget_run,
     keep_apart,
     name_place,
     undo,
+    walk,
+    write_log,
 )
-from tests.support.logs import bridge, walk, write_log
 from tests.support.rows import all_rows
 from tests.support.servers import kill_postgres, server_to_kill
 from tests.support.thorough import rounds, stride

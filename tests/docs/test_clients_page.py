@@ -22,7 +22,7 @@ from projections.surfaces.serve.listening import bind, serving
 from projections.surfaces.serve.metrics import ServiceMetrics
 from projections.surfaces.serve.states import DEFAULT_PAGE, MAX_PAGE
 from tests.docs.console import ROOT
-from tests.support.described_maps import RUN
+from tests.support.services import RUN
 
 PAGE = (ROOT / "docs" / "clients.md").read_text("utf-8")
 PLACE = f"{RUN}_p0"

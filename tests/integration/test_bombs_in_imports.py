@@ -19,9 +19,9 @@ from mcap.writer import CompressionType, Writer
 from eventsrc.envelope.system_events import EXCERPT_BYTES, RejectedPayload
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.mcap_records import MAGIC
+from tests.support.commands import MOST_MIB, run_measured
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import read_log
-from tests.support.memory import MOST_MIB, run_measured
 from tests.support.thorough import mostly_slow
 
 GIB = 2**30

@@ -26,8 +26,8 @@ from eventsrc.log.format import (
 from eventsrc.log.log_identity import common_log_id
 from eventsrc.log.mcap_records import ChunkIndex, Statistics
 from eventsrc.log.recover import TooManyLosses
+from tests.support.commands import MOST_MIB, run_measured
 from tests.support.fixtures_log import BY_HAND, KEY, envelope, flip, read_log, write_log
-from tests.support.memory import MOST_MIB, run_measured
 from tests.support.thorough import THOROUGH, mostly_slow
 
 HUGE = 20 * 2**30

@@ -14,10 +14,9 @@ from projections.localize.relocalize import candidates as candidates_module
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.queries.relocalize import CandidateReader
-from tests.support.candidates import assert_equal, view_under_commands
-from tests.support.commands_in_logs import append_command, command, forget_keyframes
 from tests.support.flickering_house import flickering_house
-from tests.support.logs import WEIRD, walk, write_log
+from tests.support.logs import WEIRD, append_command, command, forget_keyframes, walk, write_log
+from tests.support.scenes import assert_equal, view_under_commands
 from tests.support.thorough import mostly_slow, rounds
 
 MANY = 500

@@ -32,10 +32,10 @@ from eventsrc.record.transport.session import Received, Session
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from tests.support.camera_truth import truth_of
 from tests.support.commands import Commands
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
-from tests.support.tiny_models import MODEL_NAME, fixed_answer, models_for
+from tests.support.models import MODEL_NAME, fixed_answer, models_for
+from tests.support.scenes import truth_of
 
 DRIVEN_S = 14.0
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from eventsrc.adapters.sim import build_house
-from tests.support.camera_truth import truth_of
 from tests.support.commands import Commands
-from tests.support.tiny_models import models_for
+from tests.support.models import models_for
+from tests.support.scenes import truth_of
 
 
 @pytest.mark.slow

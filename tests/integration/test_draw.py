@@ -10,8 +10,7 @@ from eventsrc.log import LogWriter
 from eventsrc.record.append import append_payload
 from tests.support.commands import Commands, Said
 from tests.support.envelopes import envelope
-from tests.support.logs import write_log
-from tests.support.simulated import simulated
+from tests.support.logs import simulated, write_log
 from tests.support.thorough import mostly_slow
 
 

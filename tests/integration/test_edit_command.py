@@ -24,11 +24,10 @@ from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
 from tests.support.commands import Commands
-from tests.support.corrected_logs import EVENTS, FAR, LEFT, MERGE, RIGHT, write_rooms
 from tests.support.fixtures_log import flip, read_log
-from tests.support.fixtures_timetravel import write_damaged_log
-from tests.support.logs import walk
+from tests.support.logs import EVENTS, FAR, LEFT, MERGE, RIGHT, walk, write_rooms
 from tests.support.thorough import every_other, mostly_slow, rounds, stride
+from tests.support.walks import write_damaged_log
 
 WHY = ("--reason", "why")
 

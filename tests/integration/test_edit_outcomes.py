@@ -17,8 +17,8 @@ from eventsrc.envelope.model import KeyframeId, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogWriter
 from tests.support.commands import Commands
-from tests.support.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
 from tests.support.fixtures_log import read_log
+from tests.support.logs import EVENTS, FAR, LEFT, RIGHT, append, write_rooms
 
 WHY = ("--reason", "why")
 _OUT_OF_THE_MAP = ("correct-poses", "run-b", "--dx", "9999999.99")

@@ -13,9 +13,9 @@ from eventsrc.envelope.commands import Command, parse_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
 from tests.support.commands import Commands
-from tests.support.corrected_logs import EVENTS, FAR, LEFT, RIGHT, write_rooms
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_zenoh import Program
+from tests.support.logs import EVENTS, FAR, LEFT, RIGHT, write_rooms
 from tests.support.thorough import mostly_slow, stride
 
 Start = Callable[..., Program]

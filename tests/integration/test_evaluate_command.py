@@ -10,9 +10,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from tests.support.buildings import Building, Keyframe
+from tests.support.buildings import Building, Keyframe, drive
 from tests.support.commands import Commands
-from tests.support.drives import drive
 from tests.support.logs import write_log
 from tests.support.shared_data import shared_run_path
 from tests.support.thorough import rounds

@@ -15,9 +15,8 @@ from projections.localize.evaluate import evaluate, parallel, read_truth
 from projections.surfaces.cli.evaluate import CameraOptions, FoldSettings
 from projections.surfaces.cli.evaluate import evaluate as command
 from tests.integration.test_evaluate_command import save
-from tests.support.buildings import Building, Keyframe
+from tests.support.buildings import Building, Keyframe, drive
 from tests.support.commands import Commands
-from tests.support.drives import drive
 from tests.support.thorough import THOROUGH, rounds
 
 EVIDENCE = Settings(fusion="evidence", places="rooms")

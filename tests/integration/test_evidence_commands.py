@@ -9,8 +9,8 @@ import pytest
 
 from projections.fold.settings import Settings
 from tests.support.commands import Commands
-from tests.support.fixtures_timetravel import write_log
-from tests.support.rooms_with_things import drive
+from tests.support.evidence_drives import drive
+from tests.support.walks import write_log
 
 BY_EVIDENCE = ("--set", "fusion=evidence")
 COUNT = 80

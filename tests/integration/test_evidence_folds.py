@@ -25,11 +25,9 @@ from projections.postgres.loader import LoaderName
 from projections.store.history_recorder import map_after
 from tests.integration.test_projections import parsed
 from tests.property.test_timeline_cache import kept_early
-from tests.support.commands_in_logs import append_command, command, forget_keyframes, undo
 from tests.support.flickering_house import flickering_house
-from tests.support.live_rows import followed_and_rebuilt
-from tests.support.logs import write_log
-from tests.support.rows import all_rows, expected_graph, graph_rows
+from tests.support.logs import append_command, command, forget_keyframes, undo, write_log
+from tests.support.rows import all_rows, expected_graph, followed_and_rebuilt, graph_rows
 from tests.support.thorough import mostly_slow, rounds
 
 EVIDENCE = Settings(fusion="evidence")

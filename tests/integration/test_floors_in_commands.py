@@ -11,8 +11,7 @@ from projections.fold.settings import Settings
 from projections.history import Timeline
 from tests.property.test_floors import drive
 from tests.support.commands import Commands
-from tests.support.corrected_logs import make
-from tests.support.logs import write_log
+from tests.support.logs import make, write_log
 
 
 @pytest.fixture(scope="module")

@@ -24,11 +24,10 @@ from projections.adapters.foxglove.playback import PROTOCOL, ClientTroubles, Pas
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.settings import Settings
 from projections.map.moments import Moments
-from tests.support.commands import Commands
+from tests.support.commands import Commands, ReadyProgram
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import write_log
 from tests.support.maps import drawn_map, write_map_yaml
-from tests.support.ready_program import ReadyProgram
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")

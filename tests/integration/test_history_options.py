@@ -7,8 +7,8 @@ import pytest
 from projections.store.timeline_cache import MIN_EVENTS
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope
-from tests.support.fixtures_timetravel import write_log
 from tests.support.thorough import rounds
+from tests.support.walks import write_log
 
 ASKED = (["merges"], ["state"], ["why", "run-a_p0"], ["diff", "10"], ["bisect", "place_count > 1"])
 

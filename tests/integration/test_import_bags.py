@@ -16,8 +16,7 @@ from projections.map.fold import fold_log
 from tests.support import ros_messages as ros
 from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log
-from tests.support.imported_bags import DRIVE, envelopes, imported
-from tests.support.ros_bags import RUN, Drive, Raw, write_bag
+from tests.support.ros_bags import DRIVE, RUN, Drive, Raw, envelopes, imported, write_bag
 from tests.support.ros_messages import START, flat
 from tests.support.thorough import every_other
 

@@ -19,10 +19,9 @@ from eventsrc.envelope.system_events import (
     RejectedPayload,
 )
 from tests.support import ros_messages as ros
+from tests.support.commands import MOST_MIB, run_measured
 from tests.support.fixtures_log import read_log
-from tests.support.imported_bags import DRIVE, envelopes, imported
-from tests.support.memory import MOST_MIB, run_measured
-from tests.support.ros_bags import RUN, Raw, write_bag
+from tests.support.ros_bags import DRIVE, RUN, Raw, envelopes, imported, write_bag
 from tests.support.ros_messages import SECOND, START, flat
 
 # Hostile bags

@@ -15,7 +15,7 @@ from eventsrc.record.importers.topics import TopicChoice, looks_like_envelope
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import read_log
-from tests.support.verbatim import mixed_event
+from tests.support.logs import mixed_event
 
 ODOMETRY = {"header": {"frame_id": "odom"}, "pose": {"x": 1.0}, "timestamp": 3.0}
 BARE = [{"class_name": "cup", "confidence": 0.5, "bbox": [0, 0, 1, 1]}]

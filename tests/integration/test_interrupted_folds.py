@@ -15,10 +15,9 @@ from projections.map.digest import map_digest
 from projections.map.log_commands import read_corrections
 from projections.postgres.live_fold import LiveFold
 from tests.property.test_timeline_cache import kept_early
-from tests.support.commands_in_logs import append_command, keep_apart, name_place
-from tests.support.evidence_folds import EVIDENCE
-from tests.support.interrupts import interrupt, moments_of
-from tests.support.logs import bridge, walk, write_log
+from tests.support.commands import interrupt, moments_of
+from tests.support.evidence_drives import EVIDENCE
+from tests.support.logs import append_command, bridge, keep_apart, name_place, walk, write_log
 from tests.support.thorough import mostly_slow, rounds
 
 CLASSIC = Settings(eps_m=0.8, min_samples=3)

@@ -19,8 +19,8 @@ from projections.map.view import MapView
 from projections.store.timeline_cache import MOST_DIGESTS
 from tests.integration.test_timeline_cache_attacked import EVENTS, drive
 from tests.property.test_timeline_cache import kept_early
-from tests.support.fixtures_timetravel import write_log
-from tests.support.history_process import RULES
+from tests.support.histories import RULES
+from tests.support.walks import write_log
 
 ENDS = [1, 50, EVENTS]
 

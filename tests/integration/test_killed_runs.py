@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from projections.postgres.embedded import EmbeddedServer
-from tests.support.killed_runs import hold_run, remove_killed_runs
-from tests.support.servers import furnish
+from tests.support.servers import furnish, hold_run, remove_killed_runs
 
 
 @pytest.fixture

@@ -23,10 +23,19 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from tests.support.commands import Commands
-from tests.support.commands_in_logs import append_command, command, forget_run, keep_apart
-from tests.support.corrected_logs import EVENTS, LEFT, documents
 from tests.support.envelopes import detection, envelope, payload
-from tests.support.logs import KEY, append_raw, write_log
+from tests.support.logs import (
+    EVENTS,
+    KEY,
+    LEFT,
+    append_command,
+    append_raw,
+    command,
+    documents,
+    forget_run,
+    keep_apart,
+    write_log,
+)
 from tests.support.thorough import mostly_slow
 
 W = 24

@@ -23,8 +23,8 @@ from projections.map.fold import fold_event, fold_log
 from projections.map.view import MapView
 from scripts.programs.chaos.log_killer import LONGEST_LIFE_S, lives
 from tests.support.fixtures_log import flip
+from tests.support.logs import mixed_events
 from tests.support.thorough import THOROUGH
-from tests.support.verbatim import mixed_events
 
 SEED = 20260415
 

@@ -50,8 +50,7 @@ from scripts.programs.bench.commands import (
     undone,
     write_log,
 )
-from tests.support.commands_in_logs import command
-from tests.support.corrected_logs import write_rooms
+from tests.support.logs import command, write_rooms
 
 SAMPLE = Path("logs/sample")
 EVERY = {**KINDS, "mixed": mixed}

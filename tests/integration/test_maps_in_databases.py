@@ -24,9 +24,8 @@ from projections.postgres.queries.relocalize import CandidateReader
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY
-from tests.support.live_rows import followed_and_rebuilt
 from tests.support.maps import drawn_map
-from tests.support.rows import all_rows, map_rows
+from tests.support.rows import all_rows, followed_and_rebuilt, map_rows
 from tests.support.thorough import every_other, mostly_slow, rounds, stride
 
 ROOMS = drawn_map("########## #...#....# #...#....# #........# ##########", 1.0, (-2.0, -2.0, 0.0))

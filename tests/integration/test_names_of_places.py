@@ -25,8 +25,7 @@ from projections.postgres.queries.map_queries import (
 )
 from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
 from projections.surfaces.serve import Answerer, Pools
-from tests.support.commands_in_logs import append_command, name_place
-from tests.support.logs import walk, write_log
+from tests.support.logs import append_command, name_place, walk, write_log
 
 SETTINGS = Settings()
 NAME = 'Küche "1"'

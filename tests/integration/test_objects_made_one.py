@@ -17,11 +17,9 @@ from projections.postgres.connection import Targets
 from projections.postgres.graph_render import expected_rows
 from projections.postgres.live_fold import LiveFold, batches
 from projections.postgres.memory_sink import MemorySink, MemoryTables
-from tests.support.commands_in_logs import append_command, command
 from tests.support.envelopes import detection, envelope
-from tests.support.live_rows import followed_and_rebuilt
-from tests.support.logs import walk, write_log
-from tests.support.rows import all_rows, expected_graph, parsed
+from tests.support.logs import append_command, command, walk, write_log
+from tests.support.rows import all_rows, expected_graph, followed_and_rebuilt, parsed
 
 SETTINGS = Settings()
 

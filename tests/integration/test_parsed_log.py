@@ -25,7 +25,7 @@ from projections.map.parsing import parsed_stretches
 from tests.property.test_parsed_bytes import comparable
 from tests.support.envelopes import detection, envelope, payload
 from tests.support.fixtures_log import BY_HAND, KEY, flip
-from tests.support.random_logs import write_random_log
+from tests.support.logs import write_random_log
 from tests.support.thorough import mostly_slow, rounds
 
 COUNT = 400

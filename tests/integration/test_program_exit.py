@@ -15,8 +15,8 @@ from projections.surfaces.cli.program import EXIT_INTERRUPTED, EXIT_READER_GONE
 from tests.docs.console import ROOT
 from tests.support import prefork
 from tests.support.commands import TIMEOUT_S, Commands
-from tests.support.fixtures_timetravel import write_damaged_log, write_log
 from tests.support.logs import walk
+from tests.support.walks import write_damaged_log, write_log
 
 _CTRL_C_AT_IMPORT = """
 import _signal, sys  # nothing that loads what the program loads

@@ -21,8 +21,7 @@ from projections.surfaces.cli import COMMANDS, command_line, reading_bar, termin
 from projections.surfaces.cli.reading_bar import ReadingBar
 from projections.surfaces.cli.terminal import Bar, FileBars, output_begins
 from tests.docs.commands_page import commands
-from tests.support.commands_in_logs import append_command, name_place
-from tests.support.logs import walk, write_log
+from tests.support.logs import append_command, name_place, walk, write_log
 
 USAGE_ERROR: Any = typer.BadParameter.__base__
 Report = tuple[str, int, int, str]

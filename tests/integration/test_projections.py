@@ -17,10 +17,16 @@ from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.loader import LoaderName
-from tests.support.drops import wait_for_drops
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import WEIRD, append_raw, bridge, walk, write_log
-from tests.support.rows import all_rows, expected_graph, graph_rows, parsed, vector_rows
+from tests.support.rows import (
+    all_rows,
+    expected_graph,
+    graph_rows,
+    parsed,
+    vector_rows,
+    wait_for_drops,
+)
 from tests.support.thorough import mostly_slow
 
 SETTINGS = Settings()

@@ -16,7 +16,7 @@ from eventsrc.record.transport.session import Received, Router, Session, ZenohOp
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY
 from tests.support.fixtures_zenoh import DEADLINE_S, LOOPBACK, Program
-from tests.support.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
+from tests.support.recorders import encoded_ack, keyframe_ids, robot_at, stored_payloads
 from tests.support.thorough import rounds
 
 KEYFRAMES = rounds(6_000, 2_500)

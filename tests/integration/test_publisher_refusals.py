@@ -17,7 +17,7 @@ from eventsrc.record.transport.session import Session, ZenohOptions
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
-from tests.support.published import encoded_ack, keyframe_ids, robot_at, stored_payloads
+from tests.support.recorders import encoded_ack, keyframe_ids, robot_at, stored_payloads
 
 Sessions = Callable[[], Session]
 Start = Callable[..., Program]

@@ -15,9 +15,8 @@ from projections.postgres import RebuildProgress, rebuild, tail
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
 from projections.postgres.vector_sink import VectorShadow
-from tests.support.drops import wait_for_drops
 from tests.support.logs import bridge, walk, write_log
-from tests.support.rows import all_rows
+from tests.support.rows import all_rows, wait_for_drops
 from tests.support.thorough import THOROUGH, mostly_slow, rounds
 
 SETTINGS = Settings()

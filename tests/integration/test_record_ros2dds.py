@@ -22,7 +22,7 @@ from projections.map.fold import fold_log
 from tests.support import ros2dds
 from tests.support.fixtures_log import read_log
 from tests.support.fixtures_zenoh import LONG_LEASE
-from tests.support.ros2dds_drive import BOXES, KINDS, Sent, drive
+from tests.support.ros2dds import BOXES, KINDS, Sent, drive
 from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,

@@ -30,8 +30,8 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from tests.support.commands import Commands
-from tests.support.commands_in_logs import append_command, command
-from tests.support.crops import Encoder, add_crop, drive, jpeg, write
+from tests.support.logs import append_command, command
+from tests.support.models import Encoder, add_crop, drive, jpeg, write
 from tests.support.rows import all_rows
 from tests.support.thorough import mostly_slow, rounds
 
@@ -119,7 +119,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from eventsrc.adapters.reembedding import reembed
-from tests.support.crops import Encoder
+from tests.support.models import Encoder
 class Dies(Encoder):
     def encode(self, jpegs):
         if self.calls == int(sys.argv[2]):

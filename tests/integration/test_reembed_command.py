@@ -28,11 +28,10 @@ from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import MessageTypes
 from projections.surfaces.cli.reembed import CropModel, weight_files
 from tests.support.commands import Commands
-from tests.support.crops import FORMAT
 from tests.support.envelopes import detection, envelope
 from tests.support.fixtures_zenoh import Program
+from tests.support.models import FORMAT, fixed_answer, mean_colour_encoder
 from tests.support.thorough import examples
-from tests.support.tiny_models import fixed_answer, mean_colour_encoder
 
 WEIGHTS = "clip.onnx.data"
 NAMES = st.characters(codec="utf-8", exclude_characters="\0")

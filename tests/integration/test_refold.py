@@ -23,7 +23,7 @@ from projections.postgres.connection import Targets
 from projections.postgres.status import SinkStatus, projection_status
 from projections.surfaces.cli.db import _sink_line
 from tests.support.commands import Commands
-from tests.support.commands_in_logs import (
+from tests.support.logs import (
     append_command,
     command,
     forget_keyframes,
@@ -31,10 +31,20 @@ from tests.support.commands_in_logs import (
     keep_apart,
     name_place,
     undo,
+    walk,
+    write_log,
 )
-from tests.support.logs import walk, write_log
-from tests.support.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
-from tests.support.rows import all_rows, graph_rows, parsed
+from tests.support.rows import (
+    LOG_LENGTH,
+    SETTINGS,
+    WAIT_S,
+    all_rows,
+    fresh_rows,
+    graph_rows,
+    parsed,
+    tailing,
+    three_rooms,
+)
 from tests.support.thorough import rounds
 
 

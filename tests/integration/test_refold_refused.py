@@ -15,15 +15,24 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.statements import statements
 from projections.postgres.status import projection_status
-from tests.support.commands_in_logs import (
+from tests.support.logs import (
     append_command,
+    append_raw,
     command,
     forget_run,
     undo,
+    walk,
+    write_log,
 )
-from tests.support.logs import append_raw, walk, write_log
-from tests.support.refolds import LOG_LENGTH, SETTINGS, WAIT_S, fresh_rows, tailing, three_rooms
-from tests.support.rows import all_rows
+from tests.support.rows import (
+    LOG_LENGTH,
+    SETTINGS,
+    WAIT_S,
+    all_rows,
+    fresh_rows,
+    tailing,
+    three_rooms,
+)
 
 
 @pytest.fixture

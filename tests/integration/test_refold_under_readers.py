@@ -24,14 +24,16 @@ from tests.integration.test_rebuild_under_readers import (
     Reader,
     single_answer,
 )
-from tests.support.commands_in_logs import (
+from tests.support.logs import (
     append_command,
+    bridge,
     forget_keyframes,
     keep_apart,
     name_place,
     undo,
+    walk,
+    write_log,
 )
-from tests.support.logs import bridge, walk, write_log
 from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()

@@ -16,10 +16,10 @@ from projections.map.view import MapView
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.queries.relocalize import CandidateReader, relocalize
-from tests.support.candidates import assert_equal, found
 from tests.support.commands import Commands
 from tests.support.envelopes import detection
 from tests.support.logs import WEIRD, walk, write_log
+from tests.support.scenes import assert_equal, found
 from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()

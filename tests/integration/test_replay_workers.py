@@ -19,8 +19,7 @@ from projections.postgres.connection import Targets
 from projections.postgres.rebuild import RebuildProgress
 from tests.integration.test_parsed_log import pids
 from tests.support.fixtures_log import flip
-from tests.support.logs import append_raw, walk, write_log
-from tests.support.random_logs import write_random_log
+from tests.support.logs import append_raw, walk, write_log, write_random_log
 from tests.support.rows import all_rows
 from tests.support.thorough import THOROUGH, rounds
 

@@ -17,10 +17,9 @@ from projections.postgres.cypher import connect_for_cypher, enforces_row_securit
 from projections.postgres.grants import roles_sql
 from projections.postgres.queries.relocalize import CandidateReader
 from projections.postgres.status import projection_status
-from tests.support.drops import wait_for_drops
 from tests.support.logs import bridge, walk, write_log
 from tests.support.maps import drawn_map
-from tests.support.rows import all_rows, map_rows
+from tests.support.rows import all_rows, map_rows, wait_for_drops
 from tests.support.thorough import every_other, mostly_slow
 
 pytestmark = pytest.mark.usefixtures("server_roles")

@@ -22,7 +22,7 @@ from tests.support import ros2dds
 from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log
 from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
-from tests.support.ros2dds_drive import TF, drive
+from tests.support.ros2dds import TF, drive
 from tests.support.ros2dds_recordings import (
     announce_all,
     choice,

@@ -22,7 +22,7 @@ from projections.surfaces.cli.bridged import recording_of
 from tests.support import ros2dds
 from tests.support.fixtures_log import KEY, read_log
 from tests.support.recorders import Running
-from tests.support.ros2dds_drive import BOXES, KINDS, drive
+from tests.support.ros2dds import BOXES, KINDS, drive
 from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,

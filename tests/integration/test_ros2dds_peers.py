@@ -11,7 +11,7 @@ from eventsrc.record.transport.session import Session
 from tests.support import ros2dds
 from tests.support.fixtures_log import read_log
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
-from tests.support.ros2dds_drive import KINDS, drive
+from tests.support.ros2dds import KINDS, drive
 from tests.support.ros2dds_recordings import (
     announce_all,
     check_derived,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from eventsrc.log import LogReader
 from eventsrc.record.log_info import log_info
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 

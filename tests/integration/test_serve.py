@@ -17,9 +17,8 @@ from projections.postgres.connection import Connection, Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.answering import HEALTH_S, TokenBucket, TooMuchError
-from tests.support.commands import Commands
+from tests.support.commands import Commands, ReadyProgram
 from tests.support.logs import walk, write_log
-from tests.support.ready_program import ReadyProgram
 from tests.support.serve_questions import DEADLINE_S, ask, fetch, http_at, question
 from tests.support.servers import kill_postgres, server_to_kill
 

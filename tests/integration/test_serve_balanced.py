@@ -21,7 +21,7 @@ from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
 from tests.support.envelopes import payload
 from tests.support.logs import walk, write_log
-from tests.support.round_robin import round_robin
+from tests.support.services import round_robin
 
 pytestmark = pytest.mark.seconds
 DEADLINE_S = 30.0

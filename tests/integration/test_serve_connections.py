@@ -19,7 +19,7 @@ from starlette.types import Receive, Scope, Send
 
 from projections.surfaces.serve import connections
 from projections.surfaces.serve.listening import accept_pending, bind, serving, tls_context
-from tests.support.fixtures_tls import Certificate
+from tests.support.fixtures_zenoh import Certificate
 from tests.support.http_attacks import DEADLINE_S, answer, ask, connect, request, status
 
 LONG = 16 * 1024 * 1024

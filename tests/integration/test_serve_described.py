@@ -15,10 +15,9 @@ from pydantic import TypeAdapter
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve import Answerer, Pools, models
-from tests.support import described_maps
-from tests.support.described_maps import documents
-from tests.support.described_service import Service
+from tests.support import services as described_maps
 from tests.support.logs import write_log
+from tests.support.services import Service, documents
 
 CROPS = [crop for document in documents(4) for crop in document["detections"]]
 CLASS = {"crops": [{"class": "toilet"}]}

@@ -15,7 +15,7 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve.guard import read_origin, read_token
 from tests.support.commands import Commands
-from tests.support.fixtures_tls import Certificate
+from tests.support.fixtures_zenoh import Certificate
 from tests.support.http_attacks import answer, ask, connect, request, served, status
 from tests.support.logs import walk, write_log
 

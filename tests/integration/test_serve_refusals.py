@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 from projections.fold.errors import DatabaseError
 from projections.surfaces.serve import models
 from projections.surfaces.serve.answering import BusyError, TooMuchError
-from tests.support.described_service import FRIEND, PATHS, Service
+from tests.support.services import FRIEND, PATHS, Service
 
 REFUSED = [
     (400, "/relocalize", b"nonsense", {}),

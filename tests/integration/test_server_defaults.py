@@ -20,9 +20,8 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.grants import roles_sql
 from projections.postgres.loader import LoaderName
 from projections.postgres.status import projection_status
-from tests.support.drops import wait_for_drops
 from tests.support.logs import walk, write_log
-from tests.support.rows import all_rows
+from tests.support.rows import all_rows, wait_for_drops
 from tests.support.servers import server_to_kill
 from tests.support.thorough import mostly_slow
 

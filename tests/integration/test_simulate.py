@@ -11,7 +11,7 @@ import pytest
 from eventsrc.record.transport.session import Received, Session
 from tests.support.commands import Commands, Said
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
 
 
 def _mapfold(*arguments: str) -> Said:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_timetravel import write_log
+from tests.support.walks import write_log
 
 _LONE = ("--set", "min_samples=1", "--set", "eps_m=0.5")
 _ONES = re.compile(

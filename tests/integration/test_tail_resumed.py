@@ -19,8 +19,7 @@ from projections.postgres.connection import Targets
 from projections.postgres.live_fold import LiveFold
 from projections.store.history_recorder import map_after
 from tests.property.test_timeline_cache import kept_early
-from tests.support.commands_in_logs import append_command, name_place
-from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.logs import append_command, append_raw, bridge, name_place, walk, write_log
 from tests.support.rows import all_rows
 
 SETTINGS = Settings()

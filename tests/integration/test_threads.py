@@ -13,10 +13,9 @@ from mapfold import Map, Settings, Timeline, fold, open_log, relocalize
 
 from eventsrc.log import GROUP_COMMIT, LogReader, LogWriter
 from tests.property.test_timeline_cache import kept_early
-from tests.support.commands_in_logs import append_command, name_place
-from tests.support.evidence_folds import EVIDENCE
-from tests.support.history_answers import whole
-from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.evidence_drives import EVIDENCE
+from tests.support.histories import whole
+from tests.support.logs import append_command, append_raw, bridge, name_place, walk, write_log
 from tests.support.thorough import mostly_slow, rounds
 
 THREADS = 5

@@ -12,8 +12,8 @@ from projections.fold.semantic_map import SemanticMap
 from projections.surfaces.cli import main
 from tests.support.commands import Commands, Said
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_timetravel import write_damaged_log, write_log
 from tests.support.thorough import mostly_slow, rounds
+from tests.support.walks import write_damaged_log, write_log
 
 RULES = ("--set", "eps_m=1.0", "--set", "min_samples=3")
 XS = (0.0, 1.0, 2.0, 6.0, 5.0, 4.0, 9.0, 3.0)

@@ -25,10 +25,9 @@ from projections.store.timeline_cache import TimelineCache
 from tests.property.test_timeline_cache import kept_early
 from tests.support import prefork
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_timetravel import VECTORS, write_log
-from tests.support.history_answers import expected, told
-from tests.support.history_process import RULES, answers
+from tests.support.histories import RULES, answers, expected, told
 from tests.support.thorough import rounds
+from tests.support.walks import VECTORS, write_log
 
 EVENTS = 240
 
@@ -67,7 +66,7 @@ def kept(log: Path) -> list[Path]:
 
 def run(log: Path, *how: str) -> "subprocess.CompletedProcess[bytes]":
     return prefork.run(
-        "tests.support.history_process:main",
+        "tests.support.histories:main",
         ["history", str(log), *how],
         env=os.environ,
         cwd=Path.cwd(),

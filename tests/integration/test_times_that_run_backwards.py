@@ -10,8 +10,8 @@ import projections.surfaces.cli
 from projections.postgres.connection import Targets
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_timetravel import write_log
 from tests.support.thorough import mostly_slow
+from tests.support.walks import write_log
 
 THEN = "2026-03-24T13:00:02Z"
 """The second keyframe of the run that was imported last; three of a later time lie before it."""

@@ -14,8 +14,7 @@ from tests.support.commands import Commands
 from tests.support.logs import write_log
 from tests.support.shared_data import ROOT, shared_run
 from tests.support.thorough import rounds
-from tests.support.ui_client import read_arrays, replay
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, read_arrays, replay, showing
 
 WIDE = ("eps_m=1.0", "min_samples=8")
 SETS = [word for text in WIDE for word in ("--set", text)]

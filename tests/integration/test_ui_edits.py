@@ -10,7 +10,7 @@ from eventsrc.log import LogWriter
 from tests.support.commands import Commands
 from tests.support.logs import bridge, walk, write_log
 from tests.support.thorough import every_other
-from tests.support.ui_server import UiServer, digest, showing
+from tests.support.ui_page import UiServer, digest, showing
 
 
 @pytest.fixture

@@ -17,8 +17,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.http_attacks import answer, request, status
 from tests.support.logs import append_raw, walk, write_log
-from tests.support.ui_client import read_arrays
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, read_arrays, showing
 
 CSP = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none';"

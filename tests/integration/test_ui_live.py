@@ -12,8 +12,7 @@ from tests.support.http_attacks import connect, request
 from tests.support.logs import append_raw, bridge, walk, write_log
 from tests.support.shared_data import ROOT
 from tests.support.thorough import rounds
-from tests.support.ui_client import read_arrays, replay
-from tests.support.ui_server import UiServer, digest, showing, until
+from tests.support.ui_page import UiServer, digest, read_arrays, replay, showing, until
 
 
 class TestGrowing:

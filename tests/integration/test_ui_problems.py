@@ -14,8 +14,7 @@ from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import BY_HAND, KEY, flip
 from tests.support.logs import append_raw, walk, write_log
 from tests.support.thorough import mostly_slow
-from tests.support.ui_client import read_arrays, replay
-from tests.support.ui_server import UiServer, digest, showing, until
+from tests.support.ui_page import UiServer, digest, read_arrays, replay, showing, until
 
 
 def problems(server: UiServer) -> list[str]:

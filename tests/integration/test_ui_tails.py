@@ -7,7 +7,7 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from tests.support.commands import Commands
 from tests.support.logs import walk, write_log
-from tests.support.ui_server import showing
+from tests.support.ui_page import showing
 
 
 def test_the_lag_of_a_database(tmp_path: Path, one_database: Targets) -> None:

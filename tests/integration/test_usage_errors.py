@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from tests.support.commands import Commands
-from tests.support.fixtures_timetravel import write_log
 from tests.support.hostile_options import hostile_lines, prepared
 from tests.support.logs import walk
 from tests.support.thorough import rounds
+from tests.support.walks import write_log
 
 
 @pytest.fixture

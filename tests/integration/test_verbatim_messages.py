@@ -32,8 +32,8 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from tests.support.commands import Commands
 from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log
+from tests.support.logs import BOXES, JPEG, TF, mixed_event, mixed_events
 from tests.support.thorough import rounds
-from tests.support.verbatim import BOXES, JPEG, TF, mixed_event, mixed_events
 
 COUNT = 240
 

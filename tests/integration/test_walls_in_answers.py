@@ -33,10 +33,10 @@ from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.guard import Guard
 from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
-from tests.support.candidates import assert_equal
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
+from tests.support.scenes import assert_equal
 from tests.support.thorough import rounds
 
 WAIT_S = 60.0

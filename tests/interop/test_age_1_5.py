@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.debian_postgres import NoDebianPackages, debian_server
+from tests.support.servers import NoDebianPackages, debian_server
 
 TESTS = Path(__file__).resolve().parents[1] / "integration"
 MODULES = (

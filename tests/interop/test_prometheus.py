@@ -13,7 +13,7 @@ from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
 from tests.integration.test_metrics import REPORT
-from tests.support.described_maps import build
+from tests.support.services import build
 
 pytestmark = pytest.mark.slow
 

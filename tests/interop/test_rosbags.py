@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
 from tests.support.logs import walk, write_log
-from tests.support.ros2dds_drive import KINDS, drive
+from tests.support.ros2dds import KINDS, drive
 from tests.support.ros_messages import TYPES
 
 pytestmark = pytest.mark.slow

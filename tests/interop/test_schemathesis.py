@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from projections.postgres.connection import Targets
-from tests.support.described_maps import MODEL
 from tests.support.http_attacks import served
+from tests.support.services import MODEL
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
 from tests.property.test_places_are_dbscan import EPS_UM, Point
 from tests.support.folds import near_matrix
-from tests.support.naive_constrained import NaiveConstrainedPlaces
+from tests.support.naive_places import NaiveConstrainedPlaces
 from tests.support.thorough import rounds
 
 Statements = list[tuple[tuple[int, int], bool]]

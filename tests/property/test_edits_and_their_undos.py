@@ -23,7 +23,7 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
 from projections.map.view import MapView
-from tests.support.corrected_logs import EVENTS, FAR, LEFT, RIGHT, append, make, write_rooms
+from tests.support.logs import EVENTS, FAR, LEFT, RIGHT, append, make, write_rooms
 from tests.support.thorough import examples
 
 PLACES = st.sampled_from([LEFT, RIGHT, FAR, "run-a:3", "run-a:12", "run-b:4", "run-a:24"])

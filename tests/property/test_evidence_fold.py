@@ -21,13 +21,21 @@ from projections.map.export import state_document
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from tests.property.test_kept_folds import _plain
-from tests.support.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
-from tests.support.fixtures_timetravel import write_log
+from tests.support.evidence_drives import (
+    EVIDENCE,
+    SLOW,
+    check_recounts,
+    compiled,
+    det_ids,
+    drive,
+    drives,
+    long_drive,
+)
 from tests.support.folds import Folded, resumed, state_bytes
+from tests.support.histories import view_at
 from tests.support.memory_history import MemoryHistory
-from tests.support.past_view import view_at
-from tests.support.rooms_with_things import drive, drives, long_drive
 from tests.support.thorough import mostly_slow
+from tests.support.walks import write_log
 
 
 def check_order(deltas: list[d.Delta]) -> None:

@@ -20,9 +20,8 @@ from projections.fold import deltas as d
 from projections.fold.exact import metres_to_um
 from projections.map.export import state_document
 from projections.map.view import MapView
-from tests.support.evidence_folds import EVIDENCE, SLOW, check_recounts, compiled, det_ids
+from tests.support.evidence_drives import EVIDENCE, SLOW, check_recounts, compiled, det_ids, drives
 from tests.support.folds import Folded
-from tests.support.rooms_with_things import drives
 
 TURNS = [(0.5, -1.0, 0.0), (0.0, 0.0, 0.3), (2.0, 1.0, 3.0)]
 

@@ -22,8 +22,8 @@ from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
 from projections.map.records import Estimate, ObjectRecord, Relocation
 from projections.map.view import MapView
+from tests.support.histories import view_at
 from tests.support.memory_history import MemoryHistory
-from tests.support.past_view import view_at
 from tests.support.synthetic_objects import STEPS, Step, SyntheticDeltas, random_steps
 
 EVIDENCE = Settings(fusion="evidence")

@@ -14,7 +14,7 @@ from projections.map.digest import map_digest
 from projections.map.view import MapView
 from tests.property.test_whole_fold import worlds
 from tests.support.envelopes import detection, envelope
-from tests.support.evidence_folds import recounted_votes
+from tests.support.evidence_drives import drives, recounted_votes
 from tests.support.folds import (
     Folded,
     fold,
@@ -25,7 +25,6 @@ from tests.support.folds import (
 )
 from tests.support.memory_history import MemoryHistory
 from tests.support.naive_map import NaiveMap, micrometres
-from tests.support.rooms_with_things import drives
 
 FLOORS: list[dict[str, Any]] = [
     {},

@@ -12,9 +12,8 @@ from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from tests.property.test_floors import buildings, drive
-from tests.support.live_rows import followed_and_rebuilt
 from tests.support.logs import write_log
-from tests.support.rows import expected_graph, memory_rows
+from tests.support.rows import expected_graph, followed_and_rebuilt, memory_rows
 
 
 @given(building=buildings(), size=st.integers(1, 9))

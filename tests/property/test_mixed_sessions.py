@@ -6,9 +6,8 @@ from functools import cache
 import pytest
 
 from projections.localize.relocalize import Answer, rank
-from tests.support.buildings import Building, Keyframe
-from tests.support.drives import drive
-from tests.support.rooms import RoomMap, crops_of
+from tests.support.buildings import Building, Keyframe, drive
+from tests.support.scenes import RoomMap, crops_of
 from tests.support.thorough import mostly_slow
 
 SEEDS = (20, 21, 22)

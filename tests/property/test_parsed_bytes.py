@@ -16,7 +16,7 @@ from projections.fold.folded_ids import content_digest
 from projections.map.parsed_bytes import NoRoom, pack, unpack
 from projections.map.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from tests.support.envelopes import fields_of
-from tests.support.random_logs import write_random_log
+from tests.support.logs import write_random_log
 from tests.support.thorough import examples
 
 ROOM = 1 << 20

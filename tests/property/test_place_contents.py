@@ -12,9 +12,9 @@ from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.map.view import MapView
 from tests.property.test_floors import buildings
+from tests.support.evidence_drives import drives
 from tests.support.folds import Folded
 from tests.support.logs import write_log
-from tests.support.rooms_with_things import drives
 from tests.support.rows import recounted_contents
 
 

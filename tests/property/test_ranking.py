@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.localize.relocalize import Answer, Candidates, Crop, rank
-from tests.support.buildings import Building, Keyframe
-from tests.support.drives import drive
-from tests.support.rooms import RoomMap, crops_of
+from tests.support.buildings import Building, Keyframe, drive
+from tests.support.scenes import RoomMap, crops_of
 from tests.support.thorough import examples, mostly_slow
 
 SEEDS = (20, 21)

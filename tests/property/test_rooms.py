@@ -18,7 +18,7 @@ from projections.fold.deltas import (
 from projections.fold.pair_groups import ApartPairs, PairGroups, without_contradictions
 from projections.fold.place_members import PosedKeyframe
 from projections.fold.rooms import Rooms
-from tests.support.naive_rooms import NaiveRooms
+from tests.support.naive_places import NaiveRooms
 from tests.support.thorough import stride
 
 CELL_UM, DRIVE_UM = 750, 4000

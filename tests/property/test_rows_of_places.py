@@ -13,8 +13,8 @@ from projections.postgres.memory_sink import MemoryTables
 from tests.property.test_rows_of_evidence import followed, rebuilt
 from tests.property.test_whole_fold_corrected import World, compiled, corrected_worlds
 from tests.support.envelopes import envelope
-from tests.support.fixtures_corrections import anchor
 from tests.support.folds import Folded
+from tests.support.walks import anchor
 
 ROOMS = {"places": "rooms", "rooms": {"cell_m": 0.25, "drive_m": 0.75}}
 

@@ -23,8 +23,8 @@ from projections.map.export import state_document
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.store.records import Merge
-from tests.support.fixtures_timetravel import walks, write_log
 from tests.support.thorough import examples
+from tests.support.walks import walks, write_log
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 slow = settings(

@@ -19,13 +19,12 @@ from eventsrc.log import LogWriter, parse_fsync
 from eventsrc.record.append import append_payload
 from projections.fold.settings import Settings
 from projections.history import Timeline
-from tests.support.commands_in_logs import append_to
 from tests.support.envelopes import envelope, payload
-from tests.support.fixtures_corrections import corrected_walks
-from tests.support.fixtures_timetravel import walks
-from tests.support.history_answers import expected, told
-from tests.support.rooms_with_things import drives
+from tests.support.evidence_drives import drives
+from tests.support.histories import expected, told
+from tests.support.logs import append_to
 from tests.support.thorough import examples
+from tests.support.walks import corrected_walks, walks
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 EVIDENCE = Settings(fusion="evidence", eps_m=0.7, min_samples=3)

@@ -23,10 +23,10 @@ from projections.map.export import state_document
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_commands, read_corrections
 from projections.map.view import MapView
-from tests.support.commands_in_logs import forget_keyframes, undo
 from tests.support.envelopes import envelope
-from tests.support.fixtures_corrections import anchor, corrected_walks, write_mixed_log
+from tests.support.logs import forget_keyframes, undo
 from tests.support.thorough import rounds
+from tests.support.walks import anchor, corrected_walks, write_mixed_log
 
 RULES = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)
 Items = list[dict[str, Any] | Command]

@@ -22,9 +22,8 @@ from projections.localize.relocalize.floors import Hypotheses
 from projections.localize.relocalize.question import MAX_CROPS, Movement
 from projections.localize.relocalize.reading import MAX_MOVED_M, MAX_TURNED_RAD
 from projections.localize.relocalize.track import PARTICLES, _resampled
-from tests.support.buildings import Building, Keyframe
-from tests.support.drives import drive
-from tests.support.rooms import RoomMap, crops_of
+from tests.support.buildings import Building, Keyframe, drive
+from tests.support.scenes import RoomMap, crops_of
 from tests.support.thorough import examples, mostly_slow
 
 STILL = (0.0, 0.0, 0.0)

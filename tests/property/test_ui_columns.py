@@ -22,10 +22,10 @@ from projections.surfaces.ui.binary import packed_arrays
 from projections.surfaces.ui.columns import history_columns
 from projections.surfaces.ui.log_map import LogMap
 from projections.surfaces.ui.opened import Opened
-from tests.support.fixtures_corrections import corrected_walks, write_mixed_log
 from tests.support.logs import write_log
 from tests.support.thorough import rounds
-from tests.support.ui_client import ReplayedMap, as_float32, read_arrays, replay
+from tests.support.ui_page import ReplayedMap, as_float32, read_arrays, replay
+from tests.support.walks import corrected_walks, write_mixed_log
 from tests.unit.test_moved_things import ROOM, run
 
 PAGE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=1.0)

@@ -15,8 +15,8 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from tests.support.envelopes import envelope
-from tests.support.fixtures_timetravel import walks, write_log
 from tests.support.thorough import examples, rounds
+from tests.support.walks import walks, write_log
 
 BASE = Settings(eps_m=0.7, min_samples=3, fusion_radius_m=2.0)
 OTHERS = st.lists(

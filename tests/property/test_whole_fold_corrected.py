@@ -31,7 +31,7 @@ from projections.map.digest import map_digest
 from tests.property.test_whole_fold import LOOKS, worlds
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import Folded, resumed
-from tests.support.naive_corrected import NaiveCorrectedMap, corrected
+from tests.support.naive_map import NaiveCorrectedMap, corrected
 
 World = tuple[dict[str, Any], list[dict[str, Any]], list[Command]]
 

@@ -40,18 +40,20 @@ from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.loader import LoaderName
 from projections.postgres.memory_sink import MemorySink, MemoryTables
-from tests.support.commands_in_logs import (
+from tests.support.envelopes import envelope
+from tests.support.logs import (
     append_command,
+    append_raw,
+    bridge,
     command,
     forget_keyframes,
     keep_apart,
     name_place,
     undo,
+    walk,
+    write_log,
 )
-from tests.support.drops import wait_for_drops
-from tests.support.envelopes import envelope
-from tests.support.logs import append_raw, bridge, walk, write_log
-from tests.support.rows import ORDER, graph_rows, vector_rows
+from tests.support.rows import ORDER, graph_rows, vector_rows, wait_for_drops
 from tests.support.thorough import THOROUGH
 
 EXAMPLES = int(os.environ.get("MAPFOLD_STATEFUL_EXAMPLES", "8" if THOROUGH else "4"))

@@ -130,7 +130,7 @@ def raw_samples(reader: DataReader) -> list[bytes]:
 
 def main() -> None:
     """Write a drive, and keep it for readers until the process is killed."""
-    from tests.support.ros2dds_drive import KINDS, drive
+    from tests.support.ros2dds import KINDS, drive
 
     with participant(sys.argv[1]) as own:
         writers = {name: DataWriter(own, topic(own, name, KINDS[name]), qos=QOS) for name in KINDS}

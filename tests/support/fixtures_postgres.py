@@ -15,8 +15,7 @@ from psycopg import sql
 
 from projections.postgres.connection import Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
-from tests.support.killed_runs import hold_run, remove_killed_runs
-from tests.support.servers import CARELESS, MEMORY_DISK, RUN_HOME
+from tests.support.servers import CARELESS, MEMORY_DISK, RUN_HOME, hold_run, remove_killed_runs
 from tests.support.thorough import mostly_slow
 
 _TEMPLATE = "mapfold_test_template"

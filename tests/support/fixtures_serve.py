@@ -9,11 +9,11 @@ from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.serve import Answerer, FairQueue, Pools
-from tests.support.described_maps import build
 from tests.support.logs import walk, write_log
+from tests.support.services import build
 
 if TYPE_CHECKING:
-    from tests.support.described_service import Service
+    from tests.support.services import Service
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def described_map(tmp_path_factory: pytest.TempPathFactory, module_database: Tar
 @pytest.fixture(scope="module")
 def service(described_map: Targets) -> Iterator["Service"]:
     """Answers about `described_map`."""
-    from tests.support.described_service import serving_twice  # imports fastapi
+    from tests.support.services import serving_twice  # imports fastapi
 
     with serving_twice(described_map) as service:
         yield service

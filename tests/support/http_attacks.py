@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.support import prefork
-from tests.support.ready_program import ReadyProgram
+from tests.support.commands import ReadyProgram
 
 DEADLINE_S = 30.0
 

@@ -17,10 +17,8 @@ from typing import Any
 import numpy as np
 
 from projections.localize.relocalize import Answer, Candidates, Question, View, rank
-from tests.support.buildings import Building, Keyframe
-from tests.support.drives import drive
-from tests.support.rooms import RoomMap, crops_of
-from tests.support.scenes import Scene, Thing, around, movement
+from tests.support.buildings import Building, Keyframe, drive
+from tests.support.scenes import RoomMap, Scene, Thing, around, crops_of, movement
 
 FILE = Path(__file__).with_name("recorded_answers.json")
 

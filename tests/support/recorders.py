@@ -1,5 +1,9 @@
-"""A recorder at work beside a test."""
+"""A recorder at work beside a test.
 
+Acknowledgements as a recorder sends them, and what of a robot is in a log.
+"""
+
+import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +14,9 @@ from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import ledger_of
 from eventsrc.record.recorder import Recorder, RecorderReport
-from eventsrc.record.transport.session import Session
+from eventsrc.record.robot.acks import Ack, payload_sha256
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Session, ZenohOptions
 from tests.support.fixtures_log import KEY
 from tests.support.fixtures_zenoh import DEADLINE_S
 
@@ -59,3 +65,27 @@ def recording(
         finally:
             running._stop.set()
             running._thread.shutdown()
+
+
+def robot_at(endpoint: str, folder: Path) -> EnvelopePublisher:
+    """A publisher that sends again soon."""
+    return EnvelopePublisher(
+        ZenohOptions(connect=(endpoint,)), folder / "spool", resend_after_s=0.2
+    )
+
+
+def encoded_ack(*payloads: bytes, key: str = KEY) -> bytes:
+    """A recorder's acknowledgement of these."""
+    digests = tuple(map(payload_sha256, payloads))
+    return Ack(run_id="run-a", key=key, log_id="log", sha256=digests).encode()
+
+
+def stored_payloads(log: Path) -> list[bytes]:
+    """Envelopes in a log."""
+    with LogReader(log) as reader:
+        return [event.payload for event in reader.read(keys={KEY})]
+
+
+def keyframe_ids(log: Path) -> set[int]:
+    """Ids of the keyframes in a log."""
+    return {json.loads(p)["keyframe_id"] for p in stored_payloads(log)}

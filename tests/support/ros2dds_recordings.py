@@ -24,7 +24,7 @@ from tests.support import ros2dds
 from tests.support.fixtures_log import read_log
 from tests.support.fixtures_zenoh import DEADLINE_S
 from tests.support.recorders import Running
-from tests.support.ros2dds_drive import KINDS, LATCHED, Sent
+from tests.support.ros2dds import KINDS, LATCHED, Sent
 from tests.support.ros_messages import (
     START,
     TYPES,

@@ -1,4 +1,7 @@
-"""Bags written by rosbags, and the same detections as JSON lines."""
+"""Bags written by rosbags, and the same detections as JSON lines.
+
+A drive as bags, bags imported, and the envelopes in a log.
+"""
 
 import json
 import math
@@ -9,8 +12,11 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+from eventsrc.log import LogWriter
+from eventsrc.record.importers import BagOptions, ImportReport, import_files
 from eventsrc.ros.transforms import Transform
 from tests.support import ros_messages as ros
+from tests.support.fixtures_log import read_log
 from tests.support.ros_messages import OPTICAL, SECOND, START, TYPES, flat
 
 Recorded = tuple[str, int, Any]
@@ -161,3 +167,17 @@ class Drive:
 
 
 __all__ = ["Drive", "Raw", "Recorded", "Transform", "write_bag"]
+
+
+DRIVE = Drive(40)
+
+
+def imported(log: Path, *names: Path, **options: Any) -> ImportReport:
+    """Import into a log."""
+    with LogWriter(log) as writer:
+        return import_files(writer, [*map(str, names)], bags=BagOptions(**options))
+
+
+def envelopes(log: Path) -> list[Any]:
+    """The JSON of a log's envelopes."""
+    return [json.loads(e.payload) for e in read_log(log) if not e.key.startswith("mapfold/")]

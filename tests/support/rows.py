@@ -2,20 +2,40 @@
 
 `expected_graph` is written for being obviously right, not fast, and shares nothing with the sinks
 but the label numbering that docs/projections.md promises.
+
+Rows of a log that is followed batch by batch, beside those of a rebuild, in memory.
+
+A log to refold, a live tail beside a test, and the rows that a refold must leave.
+
+Wait until the server has dropped what rebuilds replaced.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import psycopg
 from psycopg import sql
 
+from eventsrc.envelope.model import FIRST_OFFSET
+from eventsrc.log import LogReader
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.exact import Q40
 from projections.fold.place_types import place_type
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
 from projections.map.view import MapView
-from projections.postgres.connection import Targets
-from projections.postgres.memory_sink import MemoryTables
+from projections.postgres import TailProgress, TailReport, rebuild, tail
+from projections.postgres.connection import Targets, connect
+from projections.postgres.live_fold import LiveFold, batches
+from projections.postgres.memory_sink import MemorySink, MemoryTables
+from projections.postgres.replaced_tables import wait_for_drop
+from tests.support.logs import bridge, walk, write_log
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",
@@ -210,3 +230,69 @@ def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> No
         if obj.place is not None:
             ends = gid("Object", n), gid("Place", obj.place + 1)
             rows["LOCATED_IN"].append((gid("LOCATED_IN", n), *ends, {}))
+
+
+def followed_and_rebuilt(
+    log: Path, settings: Settings, size: int, corrections: Corrections = NO_CORRECTIONS
+) -> tuple[MemoryTables, MemoryTables]:
+    """The tables of a tail and those of a rebuild, both in batches of ``size`` events."""
+    live, fresh = MemoryTables(), MemoryTables()
+    following, folding = (LiveFold(settings, corrections=corrections) for _ in range(2))
+    sink, shadow = MemorySink(), MemorySink().shadow()
+    with LogReader(log) as reader:
+        for batch in batches(reader.read(FIRST_OFFSET), size):
+            assert not any(following.feed(batch))
+            sink.prepare(following.tracker.drain(), following.view).send(live)
+            assert not any(folding.feed(batch))
+            shadow.load(folding.tracker.drain(), folding.view)(fresh)
+    shadow.finish(folding.view)(fresh)
+    shadow.swap_in(fresh)
+    return live, fresh
+
+
+SETTINGS = Settings()
+WAIT_S = 60.0
+LOG_LENGTH = 120
+
+
+def three_rooms(folder: Path) -> Path:
+    """A log of three rooms that the run b joins into one place, and a third run."""
+    documents = walk(60) + list(bridge()) + walk(40, seed=3, run_id="run-c")
+    return write_log(folder / "log", documents)
+
+
+def fresh_rows(log: Path, targets: Targets, **options: Any) -> Any:
+    """The rows of a replay, which must also be those that the view of a plain fold asks for."""
+    rebuild(log, targets, SETTINGS, **options)
+    with LogReader(log) as reader:
+        corrections = read_corrections(reader)
+        _, view = fold_log(reader, SETTINGS, corrections=corrections)
+    found = all_rows(targets)
+    assert parsed(found[0]) == expected_graph(view)
+    return found
+
+
+@contextmanager
+def tailing(
+    log: Path, targets: Targets, **options: Any
+) -> Iterator[tuple[TailProgress, "Future[TailReport]"]]:
+    """A live tail in a thread, stopped at the end."""
+    progress, stop = TailProgress(), threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(
+            tail, log, targets, options.pop("settings", SETTINGS), stop=stop, progress=progress,
+            **options,
+        )  # fmt: skip
+        try:
+            yield progress, running
+        finally:
+            stop.set()
+            running.result(WAIT_S)
+
+
+def wait_for_drops(targets: Targets) -> None:
+    """Wait until the sessions that drop have ended, in all databases of the target."""
+    for url in {targets.graph_url, targets.vector_url}:
+        with connect(url) as connection:
+            wait_for_drop(connection, "graph")
+            wait_for_drop(connection, "vectors")

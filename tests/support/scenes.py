@@ -2,19 +2,35 @@
 
 No embeddings: a match's cosine is made from whether it shows the same thing and from the change of
 side, as `projections.fold.evidence` describes it.
+
+Candidates of the databases beside those of exact search, for tests.
+
+Candidates whose Places are the true rooms, so that ranking is tested without clustering.
+
+Which thing each detection on a drawn picture shows, from what the picture truly shows.
 """
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
+from eventsrc.log import LogReader
 from projections.fold.evidence import EvidenceConstants
+from projections.fold.exact import quantise, to_float32
+from projections.fold.semantic_map import SemanticMap
+from projections.fold.settings import Settings
 from projections.localize.relocalize import (
     Camera,
+    CandidatePlace,
     Candidates,
     Crop,
+    ExactIndex,
     MapConstants,
     Match,
     ObjectEstimate,
@@ -22,6 +38,10 @@ from projections.localize.relocalize import (
     View,
 )
 from projections.localize.relocalize.question import Box
+from projections.map.fold import fold_log
+from projections.map.log_commands import read_corrections
+from projections.map.view import MapView
+from tests.support.buildings import Keyframe
 
 Pose = tuple[float, float, float]
 EVIDENCE = EvidenceConstants(range_m=2.5)
@@ -149,3 +169,132 @@ def around(thing: Thing, count: int, far_m: float = 2.0, start: float = 0.0) -> 
     return [
         (thing.x + far_m * math.cos(a), thing.y + far_m * math.sin(a), a + math.pi) for a in angles
     ]
+
+
+def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
+    """All that matches say but their similarity, in the order of the fold."""
+    return [
+        [
+            (
+                m.det_id,
+                m.run_id,
+                m.pose,
+                m.bbox,
+                m.class_name,
+                m.object_id,
+                m.object_place,
+                m.keyframe_place,
+                m.object_estimate,
+            )
+            for m in sorted(row, key=lambda m: m.observation)
+        ]
+        for row in candidates.matches
+    ]
+
+
+def assert_equal(live: Candidates, exact: Candidates) -> None:
+    """Both have the same matches, places and constants; cosines but for rounding."""
+    assert found(live) == found(exact)
+    assert live.constants == exact.constants
+    for ours, theirs in zip(live.matches, exact.matches, strict=True):
+        assert [m.similarity for m in ours] == pytest.approx(
+            [m.similarity for m in theirs], abs=1e-5
+        )
+        for match in theirs:
+            for place in {match.object_place, match.keyframe_place} - {None}:
+                assert live.places[place] == exact.places[place]  # type: ignore[index]
+
+
+def view_under_commands(log: Path) -> MapView:
+    """The map of a log with the settings of its commands."""
+    with LogReader(log) as reader:
+        corrections = read_corrections(reader)
+        return fold_log(reader, corrections.settings or Settings(), corrections=corrections)[1]
+
+
+def fold(run: Sequence[Keyframe], **settings: float) -> MapView:
+    """The map of a run."""
+    chosen = Settings.model_validate({"eps_m": 1.0, **settings})
+    semantic_map, view = SemanticMap(chosen), MapView(chosen)
+    for offset, keyframe in enumerate(run):
+        view.apply_event(offset, semantic_map.fold(offset, keyframe.accepted))
+    return view
+
+
+def crops_of(keyframe: Keyframe, *, boxes: bool = True) -> list[Crop]:
+    """A keyframe's detections as crops."""
+    return [
+        Crop(
+            to_float32(quantise(vector)),
+            detection.bbox if boxes else None,
+            detection.class_name,
+            det_id,
+        )
+        for vector, detection, det_id in zip(
+            keyframe.accepted.vectors,
+            keyframe.accepted.envelope.detections,
+            keyframe.accepted.det_ids,
+            strict=True,
+        )
+        if vector is not None
+    ]
+
+
+class RoomMap:
+    """A mapped run, searched exactly, with the rooms as Places."""
+
+    def __init__(self, run: Sequence[Keyframe]) -> None:
+        self.run = run
+        self.view = fold(run)
+        self._index = ExactIndex(self.view)
+        self.rooms = sorted({keyframe.room for keyframe in run})
+        self._places = {i: CandidatePlace(room, float(i), 0.0) for i, room in enumerate(self.rooms)}
+
+    def search(self, crops: Sequence[Crop]) -> Candidates:
+        """As `ExactIndex.search`, each match in the room its keyframe is in."""
+        found = self._index.search(crops)
+        rows = tuple(tuple(self._in_room(m) for m in row) for row in found.matches)
+        return Candidates(rows, self._places)
+
+    def _in_room(self, match: Match) -> Match:
+        keyframe = self.view.observations[match.observation].keyframe
+        room = self.rooms.index(self.run[keyframe].room)
+        return match._replace(object_place=room, keyframe_place=room)
+
+
+LEAST_OVERLAP = 0.5
+
+
+def truth_of(envelopes: Iterable[dict[str, Any]], truth: Path) -> list[dict[str, Any]]:
+    """Truth in the form of `evaluate`, a document for each envelope.
+
+    A detection shows the thing of its class whose box overlaps its own most, by half at least.
+    """
+    pictures = {p["stamp"]: p for p in map(json.loads, truth.read_text().splitlines())}
+    return [_of_one(envelope, pictures[envelope["timestamp"]]) for envelope in envelopes]
+
+
+def _of_one(envelope: dict[str, Any], picture: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "run_id": envelope["run_id"],
+        "keyframe_id": envelope["keyframe_id"],
+        "room": picture["room"],
+        "instances": [_instance(d, picture["things"]) for d in envelope["detections"]],
+    }
+
+
+def _instance(detection: dict[str, Any], things: list[dict[str, Any]]) -> str | None:
+    near = [
+        (_overlap(detection["bbox"], thing["box"]), thing["instance"])
+        for thing in things
+        if thing["class"] == detection["class"]
+    ]
+    best = max(near, default=(0.0, None))
+    return best[1] if best[0] >= LEAST_OVERLAP else None
+
+
+def _overlap(one: list[float], other: list[float]) -> float:
+    sides = [min(one[i + 2], other[i + 2]) - max(one[i], other[i]) for i in (0, 1)]
+    shared = max(0.0, sides[0]) * max(0.0, sides[1])
+    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (one, other)]
+    return shared / (sum(areas) - shared)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.commands import Commands
 from tests.support.shared_data import ROOT
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

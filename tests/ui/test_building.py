@@ -22,7 +22,7 @@ from tests.property.test_floors import drive
 from tests.support.commands import Commands
 from tests.support.envelopes import payload
 from tests.support.logs import KEY, write_log
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.browser import digest, pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment

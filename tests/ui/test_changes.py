@@ -13,7 +13,7 @@ from playwright.sync_api import Page, expect
 from eventsrc.log import LogReader
 from tests.support.commands import Commands
 from tests.support.logs import append_raw
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.browser import point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment

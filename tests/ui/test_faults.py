@@ -11,7 +11,7 @@ from projections.surfaces.ui.live import MOST_STREAMS
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import write_log
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.conftest import Visit
 
 BUSY = json.dumps({"error": {"kind": "too_much", "message": "too many questions are waiting"}})

@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 
 from tests.support.commands import Commands
 from tests.support.shared_data import shared_run
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.conftest import Visit
 from tests.ui.test_moments import check_digests, moment
 

@@ -15,7 +15,7 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_events
 from projections.map.view import MapView
 from tests.support.commands import Commands
-from tests.support.ui_server import UiServer
+from tests.support.ui_page import UiServer
 from tests.ui.browser import digest, pixels, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 

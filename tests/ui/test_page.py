@@ -18,7 +18,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import append_raw, write_log
 from tests.support.shared_data import ROOT, shared_run
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.conftest import ALL, SAMPLE, WIDE, Visit
 
 WEB = ROOT / "projections" / "surfaces" / "ui" / "web"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.support.ui_server import UiServer
+from tests.support.ui_page import UiServer
 from tests.ui.browser import digest
 from tests.ui.conftest import Visit
 

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.support.commands import Commands
-from tests.support.ui_server import UiServer, showing
+from tests.support.ui_page import UiServer, showing
 from tests.ui.browser import pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment

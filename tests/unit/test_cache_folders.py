@@ -10,7 +10,7 @@ from eventsrc.log import cache_folder, cache_sizes, make_cache_folder
 from projections.history import Timeline
 from tests.property.test_timeline_cache import kept_early
 from tests.support.envelopes import envelope
-from tests.support.fixtures_timetravel import write_log
+from tests.support.walks import write_log
 
 
 @pytest.fixture

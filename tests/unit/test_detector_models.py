@@ -16,7 +16,7 @@ from eventsrc.adapters.detector.finder import COCO, Finder, FinderOptions, read_
 from eventsrc.adapters.detector.onnx_model import ModelError, OnnxModel
 from eventsrc.adapters.detector.vision import Scaling, planes
 from eventsrc.base.errors import MisuseError
-from tests.support.tiny_models import (
+from tests.support.models import (
     DIMENSION,
     Graph,
     colour_detector,

@@ -33,7 +33,7 @@ from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.listing import what
 from projections.fold.settings import Camera, Settings
-from tests.support.corrected_logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
+from tests.support.logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 
 CUP_LEFT, CUP_RIGHT, LAMP = "obj-2237cc2f33929b56", "obj-dc4cb3fc37c4dc9a", "obj-36156c6b0fcc3c5d"
 ALL = Span(None, None)

@@ -13,7 +13,7 @@ from projections.history import Timeline
 from projections.history.merges import chains_of, merge_reason
 from projections.history.names import keyframe_name
 from tests.support.envelopes import envelope
-from tests.support.fixtures_timetravel import write_log
+from tests.support.walks import write_log
 
 ARMS = [(-3, 0), (-2, 0), (-1, 0), (3, 0), (2, 0), (1, 0), (0, 3), (0, 2), (0, 1)]
 """Three places of three keyframes on the arms of a star, the last of each 1 m from its middle."""

@@ -2,8 +2,7 @@
 
 from projections.localize.evaluate.trials import RoomIndex
 from projections.localize.evaluate.truth import TrueKeyframe, Truth
-from tests.support.buildings import Building
-from tests.support.drives import drive
+from tests.support.buildings import Building, drive
 
 HOME, STRANGER = Building(41, things=12), Building(42, things=12)
 MAPPED, ASKED = drive(HOME, "a", 1, 40), drive(HOME, "b", 2, 40)

@@ -13,7 +13,7 @@ from projections.history import Timeline
 from projections.history.merges import chains_of, merge_document, merge_reason, refusal_document
 from projections.history.rendering import merge_text, merges_text, refusals_text
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_corrections import anchor, write_mixed_log
+from tests.support.walks import anchor, write_mixed_log
 
 RULES = Settings(places="rooms")
 SAID: dict[str, Any] = {"issued_by": "ann@lab", "reason": "a door"}

@@ -19,8 +19,8 @@ from projections.map.fold import fold_log
 from projections.store.history_recorder import map_after
 from tests.property.test_timeline_cache import kept_early
 from tests.support.envelopes import envelope, payload
-from tests.support.fixtures_timetravel import write_log
-from tests.support.history_process import RULES
+from tests.support.histories import RULES
+from tests.support.walks import write_log
 
 
 def documents(first: int, last: int, step: float) -> list[dict[str, object]]:

@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from eventsrc.adapters.sim import detector, simulate_run, tour
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
 from tests.support.thorough import stride
 
 Function = Callable[..., float]

@@ -15,7 +15,7 @@ from eventsrc.adapters.sim.detector import DIM
 from eventsrc.adapters.sim.run import truth_path, write_run
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
 from tests.support.thorough import stride
 
 WITNESS_SHA256 = "f82a71e2193354310bd068bc8511907b6972614add60546300a3515dc79960f6"

@@ -6,7 +6,7 @@ import pytest
 from eventsrc.adapters.sim import build_house, occupancy_map
 from eventsrc.envelope.occupancy_map import OCCUPIED, decode_map
 from projections.fold.occupancy import OccupancyGrid
-from tests.support.simulated import simulated
+from tests.support.logs import simulated
 
 
 @pytest.mark.parametrize("seed", [1, 7, 12])

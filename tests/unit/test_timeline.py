@@ -12,7 +12,7 @@ from projections.fold.settings import Settings
 from projections.history import ExpressionError, NoSuchThing, Timeline
 from projections.history.merges import merge_document
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_timetravel import write_log
+from tests.support.walks import write_log
 
 CUP = detection("cup", [1.0, 0.0], det_id="the-cup")
 CUP_AGAIN = detection("cup", [1.0, 0.0], det_id="the-cup-again")

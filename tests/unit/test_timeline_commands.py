@@ -37,7 +37,7 @@ from projections.history.whatif import command_trials, what_if
 from projections.history.whatif_rendering import whatif_text
 from projections.map.export import state_document, state_text
 from tests.support.envelopes import detection, envelope
-from tests.support.fixtures_corrections import anchor, write_mixed_log
+from tests.support.walks import anchor, write_mixed_log
 
 CUP = detection("cup", [1.0, 0.0], det_id="the-cup")
 OTHER_CUP = detection("cup", [0.0, 1.0], det_id="other-cup")

@@ -28,7 +28,7 @@ from eventsrc.adapters.detector.poses import poses_of_file
 from eventsrc.adapters.sim import build_house
 from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
 from eventsrc.envelope.model import RunId
-from tests.support.tiny_models import models_for
+from tests.support.models import models_for
 
 MOST_ADDED_MS = 8.0
 LEAST_PER_S = 60.0

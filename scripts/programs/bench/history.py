@@ -27,7 +27,7 @@ from projections.map.digest import map_digest
 from projections.map.export import state_text
 from projections.map.view import MapView
 from scripts.programs.bench.timetravel import RULES, make_log, payloads, say, timed
-from tests.support.history_answers import MemoryHistory
+from tests.support.histories import MemoryHistory
 
 MORE = 1_000
 """Events by which a log has grown."""

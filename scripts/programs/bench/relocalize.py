@@ -33,9 +33,8 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.queries.relocalize import CandidateReader
-from tests.support.buildings import Building
-from tests.support.drives import drive
-from tests.support.rooms import crops_of
+from tests.support.buildings import Building, drive
+from tests.support.scenes import crops_of
 
 APART_M = 60.0
 KEYFRAMES = 4_000

@@ -32,7 +32,7 @@ from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from projections.surfaces.serve import Answerer, Pools
 from scripts.programs.bench.projections.world import KEY, World
-from tests.support.cpu_time import family_cpu_seconds
+from tests.support.commands import family_cpu_seconds
 
 TOGETHER = 16
 """Messages that a recorder and a fold check together."""

@@ -18,7 +18,7 @@ from playwright.sync_api import CDPSession
 from eventsrc.log import NEVER, LogWriter
 from scripts.programs.bench.timetravel import payloads
 from tests.support.commands import Commands
-from tests.support.ui_server import showing
+from tests.support.ui_page import showing
 from tests.ui.browser import browser
 
 LIMIT_MS = 100.0

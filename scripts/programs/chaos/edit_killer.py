@@ -31,10 +31,9 @@ from projections.map.log_commands import read_commands
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.status import projection_status
-from tests.support.commands_in_logs import forget_keyframes, keep_apart, name_place, undo
 from tests.support.envelopes import payload
 from tests.support.fixtures_zenoh import LOOPBACK, MAPFOLD, Program
-from tests.support.logs import KEY, walk, write_log
+from tests.support.logs import KEY, forget_keyframes, keep_apart, name_place, undo, walk, write_log
 from tests.support.rows import all_rows
 from tests.support.servers import kill_postgres, server_to_kill
 

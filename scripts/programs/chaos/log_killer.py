@@ -17,7 +17,7 @@ from pathlib import Path
 
 from eventsrc.log import LogReader, LogWriter, verify_log
 from scripts.programs.chaos.log_writer import event_at
-from tests.support.verbatim import recorded
+from tests.support.logs import recorded
 
 ROOT = Path(__file__).parents[3]
 LONGEST_LIFE_S = 0.9

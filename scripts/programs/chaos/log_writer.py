@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from eventsrc.log import LogWriter, NewEvent, parse_fsync
-from tests.support.verbatim import mixed_event
+from tests.support.logs import mixed_event
 
 KEY = "tb/detections"
 ROTATE_EVENTS = 2000

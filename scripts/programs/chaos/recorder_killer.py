@@ -45,9 +45,9 @@ from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Router, ZenohOptions, open_session
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from tests.support.commands_in_logs import name_place
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_zenoh import LOOPBACK, MAPFOLD, Program
+from tests.support.logs import name_place
 
 LONGEST_LIFE_S = 0.6
 LONGEST_RECOVERY_S = 0.06

@@ -24,12 +24,10 @@ from eventsrc.envelope.system_events import (
 )
 from eventsrc.log import NEVER, LogWriter, NewEvent, seal
 from eventsrc.record.append import append_payload
-from tests.support.commands_in_logs import anchor
 from tests.support.envelopes import MODEL, embedding, payload
-from tests.support.logs import KEY, WEIRD
+from tests.support.evidence_drives import DIM, Room
+from tests.support.logs import KEY, WEIRD, anchor, mixed_event
 from tests.support.maps import drawn_map
-from tests.support.rooms_with_things import DIM, Room
-from tests.support.verbatim import mixed_event
 
 _RUNS = ("run-a", "run-b", "run $$'c")
 _NEW_SPACE = "another/space"

@@ -16,7 +16,7 @@ from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.map.fold import fold_log
 from projections.map.log_commands import read_corrections
-from tests.support.history_answers import whole
+from tests.support.histories import whole
 
 CHOICES = [
     *((name, *assignments) for name, assignments in PRESETS.items()),

@@ -18,7 +18,7 @@ from projections.history.parallel import Rules, fold_all
 from projections.map.log_commands import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
-from tests.support.history_answers import whole
+from tests.support.histories import whole
 
 from .outcomes import Chosen, Tally, folded, outcome, stories
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from tests.support.cpu_time import cpu_seconds
+from tests.support.commands import cpu_seconds
 from tests.support.fixtures_zenoh import MAPFOLD
 
 ROOT = Path(__file__).parents[3]

@@ -9,7 +9,7 @@ from typing import Any
 from mapfold import Settings, Timeline
 
 from scripts.programs.attack.arena import Arena
-from tests.support.interrupts import interrupt
+from tests.support.commands import interrupt
 from tests.support.logs import bridge, walk, write_log
 
 LONGEST_LIFE_S = 3.0

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from scripts.programs.attack.arena import Arena
 from scripts.programs.attack.honest_client import HonestClient, question
 from scripts.programs.attack.service import serve
-from tests.support.fixtures_tls import make_certificate
+from tests.support.fixtures_zenoh import make_certificate
 from tests.support.logs import walk, write_log
 
 SECONDS = 4.0

@@ -16,7 +16,7 @@ from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.record.log_info import log_info
 from eventsrc.record.recorder import Recorder
 from eventsrc.record.transport.session import ZenohOptions, open_session
-from tests.support.cpu_time import UnusedCpu, cpu_seconds, unused_cpu
+from tests.support.commands import UnusedCpu, cpu_seconds, unused_cpu
 
 from .payloads import KEY
 from .plain import PlainFile
