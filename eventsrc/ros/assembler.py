@@ -29,8 +29,7 @@ from .messages import (
     lens_of,
     read,
 )
-from .poses import PicturePose, PoseSource
-from .stream import Counts, Stream
+from .stream import Counts, PicturePose, PoseSource, Stream
 from .transforms import TransformBuffer
 
 _MOST_EMBEDDINGS: Final = 1_000

@@ -1,8 +1,28 @@
-"""Streams: a topic of detections with its run, and the topics and frames of its poses."""
+"""Streams: a topic of detections with its run, and the poses at which its pictures were taken.
 
+The pose is interpolated at the picture's stamp, from transforms, odometry or a localiser's poses.
+``x``, ``y`` are the camera's position, since bearings start there; ``yaw`` is the heading of the
+robot's base, ``camera_yaw`` the angle from it to the camera's heading. Results are rounded to
+micrometres and nanoradians.
+"""
+
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final, TypeAlias
+
+from .messages import (
+    ODOMETRY,
+    POSE,
+    TF,
+    BadMessage,
+    Covariance,
+    StampedPose,
+    pose_of,
+    read,
+    transform_of,
+)
+from .transforms import TimeSeries, Transform, TransformBuffer, compose, interpolate, rotate
 
 DEFAULT_WAIT_NS: Final = 1_000_000_000
 DEFAULT_MAX_GAP_NS: Final = 500_000_000
@@ -74,3 +94,154 @@ class Counts:
         """Count a message that cannot be used."""
         self.unused[topic] = self.unused.get(topic, 0) + 1
         self.reasons.setdefault(topic, reason)
+
+
+_MOST_POSES: Final = 50_000
+_UPRIGHT: Final = 0.5
+"""Least vertical component, at 30° from the horizontal, of a z axis that is no optical axis."""
+_METRES, _RADIANS = 6, 9
+_Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
+"""The base, the camera and the error of the pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class PicturePose:
+    """A pose in the map frame, metres and radians; ``z`` is the base's height. ``has_base`` and
+    ``has_camera`` say which of the two frames were known."""
+
+    x: float
+    y: float
+    z: float
+    yaw: float
+    camera_yaw: float
+    covariance: Covariance | None
+    has_base: bool
+    has_camera: bool
+
+
+class PoseSource:
+    """The poses of one stream."""
+
+    def __init__(self, stream: Stream, buffer: TransformBuffer, counts: Counts) -> None:
+        self._stream = stream
+        self._buffer = buffer
+        self._counts = counts
+        self._given: TimeSeries[StampedPose] = TimeSeries()
+        self._frame: str | None = None
+        self.received = 0
+        """Number of messages added, without those that other streams added to a shared buffer."""
+
+    def add_transforms(self, topic: str, type_name: str, message: Any) -> None:
+        """Add the transforms of a TFMessage; they are static if ``topic`` is the stream's
+        ``tf_static``."""
+        self.received += 1
+        _expect(type_name, TF)
+        static = topic == self._stream.tf_static
+        for each in read(lambda m: [*m.transforms], message):
+            try:
+                parent, child, stamp_ns, pose = read(transform_of, each)
+            except BadMessage as error:
+                self._counts.refuse(topic, str(error))
+                continue
+            if static:
+                self._buffer.add_static(parent, child, pose)
+            else:
+                self._buffer.add(parent, child, stamp_ns, pose)
+
+    def add_pose(self, topic: str, type_name: str, message: Any) -> None:
+        """Add a pose of odometry or of a localiser. Raises BadMessage."""
+        self.received += 1
+        _expect(type_name, ODOMETRY, POSE)
+        pose = read(pose_of, message)
+        if pose.fault is not None:
+            self._counts.refuse(topic, pose.fault)
+        frame = self.frame
+        if frame is None:
+            frame = self._frame = pose.parent
+        if pose.parent != frame:
+            raise BadMessage(f"it is in the frame {pose.parent!r:.80}, not in {frame!r:.80}")
+        self._given.add(pose.stamp_ns, pose)
+        if len(self._given.stamps) > _MOST_POSES:
+            self._given.forget_half()
+
+    @property
+    def frame(self) -> str | None:
+        """The frame that the poses are in; None before it is known."""
+        return self._stream.map_frame if self._stream.pose is None else self._frame
+
+    def at(self, stamp_ns: int, camera: str, *, final: bool) -> PicturePose | None:
+        """The pose of a picture; None while it is unknown. ``camera`` is the frame of the camera.
+
+        With ``final`` the base's pose stands for an unknown camera's, and the other way round.
+        """
+        of = self._of_transforms if self._stream.pose is None else self._of_poses
+        base, there, covariance = of(stamp_ns, camera, final=final)
+        if base is None or there is None:
+            if not final or (at := base or there) is None:
+                return None
+        else:
+            at = there
+        looks = None if there is None else heading_of_camera(there, camera)
+        yaw = heading(base) if base is not None else looks or 0.0
+        return PicturePose(
+            round(at.x, _METRES),
+            round(at.y, _METRES),
+            round((base or at).z, _METRES),
+            round(yaw, _RADIANS),
+            0.0 if looks is None else round(math.remainder(looks - yaw, math.tau), _RADIANS),
+            covariance,
+            base is not None,
+            there is not None,
+        )
+
+    def _of_transforms(self, stamp_ns: int, camera: str, *, final: bool) -> _Found:
+        stream, lookup = self._stream, self._buffer.lookup
+        base = lookup(stream.map_frame, stream.base_frame, stamp_ns)
+        there = base
+        if base is None:
+            if not final:
+                return None, None, None
+            there = lookup(stream.map_frame, camera, stamp_ns) if camera else None
+        elif camera:
+            inside = lookup(stream.base_frame, camera, stamp_ns)
+            there = None if inside is None else compose(base, inside)
+        known = self._given.latest(stamp_ns)
+        return base, there, None if known is None else known.covariance
+
+    def _of_poses(self, stamp_ns: int, camera: str, *, final: bool) -> _Found:  # noqa: ARG002
+        around = self._given.around(stamp_ns, self._stream.max_gap_ns)
+        if around is None:
+            return None, None, None
+        before, after, share = around
+        base = interpolate(before.pose, after.pose, share)
+        covariance = _between(before.covariance, after.covariance, share)
+        child = before.child or self._stream.base_frame
+        inside = self._buffer.lookup(child, camera or child, stamp_ns)
+        return base, None if inside is None else compose(base, inside), covariance
+
+
+def heading(t: Transform) -> float:
+    """The direction of the x axis on the ground, radians."""
+    x, y, _ = rotate(t, 1.0, 0.0, 0.0)
+    return math.atan2(y, x)
+
+
+def heading_of_camera(t: Transform, frame: str) -> float:
+    """The heading of a camera on the ground, radians: along z in an optical frame, along x in a
+    frame of the robot's body. A frame without ``optical`` in its name counts as optical if its z
+    axis is within 30° of the horizontal."""
+    x, y, z = rotate(t, 0.0, 0.0, 1.0)
+    if "optical" in frame or abs(z) < _UPRIGHT:
+        return math.atan2(y, x)
+    return heading(t)
+
+
+def _between(a: Covariance | None, b: Covariance | None, share: float) -> Covariance | None:
+    if a is None or b is None:
+        return None
+    return tuple((1.0 - share) * one + share * other for one, other in zip(a, b, strict=True))
+
+
+def _expect(type_name: str, *expected: str) -> None:
+    if type_name not in expected:
+        raise BadMessage(f"it is {type_name:.80}, not {' or '.join(expected)}")

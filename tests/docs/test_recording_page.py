@@ -14,7 +14,7 @@ from eventsrc.envelope.readers import DetectionModel, EnvelopeCamera, EnvelopeMo
 from eventsrc.record.metrics import serving_metrics
 from eventsrc.record.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
 from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES
-from eventsrc.record.robot.sender import WINDOW
+from eventsrc.record.robot.publisher import WINDOW
 from eventsrc.record.robot.spool import DEFAULT_SPOOL_BYTES
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT
 from eventsrc.record.transport.session import ZenohOptions, open_session

@@ -12,16 +12,18 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from eventsrc.adapters.detector.encoder import Encoder, read_preparation
-from eventsrc.adapters.detector.finder import Finder, FinderOptions
-from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate
-from eventsrc.adapters.detector.keyframes import CROP_SIDE, Keyframes
-from eventsrc.adapters.detector.live import LivePictures
+from eventsrc.adapters.detector.keyframes import CROP_SIDE, GateLimits, KeyframeGate, Keyframes
 from eventsrc.adapters.detector.onnx_model import OnnxModel
-from eventsrc.adapters.detector.outputs import FileOutput
+from eventsrc.adapters.detector.picture_sources import LivePictures
 from eventsrc.adapters.detector.poses import NoPoses
-from eventsrc.adapters.detector.service import Detection
+from eventsrc.adapters.detector.service import Detection, FileOutput
 from eventsrc.adapters.detector.vision import decode, encode_jpeg, shrunk
+from eventsrc.adapters.detector.vision_models import (
+    Encoder,
+    Finder,
+    FinderOptions,
+    read_preparation,
+)
 from eventsrc.adapters.sim import build_house
 from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
 from eventsrc.envelope.crops import MAX_CROP_BYTES, decode_crop

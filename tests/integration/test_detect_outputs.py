@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from eventsrc.adapters.detector.keyframes import Crop, Keyframe
-from eventsrc.adapters.detector.outputs import CropSender, ZenohOutput
+from eventsrc.adapters.detector.service import CropSender, ZenohOutput
 from eventsrc.envelope.model import DetId
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Session, ZenohOptions

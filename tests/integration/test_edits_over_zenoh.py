@@ -24,14 +24,12 @@ from eventsrc.envelope.model import RunId
 from eventsrc.envelope.system_events import COMMAND_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import Event, LogReader, LogWriter
 from eventsrc.record.recorder import Recorder
-from eventsrc.record.recorder.edit_requests import (
+from eventsrc.record.recorder.edits import (
     MAX_EDITS_WAITING,
+    CommandRefused,
     EditRequest,
     Edits,
     KnownCommands,
-)
-from eventsrc.record.recorder.edits import (
-    CommandRefused,
     NewerCommand,
     NoAnswer,
     Refused,

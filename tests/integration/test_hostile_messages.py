@@ -29,7 +29,7 @@ LONG_KEYS = ("t/" + "é" * 11_000, "t/" + "k" * 22_000, "t/" + "k" * 60_000)
 PANIC = """
 import sys
 from eventsrc.record.transport.session import ZenohOptions, open_session
-from eventsrc.record.transport.errors import transport_errors
+from eventsrc.record.transport.declarations import transport_errors
 from eventsrc.base.errors import TransportError
 
 session = open_session(ZenohOptions(connect=(sys.argv[1],)), mode="client")

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 
 from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import Event, LogWriter
-from eventsrc.record.importers.topics import TopicChoice, looks_like_envelope
+from eventsrc.record.importers.sources import TopicChoice, looks_like_envelope
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import read_log

@@ -11,8 +11,7 @@ from eventsrc.base.errors import InvalidEnvelope, MisuseError, SpoolFull, Transp
 from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import LogReader
 from eventsrc.record.robot.acks import Refusal, Refusals, ack_key, refusal_key
-from eventsrc.record.robot.publisher import EnvelopePublisher
-from eventsrc.record.robot.sender import Sender
+from eventsrc.record.robot.publisher import EnvelopePublisher, Sender
 from eventsrc.record.transport.session import Session, ZenohOptions
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY

@@ -12,10 +12,9 @@ from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, Verbatim
 from eventsrc.record.gap_history import ledger_of
 from eventsrc.record.importers import import_files
 from eventsrc.record.recorder import Recorder
-from eventsrc.record.recorder.bridged import Bridge
+from eventsrc.record.recorder.bridged import Bridge, append_missing, message_of
 from eventsrc.record.recorder.checking import Checker
 from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
-from eventsrc.record.recorder.unfinished import append_missing, message_of
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording, derive, read_recording
 from projections.surfaces.cli.bridged import recording_of

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.adapters.detector.boxes import suppress
-from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate, Pose
+from eventsrc.adapters.detector.heads import suppress
+from eventsrc.adapters.detector.keyframes import GateLimits, KeyframeGate, Pose
 from eventsrc.adapters.detector.poses import NEAR_S, PoseTrack
 from eventsrc.adapters.detector.vision import Letterbox
 

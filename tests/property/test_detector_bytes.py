@@ -9,8 +9,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.adapters.detector.messages import MessageError, picture_of, pose_of
 from eventsrc.adapters.detector.picture import PictureError, check_picture, split_stream
+from eventsrc.adapters.detector.picture_sources import picture_of
+from eventsrc.adapters.detector.poses import MessageError, pose_of
 from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.adapters.sim.pictures import compressed_image
 from eventsrc.envelope.grey_images import encode_png

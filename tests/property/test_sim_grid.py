@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from eventsrc.adapters.sim.floorplan import Point, Rect, Segment, Walls
 from eventsrc.adapters.sim.grid import DriveGrid
-from eventsrc.adapters.sim.shapes import Point, Rect, Segment, Walls
 from eventsrc.adapters.sim.tour import nearest_by_route
 from eventsrc.base.errors import MapfoldError
 

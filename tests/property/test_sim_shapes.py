@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from eventsrc.adapters.sim.shapes import Point, Rect, Segment, Walls, rect_clearance, wrap
+from eventsrc.adapters.sim.floorplan import Point, Rect, Segment, Walls, rect_clearance, wrap
 
 # Quarters: exact in floating point, so that only the method is under test, not the rounding.
 coordinates = st.integers(-40, 40).map(lambda n: n / 4)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.adapters.detector.encoder import read_preparation
+from eventsrc.adapters.detector.vision_models import read_preparation
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.label_files import read_label_file
 from eventsrc.base.user_files import MAX_DEPTH, FileFault, parse_json, read_file

@@ -10,11 +10,9 @@ from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 from eventsrc.record.gap_history import ledger_of
 from eventsrc.record.recorder import Recorder
-from eventsrc.record.recorder.bridged import Bridge
-from eventsrc.record.recorder.unfinished import message_of
+from eventsrc.record.recorder.bridged import Bridge, message_of, topic_of
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
-from eventsrc.ros.bridge_keys import topic_of
 from eventsrc.ros.derivation import derive
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest

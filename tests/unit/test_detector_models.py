@@ -11,10 +11,16 @@ import pytest
 from onnx import TensorProto
 
 from eventsrc.adapters.detector import vision
-from eventsrc.adapters.detector.encoder import Encoder, read_preparation
-from eventsrc.adapters.detector.finder import COCO, Finder, FinderOptions, read_labels
 from eventsrc.adapters.detector.onnx_model import ModelError, OnnxModel
 from eventsrc.adapters.detector.vision import Scaling, planes
+from eventsrc.adapters.detector.vision_models import (
+    COCO,
+    Encoder,
+    Finder,
+    FinderOptions,
+    read_labels,
+    read_preparation,
+)
 from eventsrc.base.errors import MisuseError
 from tests.support.models import (
     DIMENSION,

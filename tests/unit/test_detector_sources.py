@@ -12,12 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eventsrc.adapters.detector.files import Timing, open_images
-from eventsrc.adapters.detector.gate import Pose
-from eventsrc.adapters.detector.live import NewestQueue
-from eventsrc.adapters.detector.messages import MessageError, picture_of, pose_of
 from eventsrc.adapters.detector.picture import Picture, PictureError
-from eventsrc.adapters.detector.poses import LivePoses, poses_of_file
+from eventsrc.adapters.detector.picture_sources import NewestQueue, Timing, open_images, picture_of
+from eventsrc.adapters.detector.poses import LivePoses, MessageError, Pose, pose_of, poses_of_file
 from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.adapters.sim.pictures import compressed_image
 from eventsrc.base.errors import MisuseError

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from eventsrc.record.importers.json_lines import read_line
-from eventsrc.record.importers.source import ImportedMessage
+from eventsrc.record.importers.sources import ImportedMessage
 
 TS = 1740000000.123
 TS_NS = 1740000000123000000

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.adapters.sim.catalogue import FURNITURE, MODELS
+from eventsrc.adapters.sim.house import FURNITURE, MODELS
 from projections.fold import place_type_table
 from projections.fold.place_type_table import NAMES, SHARES, SYNONYMS, TABLE, TYPES
 from projections.fold.place_types import UNSURE, known_class, place_type, type_of_name

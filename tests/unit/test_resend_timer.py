@@ -1,6 +1,6 @@
 """When the robot sends a probe, and when it sends everything again."""
 
-from eventsrc.record.robot.sender import ResendTimer
+from eventsrc.record.robot.publisher import ResendTimer
 
 RESEND_AFTER_S = 2.0
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 
-from eventsrc.adapters.sim.catalogue import MODELS
 from eventsrc.adapters.sim.detector import (
     FOCAL_PX,
     HEIGHT_PX,
@@ -13,9 +12,8 @@ from eventsrc.adapters.sim.detector import (
     VisibleObject,
     visible_objects,
 )
-from eventsrc.adapters.sim.floorplan import FloorPlan
-from eventsrc.adapters.sim.house import House, Thing, build_house
-from eventsrc.adapters.sim.shapes import Rect, Segment
+from eventsrc.adapters.sim.floorplan import FloorPlan, Rect, Segment
+from eventsrc.adapters.sim.house import MODELS, House, Thing, build_house
 from eventsrc.adapters.sim.tour import TruePose
 
 FAR_WALL = Segment(-50.0, -50.0, -50.0, 50.0)

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
+from eventsrc.adapters.sim.floorplan import Segment, wrap
 from eventsrc.adapters.sim.house import House, build_house
-from eventsrc.adapters.sim.shapes import Segment, wrap
 from eventsrc.adapters.sim.tour import (
     KEYFRAME_M,
     KEYFRAME_RAD,

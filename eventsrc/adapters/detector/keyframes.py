@@ -1,4 +1,9 @@
-"""Make envelopes from pictures by the keyframe gate, the detector and the encoder."""
+"""Make envelopes from pictures by the keyframe gate, the detector and the encoder.
+
+The gate decides which pictures become keyframes: when the robot has moved or turned far enough
+since the last keyframe with a pose, or when the time since the last keyframe is up. A picture
+without a pose has only the time. The first picture is one, and so is the first with a pose.
+"""
 
 import base64
 import math
@@ -11,12 +16,54 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
 
-from .encoder import Encoder
-from .finder import Finder, Found
-from .gate import KeyframeGate, Pose
 from .picture import Picture, PictureError, Pixels
-from .poses import Poses
+from .poses import Pose, Poses
 from .vision import encode_jpeg, shrunk
+from .vision_models import Encoder, Finder, Found
+
+MOVED_M = 0.5
+TURNED_DEG = 15.0
+AFTER_S = 5.0
+_SLACK = 1e-6
+"""Tolerance for rounding, metres and radians: ten steps of 5 cm count as half a metre."""
+
+
+@dataclass(frozen=True, slots=True)
+class GateLimits:
+    """The distance, turn and time after which a keyframe is due; None for ``after_s`` for no time
+    limit."""
+
+    moved_m: float = MOVED_M
+    turned_rad: float = math.radians(TURNED_DEG)
+    after_s: float | None = AFTER_S
+
+
+class KeyframeGate:
+    """Decides for each picture in turn whether it is a keyframe, from the last keyframe."""
+
+    def __init__(self, limits: GateLimits) -> None:
+        self._limits = limits
+        self._stamp_s: float | None = None
+        self._pose: Pose | None = None
+
+    def set_last(self, stamp_s: float, pose: Pose | None) -> None:
+        """Set the last keyframe."""
+        self._stamp_s = stamp_s
+        self._pose = pose or self._pose
+
+    def is_due(self, stamp_s: float, pose: Pose | None) -> bool:
+        """Whether this picture should be a keyframe."""
+        if self._stamp_s is None or (pose is not None and self._pose is None):
+            return True
+        after_s = self._limits.after_s
+        if after_s is not None and abs(stamp_s - self._stamp_s) >= after_s:
+            return True  # also for a stamp that jumps back, as of a recording that starts again
+        if pose is None or self._pose is None:
+            return False
+        moved = math.hypot(pose.x - self._pose.x, pose.y - self._pose.y)
+        turned = abs(math.remainder(pose.yaw - self._pose.yaw, math.tau))
+        return moved >= self._limits.moved_m - _SLACK or turned >= self._limits.turned_rad - _SLACK
+
 
 FIRST_KEYFRAME: Final = 1
 CROP_SIDE: Final = 640

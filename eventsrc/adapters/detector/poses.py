@@ -1,23 +1,28 @@
 """The robot's poses by time, from a file or as they arrive, and the pose at which a picture was
 taken.
 
+A message that arrives is JSON with ``x``, ``y``, ``yaw`` (or ``map_x`` …) and ``stamp`` or
+``timestamp``, or in CDR geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry.
+The type of a message follows from its length.
+
 A picture has a pose if one is known within `NEAR_S` of its stamp. With such a pose on each side it
 is interpolated linearly; otherwise it is the nearest one.
 """
 
+import json
 import math
 import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.cdr import CdrFault, CdrFields, is_cdr
+from eventsrc.envelope.model import MAX_POSITION_M, MAX_TIMESTAMP_S
 from eventsrc.envelope.trajectory import read_trajectory
-
-from .gate import Pose
-from .messages import MessageError, pose_of
 
 NEAR_S: Final = 0.1
 _KEPT: Final = 20_000
@@ -26,6 +31,19 @@ _KEPT_BYTES: Final = 16 * 1024 * 1024
 """Bound of the bytes of unread messages: 20,000 of Odometry with covariances take 14 MB."""
 _SLACK_S: Final = 1e-6
 """Tolerance for rounding: stamps 100 ms apart are still within 100 ms."""
+_POSE_BYTES: Final = 56
+_COVARIANCE_BYTES: Final = 288
+_TWIST_BYTES: Final = 48 + _COVARIANCE_BYTES
+_MOST_PADDING: Final = 3
+_NORM_SLACK: Final = 0.1
+
+
+class Pose(NamedTuple):
+    """The robot's pose in the map frame: metres, and radians to the left of the x axis."""
+
+    x: float
+    y: float
+    yaw: float
 
 
 class Poses(Protocol):
@@ -178,3 +196,91 @@ class LivePoses:
         self._track.add(stamp_s, pose)
         if len(self._track) > 2 * _KEPT:
             self._track.forget_before(_KEPT)
+
+
+class MessageError(ValueError):
+    """A message that is no picture or no pose; the text is the reason."""
+
+
+def pose_of(payload: bytes, received_s: float) -> tuple[float, Pose]:
+    """Stamp, in seconds, and pose of a message. Raises MessageError."""
+    if is_cdr(payload):
+        try:
+            return _pose_of_cdr(CdrFields(payload), received_s)
+        except CdrFault as fault:
+            raise MessageError(f"no pose in CDR: {fault}") from None
+    return _pose_of_json(payload, received_s)
+
+
+def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, Pose]:
+    stamp_s = header_stamp(fields, received_s)
+    if not _is_length(fields.left(8), _POSE_BYTES, _POSE_BYTES + _COVARIANCE_BYTES):
+        fields.text("child_frame_id")
+        if not _is_length(fields.left(8), _POSE_BYTES + _COVARIANCE_BYTES + _TWIST_BYTES):
+            raise MessageError(
+                "a message in CDR of another length than geometry_msgs/PoseStamped, "
+                "PoseWithCovarianceStamped and nav_msgs/Odometry have"
+            )
+    x, y, _ = fields.numbers("ddd", "position")
+    return stamp_s, _checked(x, y, _yaw(fields.numbers("dddd", "orientation")))
+
+
+def _is_length(left: int, *lengths: int) -> bool:
+    """Whether ``left`` bytes are one of ``lengths``, or that plus padding."""
+    return any(length <= left <= length + _MOST_PADDING for length in lengths)
+
+
+def header_stamp(fields: CdrFields, received_s: float) -> float:
+    """The stamp of a header in seconds, ``received_s`` if it is zero. Skips the frame."""
+    seconds, nanoseconds = fields.numbers("iI", "header.stamp")
+    fields.text("header.frame_id")
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise CdrFault(f"header.stamp is {seconds} s and {nanoseconds} ns")
+    return received_s if seconds == nanoseconds == 0 else seconds + nanoseconds / 1e9
+
+
+def _yaw(quaternion: tuple[float, ...]) -> float:
+    norm = math.sqrt(math.fsum(q * q for q in quaternion))
+    if not abs(norm - 1.0) <= _NORM_SLACK:
+        raise MessageError(f"a pose whose quaternion has length {norm:.3g} instead of 1")
+    x, y, z, w = (q / norm for q in quaternion)
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _pose_of_json(payload: bytes, received_s: float) -> tuple[float, Pose]:
+    try:
+        document = json.loads(payload)
+    except (ValueError, RecursionError):
+        raise MessageError("a pose that is neither JSON nor CDR") from None
+    if not isinstance(document, dict):
+        raise MessageError("a pose that is no JSON object")
+    numbers = [_first(document, names) for names in (("x", "map_x"), ("y", "map_y"))]
+    yaw = _first(document, ("yaw", "map_yaw"))
+    stamp = _first(document, ("stamp", "timestamp"))
+    if None in numbers or yaw is None:
+        raise MessageError("a pose without the numbers x, y and yaw")
+    stamp_s = received_s if stamp is None else stamp
+    if not 0.0 <= stamp_s <= MAX_TIMESTAMP_S:
+        raise MessageError(f"a pose with the stamp {stamp_s:g}, which is no Unix time")
+    return stamp_s, _checked(float(numbers[0] or 0.0), float(numbers[1] or 0.0), yaw)
+
+
+def _first(document: Mapping[str, Any], names: tuple[str, ...]) -> float | None:
+    for name in names:
+        value = document.get(name)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return _float(value)
+    return None
+
+
+def _float(value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _checked(x: float, y: float, yaw: float) -> Pose:
+    if not (abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)):
+        raise MessageError(f"a pose at x {x:g}, y {y:g}, yaw {yaw:g}")
+    return Pose(x, y, yaw)

@@ -1,13 +1,180 @@
-"""The loop of `mapfold detect`: a source's pictures through the models to an output."""
+"""The loop of `mapfold detect`: a source's pictures through the models to an output, which is Zenoh
+through a robot's spool, or a file of JSON lines.
+"""
 
+import json
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Protocol
+from urllib.parse import quote
 
-from .keyframes import Counts, Keyframes
-from .live import LivePictures
-from .outputs import Delivered, Output
+from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, TransportError
+from eventsrc.base.output_files import written_whole
+from eventsrc.base.text import counted
+from eventsrc.record.robot.publisher import EnvelopePublisher
+from eventsrc.record.transport.session import Session
+
+from .keyframes import Counts, Crop, Keyframe, Keyframes
 from .picture import Picture
+from .picture_sources import LivePictures
+
+CROPS_KEY: Final = "tb/crops"
+_SLICE_S: Final = 0.25
+_LAST_CHANCE_S: Final = 2.0
+
+
+@dataclass
+class Delivered:
+    """Counts of keyframes by outcome: ``waiting`` and ``refused`` ones are in the spool, those with
+    ``no_room`` did not fit into it."""
+
+    published: int = 0
+    waiting: int = 0
+    refused: int = 0
+    no_room: int = 0
+    crops: int = 0
+    crops_lost: int = 0
+    """Crops not sent because there was no subscriber."""
+
+
+class Output(Protocol):
+    """A destination of keyframes."""
+
+    @property
+    def delivered(self) -> Delivered:
+        """The counts so far."""
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Write or send one keyframe."""
+
+    def close(self, wait_s: float) -> None:
+        """Close the output, after waiting at most ``wait_s`` seconds for acknowledgements."""
+
+
+class FileOutput:
+    """Envelopes as JSON lines in a new file, which gets its name when it is closed, or when a write
+    fails: then it has the whole lines before. Raises MisuseError if the file exists already or
+    cannot be made, MapfoldError where writing fails."""
+
+    def __init__(self, path: Path) -> None:
+        self.delivered = Delivered()
+        if path.is_file():
+            raise MisuseError(f"--out {path}: there is such a file; remove it, or choose another")
+        self._path, self._stack = path, ExitStack()
+        self._file = self._stack.enter_context(written_whole(path))
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Write its envelope."""
+        whole = self._file.tell() if self._file.seekable() else None
+        try:
+            self._file.write(_encode(keyframe.envelope) + b"\n")
+        except MapfoldError as error:
+            if whole is not None:  # keyframes of a camera cannot be had a second time
+                self._file.truncate(whole)
+            self._stack.close()
+            count = counted(self.delivered.published, "keyframe")
+            raise MapfoldError(f"{error}; {self._path} has the {count} before") from None
+        self.delivered.published += 1
+
+    def close(self, wait_s: float) -> None:  # noqa: ARG002  as `Output` has it
+        """Close the file."""
+        self._stack.close()
+
+
+class ZenohOutput:
+    """Envelopes over Zenoh through a spool, which keeps them until a recorder acknowledges them;
+    crops directly.
+
+    While the spool is full, `send` waits if ``patient`` (pictures from files), else it drops the
+    keyframe (a camera).
+    """
+
+    def __init__(
+        self,
+        publisher: EnvelopePublisher,
+        crops: "CropSender | None",
+        stop: threading.Event,
+        *,
+        patient: bool,
+        note: Callable[[str], None],
+    ) -> None:
+        self._counts = Delivered()
+        self._publisher, self._crops, self._stop = publisher, crops, stop
+        self._patient, self._note = patient, note
+
+    @property
+    def delivered(self) -> Delivered:
+        """The counts so far, and the number of envelopes in the spool."""
+        spooled = self._publisher
+        return replace(self._counts, waiting=spooled.unacknowledged, refused=spooled.refused_count)
+
+    def send(self, keyframe: Keyframe) -> None:
+        """Spool its envelope and send its crops."""
+        payload = _encode(keyframe.envelope)
+        while True:
+            try:
+                self._publisher.publish(payload)
+            except SpoolFull as full:
+                if self._patient and not self._stop.is_set():
+                    self._publisher.flush(_SLICE_S)
+                    continue
+                if self._counts.no_room == 0:
+                    self._note(f"keyframe lost: {full}")
+                self._counts.no_room += 1
+                return
+            break
+        self._counts.published += 1
+        if self._crops is not None:
+            for crop in keyframe.crops:
+                sent = self._crops.send(crop)
+                self._counts.crops += sent
+                self._counts.crops_lost += not sent
+
+    def close(self, wait_s: float) -> None:
+        """Wait for acknowledgements, for a shorter time after ``stop``, and close the spool."""
+        left_s = min(wait_s, _LAST_CHANCE_S) if self._stop.is_set() else wait_s
+        stopped = self._stop.is_set()
+        while left_s > 0 and self._publisher.unacknowledged:
+            self._publisher.flush(min(_SLICE_S, left_s))
+            left_s -= _SLICE_S
+            if self._stop.is_set() and not stopped:
+                break
+        self._publisher.close()
+
+
+class CropSender:
+    """Publishes crops under ``prefix/det_id``, percent-encoded where a key allows less."""
+
+    def __init__(self, session: Session, prefix: str, note: Callable[[str], None]) -> None:
+        self._session, self._prefix, self._note = session, prefix, note
+        self._heard = session.publisher(f"{prefix}/*")
+        self._noted = False
+
+    def send(self, crop: Crop) -> bool:
+        """Publish a crop; return False if there is no subscriber."""
+        if not self._heard.has_subscriber:
+            if not self._noted:
+                self._note(
+                    f"crops are lost: there is no subscriber to {self._prefix}/*;"
+                    " a recorder keeps them, unless its --crops says otherwise"
+                )
+            self._noted = True
+            return False
+        try:
+            self._session.put(f"{self._prefix}/{quote(crop.det_id, safe='')}", crop.jpeg)
+        except TransportError as error:
+            if not self._noted:
+                self._note(str(error))
+            self._noted = True
+            return False
+        return True
+
+
+def _encode(envelope: dict[str, Any]) -> bytes:
+    return json.dumps(envelope, ensure_ascii=False, separators=(",", ":")).encode()
 
 
 @dataclass(frozen=True, slots=True)

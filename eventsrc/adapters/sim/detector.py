@@ -28,10 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import MODELS
-from .house import House, Thing
+from .floorplan import wrap
+from .house import MODELS, House, Thing
 from .random_streams import Vector, bernoulli, direction, normal, normals, stream, uniform, unit
-from .shapes import wrap
 from .tour import TruePose
 
 WIDTH_PX, HEIGHT_PX = 640, 400

@@ -14,7 +14,7 @@ import numpy as np
 
 from eventsrc.base.errors import MapfoldError
 
-from .shapes import Point, Rect, Walls, rect_clearance
+from .floorplan import Point, Rect, Walls, rect_clearance
 
 CLEARANCE_M = 0.28
 _COMFORT_M = 0.45

@@ -35,10 +35,10 @@ from eventsrc.envelope.model import RunId
 from eventsrc.record.transport.session import Session
 
 from .detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, Box
+from .floorplan import Rect
 from .house import House, build_house
 from .random_streams import stream
 from .run import DEFAULT_SEED, encode, noisy_pose, start_of
-from .shapes import Rect
 from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
 
 Colour = tuple[int, int, int]

@@ -24,9 +24,9 @@ from eventsrc.envelope.model import KeyframeId, RunId, default_det_id
 from eventsrc.record.transport.session import Session
 
 from .detector import detect, visible_objects
+from .floorplan import wrap
 from .house import House, build_house
 from .random_streams import normal, stream
-from .shapes import wrap
 from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
 
 DEFAULT_SEED = 7

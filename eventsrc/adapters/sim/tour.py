@@ -21,11 +21,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .floorplan import HALL, OPENING_M, Room
+from .floorplan import HALL, OPENING_M, Point, Room, wrap
 from .grid import DriveGrid
 from .house import House
 from .random_streams import bernoulli, stream, uniform
-from .shapes import Point, wrap
 
 EXPLORER = "a"
 _TWO_VIEWS_FROM_M = 5.0

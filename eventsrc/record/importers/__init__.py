@@ -10,7 +10,7 @@ from .run import (
     check_sources,
     import_files,
 )
-from .topics import TopicChoice
+from .sources import TopicChoice
 
 __all__ = [
     "DEFAULT_KEY",

@@ -29,7 +29,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.envelope.ingest import check_cost
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 
-from .source import ImportedMessage
+from .sources import ImportedMessage
 
 _DECODER = json.JSONDecoder()
 _SPACE = " \t\r\n"

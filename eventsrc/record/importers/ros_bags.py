@@ -17,7 +17,7 @@ from eventsrc.ros.stream import Counts
 
 from .bag_files import Bag, BagContents, bag_name
 from .bag_streams import BagOptions, Choice, choose, sampled
-from .source import ImportedMessage
+from .sources import ImportedMessage
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ duplicate keyframes, so the map is the same.
 """
 
 import sys
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.forms import BARE_LIST_VERSION
@@ -26,11 +27,19 @@ from eventsrc.record.append import Checked, NewMap, check_payloads, checked_even
 from .bag_files import METADATA, START_BYTES, is_bag, is_file_of_a_bag
 from .bag_streams import BagOptions
 from .json_lines import JsonLines
-from .log_times import LogTimes
-from .mcap_files import MCAP_MAGIC, McapFile, OtherLog
 from .ros_bags import BagReport, RosBag
-from .source import ImportedMessage, Source
-from .topics import NO_ENVELOPES, NOT_CHOSEN, PassedOver, TopicChoice, looks_like_envelope
+from .sources import (
+    MCAP_MAGIC,
+    NO_ENVELOPES,
+    NOT_CHOSEN,
+    ImportedMessage,
+    McapFile,
+    OtherLog,
+    PassedOver,
+    Source,
+    TopicChoice,
+    looks_like_envelope,
+)
 
 DEFAULT_KEY = "tb/detections"
 STDIN = "-"
@@ -103,7 +112,7 @@ def import_files(
 ) -> ImportReport:
     """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
     without a key get ``key``. Without a time of receipt the log time of an envelope is its stamp
-    (`log_times`), that of anything else the log time of the message before it.
+    (`LogTimes`), that of anything else the log time of the message before it.
 
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
@@ -376,3 +385,52 @@ def _open_file(name: str, files: ExitStack) -> tuple[BinaryIO, int | None]:
 def _peek(file: BinaryIO) -> bytes:
     data: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
     return data
+
+
+TOGETHER_NS: Final = 10 * 1_000_000_000
+"""A run whose first stamp is at most this long before the last log time counts as simultaneous."""
+CLOCK_SET_NS: Final = 24 * 3600 * 1_000_000_000
+"""A keyframe stamped longer than this before its run's latest log time means that the robot's clock
+was set back."""
+
+
+class LogTimes:
+    """The log times of messages, in the order in which they are appended; int nanoseconds.
+
+    Each takes logarithmic time, whatever the number of runs.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._starts: dict[RunId, int] = {}
+        """The number of the first message of each run, or of the first since its clock was set."""
+        self._numbers: list[int] = []
+        self._peaks: list[int] = []
+        """The log times that are higher than those of all later messages, so in falling order;
+        ``_numbers`` are the numbers of their messages."""
+        self.last_ns: int | None = None
+
+    def add(self, logged_ns: int) -> int:
+        """Add a message with the log time ``logged_ns``, which is returned."""
+        while self._peaks and self._peaks[-1] <= logged_ns:
+            self._peaks.pop()
+            self._numbers.pop()
+        self._peaks.append(logged_ns)
+        self._numbers.append(self._count)
+        self._count += 1
+        self.last_ns = logged_ns
+        return logged_ns
+
+    def add_stamped(self, run_id: RunId, stamp_ns: int) -> int:
+        """Add a keyframe of a run by its stamp; return its log time."""
+        start = self._starts.get(run_id)
+        if start is None:
+            together = self.last_ns is not None and 0 <= self.last_ns - stamp_ns <= TOGETHER_NS
+            latest_ns = self.last_ns if together else None
+        else:
+            latest_ns = self._peaks[bisect_left(self._numbers, start)]
+            if latest_ns - stamp_ns > CLOCK_SET_NS:
+                start = latest_ns = None
+        if start is None:
+            self._starts[run_id] = self._count
+        return self.add(stamp_ns if latest_ns is None else max(stamp_ns, latest_ns))

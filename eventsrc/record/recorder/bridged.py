@@ -1,15 +1,36 @@
 """Record messages of a zenoh-bridge-ros2dds verbatim, and the envelopes that they complete.
 
-Zenoh's threads put messages into the queue and note tokens of types. The writer thread gives the
-messages to `Bridge.take`, which finds the type of each and returns what is to be appended: the
-message with its schema, and right behind it the envelopes that it completes (`eventsrc.ros`).
+Keys, types and caches: a message of topic ``/tf`` comes under the key ``tf``, or ``bot1/tf`` from a
+bridge whose namespace is ``/bot1``. Its payload is the message in CDR, with the four bytes of
+encapsulation before it. In a log its topic is the key with a slash before it. The type is in a
+liveliness token that the bridge declares for each topic that it publishes, with ``§`` for each
+slash of the key and of the type::
 
-A message whose type no token has given yet is held back, for at most `HOLD_NS` and within
-`HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema, and no envelope is made of it.
-Messages of one topic keep their order. Only messages under keys of no topic are left out; they are
-counted.
+    @/<zenoh id>/@ros2_lv/MP/bot1§tf/tf2_msgs§msg§TFMessage/<quality of service>
+    @ros2_lv/<zenoh id>/MP/…                                     (older bridges)
+
+The last messages of a transient-local topic (``/tf_static``) are in a cache of the bridge, which
+answers queries::
+
+    bot1/tf_static/@adv/pub/**
+    @/<zenoh id>/@ros2_pub_cache/bot1/tf_static  (older bridges)
+
+Recording: Zenoh's threads put messages into the queue and note tokens of types. The writer thread
+gives the messages to `Bridge.take`, which finds the type of each and returns what is to be
+appended: the message with its schema, and right behind it the envelopes that it completes
+(`eventsrc.ros`). A message whose type no token has given yet is held back, for at most `HOLD_NS`
+and within `HOLD_MESSAGES` and `HOLD_BYTES`; then it is kept without a schema, and no envelope is
+made of it. Messages of one topic keep their order. Only messages under keys of no topic are left
+out; they are counted.
+
+After a kill: a recorder may have written a message and not yet what it completes, and detections
+that waited for a pose were not made into an envelope at all. Both follow from the messages in the
+log (`eventsrc.ros.derivation`), so the next recorder appends them before it records
+(`append_missing`). It must read the last recording's messages once; after a regular end there is
+nothing to do. A recording that has lost events to damage is left as it is.
 """
 
+import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,18 +38,86 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import msgspec
+from pydantic import ValidationError
 
-from eventsrc.envelope.model import ENVELOPE_VERSION
-from eventsrc.envelope.system_events import MAP_KEY
-from eventsrc.log import MessageFormat
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
+from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
+from eventsrc.record.append import append_payload, map_event
 from eventsrc.record.transport.session import Received
-from eventsrc.ros.bridge_keys import key_of, type_of_token
-from eventsrc.ros.derivation import CDR, ROS2MSG, Derivation, Derived, RosRecording
+from eventsrc.ros.derivation import (
+    CDR,
+    ROS2MSG,
+    Derivation,
+    Derived,
+    RosRecording,
+    derive,
+    identity_of,
+    recording_of,
+)
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.stream import Counts
 
 from .checking import CheckedMessage
 from .queue import BridgedMessage
+
+SLASH: Final = "§"
+MAX_TOKEN: Final = 4_096
+_ANY_KEY: Final = "?_anyke"
+"""The parameter of a query that accepts answers under other keys than its own."""
+_TOKEN: Final = re.compile(r"(?:@/[^/]+/@ros2_lv|@ros2_lv/[^/]+)/MP/([^/]+)/([^/]+)(?:/.*)?")
+_TYPE: Final = re.compile(r"[A-Za-z]\w{0,99}/msg/[A-Za-z]\w{0,99}", re.ASCII)
+_NAME: Final = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+_MAX_NAME: Final = 500
+
+
+def topic_of(namespace: str, topic: str, option: str) -> str:
+    """The topic in a log of messages of the ROS topic ``topic`` from a bridge with ``namespace``.
+    Raises MisuseError, which names ``option``, for an invalid name."""
+    name = topic.removeprefix("/")
+    if not _is_name(name):
+        raise MisuseError(
+            f"{option} {visible(repr(topic[:80]))} is no name of a ROS 2 topic; examples: "
+            "/detections, /camera/detections"
+        )
+    bare = namespace.strip("/")
+    if bare and not _is_name(bare):
+        raise MisuseError(
+            f"--namespace {visible(repr(namespace[:80]))} is no ROS 2 namespace; example: /bot1"
+        )
+    return f"/{bare}/{name}" if bare else f"/{name}"
+
+
+def _is_name(text: str) -> bool:
+    return len(text) <= _MAX_NAME and _NAME.fullmatch(text) is not None
+
+
+def key_of(topic: str) -> str:
+    """The Zenoh key of a topic in a log."""
+    return topic.removeprefix("/")
+
+
+def token_selectors(key: str) -> tuple[str, ...]:
+    """The key expressions that match the type tokens of a key, of current and older bridges."""
+    escaped = key.replace("/", SLASH)
+    return f"@/*/@ros2_lv/MP/{escaped}/**", f"@ros2_lv/*/MP/{escaped}/**"
+
+
+def cache_selectors(key: str) -> tuple[str, ...]:
+    """The queries for the cached messages of a key, of current and older bridges."""
+    return f"{key}/@adv/pub/**{_ANY_KEY}", f"@/*/@ros2_pub_cache/{key}{_ANY_KEY}"
+
+
+def type_of_token(token: str) -> tuple[str, str] | None:
+    """Key and type (``tf2_msgs/msg/TFMessage``) of a token; None if it is no token of a topic."""
+    found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN else None
+    if found is None:
+        return None
+    key, type_name = (part.replace(SLASH, "/") for part in found.groups())
+    return (key, type_name) if _TYPE.fullmatch(type_name) else None
+
 
 HOLD_NS: Final = 10_000_000_000
 HOLD_MESSAGES: Final = 4_096
@@ -212,3 +301,70 @@ def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]
         for message in check([Received(derived.key, derived.payload)]):
             # no robot sent it, so none is answered
             yield msgspec.structs.replace(message, sha256="")
+
+
+def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:
+    """Append the events that follow from the messages of the log's last recording of ROS and are
+    not in it, and end that recording; returns how many. Raises LogDamaged."""
+    last = None
+    for event in reader.read(keys={ROS_KEY}):
+        last = event
+    if last is None:
+        return 0
+    recording = recording_of(last)
+    if not recording.streams:
+        return 0
+    missing = _missing(reader, Offset(last.offset), types)
+    for derived in missing:
+        if derived.key == MAP_KEY:
+            writer.append_all([map_event(derived.payload, writer.now_ns())])
+        else:
+            append_payload(writer, derived.key, derived.payload)
+    writer.append(ROS_KEY, RosRecording(key=recording.key).encode())
+    writer.sync()
+    return len(missing)
+
+
+def message_of(event: Event) -> tuple[str, str] | None:
+    """Type and definition of an event that is a message of ROS in CDR, with its schema."""
+    if not isinstance(event, VerbatimEvent):
+        return None
+    form = event.format
+    if form.encoding != CDR or not form.schema_text:
+        return None
+    return form.schema, form.schema_text.decode(errors="replace")
+
+
+def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Derived]:
+    made: dict[tuple[str, int] | None, Derived] = {}
+    maps: deque[Derived] = deque()
+    has_losses = False
+
+    def watched() -> Iterator[Event]:
+        """Yield the events, and remove those that the log has from ``made`` and ``maps``."""
+        nonlocal has_losses
+        for event in reader.read(start):
+            has_losses = has_losses or _is_rot(event)
+            if event.key == MAP_KEY and maps:
+                maps.popleft()
+            elif event.is_envelope:
+                made.pop(identity_of(event.payload), None)
+            yield event
+
+    for _, derived in derive(watched(), types, message_of):
+        if derived.key == MAP_KEY:
+            maps.append(derived)
+        else:
+            made[identity_of(derived.payload)] = derived
+    return [] if has_losses else [*maps, *made.values()]
+
+
+def _is_rot(event: Event) -> bool:
+    """Whether an event replaces a lost one. If that was a message of ROS, the keyframes after it
+    would get other numbers."""
+    if event.key != LOSS_KEY:
+        return False
+    try:
+        return Loss.model_validate_json(event.payload).cause == "rot"
+    except ValidationError:
+        return False

@@ -28,7 +28,7 @@ from eventsrc.record.append import NewMap, check_payloads, map_event, rejected_e
 from eventsrc.record.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
 from eventsrc.record.transport.session import Received
 
-from .edit_requests import EditRequest
+from .edits import EditRequest
 from .queue import MAX_BATCH_BYTES, BridgedMessage, CropMessage, MessageQueue
 
 CROP_FORMAT: Final = MessageFormat(

@@ -23,7 +23,7 @@ from eventsrc.record.robot.acks import SENT_SUFFIX
 from eventsrc.record.transport.config import MAX_KEY_BYTES
 from eventsrc.record.transport.session import Received, SequenceNumber
 
-from .edit_requests import MAX_EDITS_WAITING, EditRequest
+from .edits import MAX_EDITS_WAITING, EditRequest
 
 MAX_SOURCES: Final = 4_096
 _NUMBERS: Final = 2**32

@@ -10,6 +10,7 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogWriter
+from eventsrc.record.recorder.bridged import cache_selectors, token_selectors
 from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
 from eventsrc.record.transport.session import (
     Query,
@@ -18,11 +19,9 @@ from eventsrc.record.transport.session import (
     SizeLimit,
     check_keys,
 )
-from eventsrc.ros.bridge_keys import cache_selectors, token_selectors
 
 from .bridged import Bridge
-from .edit_requests import EditRequest, Edits, fault_of, refuse_query
-from .edits import edit_key
+from .edits import EditRequest, Edits, edit_key, fault_of, refuse_query
 from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 

@@ -16,7 +16,7 @@
 * Losses are recorded about once a second, not one by one, to spare an overloaded recorder.
 * `check_payloads` rejects messages under ``mapfold/``: they could forge a loss or a command.
 * A message of a bridge (`bridged`) is appended with what it completes right behind it.
-* A command that came as a query (`edit_requests`) is appended behind the messages of its batch and
+* A command that came as a query (`edits`) is appended behind the messages of its batch and
   synced at once. It is not counted as a message.
 """
 
@@ -50,7 +50,7 @@ from eventsrc.ros.stream import Counts
 
 from .bridged import Bridge
 from .checking import CROP_FORMAT, Batch, CheckedMessage, Checker
-from .edit_requests import EditRequest, Edits
+from .edits import EditRequest, Edits
 from .queue import MessageQueue
 
 

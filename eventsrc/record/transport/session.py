@@ -38,10 +38,14 @@ from .declarations import (
     Subscription,
     check_key_length,
     heartbeats_under,
+    ignore_transport_errors,
+    is_panic,
+    one_line,
+    open_error,
     parse_heartbeat,
     sequence_number,
+    transport_errors,
 )
-from .errors import ignore_transport_errors, is_panic, one_line, open_error, transport_errors
 
 __all__ = [
     "Mode",

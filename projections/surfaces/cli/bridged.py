@@ -15,9 +15,7 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.recorder import DEFAULT_KEYS, RecorderReport
-from eventsrc.record.recorder.bridged import Bridge
-from eventsrc.record.recorder.unfinished import append_missing
-from eventsrc.ros.bridge_keys import topic_of
+from eventsrc.record.recorder.bridged import Bridge, append_missing, topic_of
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream

@@ -8,33 +8,38 @@ from typing import Annotated, Final
 
 import typer
 
-from eventsrc.adapters.detector.encoder import Encoder, read_preparation
-from eventsrc.adapters.detector.files import open_images
-from eventsrc.adapters.detector.finder import (
-    CONFIDENCE,
-    MOST,
-    OVERLAP,
-    SIZE,
-    Finder,
-    FinderOptions,
-    read_labels,
-)
-from eventsrc.adapters.detector.gate import AFTER_S, MOVED_M, TURNED_DEG, KeyframeGate
 from eventsrc.adapters.detector.heads import HEADS
-from eventsrc.adapters.detector.keyframes import Keyframes
-from eventsrc.adapters.detector.live import QUEUE, LivePictures
+from eventsrc.adapters.detector.keyframes import (
+    AFTER_S,
+    MOVED_M,
+    TURNED_DEG,
+    KeyframeGate,
+    Keyframes,
+)
 from eventsrc.adapters.detector.onnx_model import OnnxModel
-from eventsrc.adapters.detector.outputs import (
+from eventsrc.adapters.detector.picture import Picture
+from eventsrc.adapters.detector.picture_sources import QUEUE, LivePictures, open_images
+from eventsrc.adapters.detector.poses import NoPoses, Poses, poses_of_file
+from eventsrc.adapters.detector.service import (
     CROPS_KEY,
     CropSender,
+    Detection,
     FileOutput,
     Output,
     ZenohOutput,
 )
-from eventsrc.adapters.detector.picture import Picture
-from eventsrc.adapters.detector.poses import NoPoses, Poses, poses_of_file
-from eventsrc.adapters.detector.service import Detection
 from eventsrc.adapters.detector.vision import check_installed
+from eventsrc.adapters.detector.vision_models import (
+    CONFIDENCE,
+    MOST,
+    OVERLAP,
+    SIZE,
+    Encoder,
+    Finder,
+    FinderOptions,
+    read_labels,
+    read_preparation,
+)
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.record.robot.publisher import EnvelopePublisher

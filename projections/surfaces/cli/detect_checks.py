@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from eventsrc.adapters.detector.files import Timing
-from eventsrc.adapters.detector.gate import AFTER_S, GateLimits
+from eventsrc.adapters.detector.keyframes import AFTER_S, GateLimits
 from eventsrc.adapters.detector.onnx_model import Device
+from eventsrc.adapters.detector.picture_sources import Timing
 from eventsrc.base.clock import system_clock
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible

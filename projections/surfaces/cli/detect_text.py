@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from eventsrc.adapters.detector.live import LivePictures
+from eventsrc.adapters.detector.picture_sources import LivePictures
 from eventsrc.adapters.detector.poses import NEAR_S
 from eventsrc.adapters.detector.service import Detection, Report
 from eventsrc.base.advised import advised

@@ -25,8 +25,7 @@ from eventsrc.record.importers import (
     import_files,
 )
 from eventsrc.record.importers.map_yaml import read_map_yaml
-from eventsrc.record.importers.source import Source
-from eventsrc.record.importers.topics import NOT_CHOSEN
+from eventsrc.record.importers.sources import NOT_CHOSEN, Source
 from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines

@@ -16,8 +16,7 @@ from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.record.gap_history import fold_and_save_ledger
 from eventsrc.record.recorder import DEFAULT_CROPS, DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
-from eventsrc.record.recorder.edit_requests import Edits, KnownCommands
-from eventsrc.record.recorder.edits import EDIT_PREFIX, edit_key
+from eventsrc.record.recorder.edits import EDIT_PREFIX, Edits, KnownCommands, edit_key
 from eventsrc.record.transport.config import parse_address
 from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes

@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from eventsrc.adapters.detector.encoder import Encoder, read_preparation
 from eventsrc.adapters.detector.onnx_model import Device, OnnxModel
 from eventsrc.adapters.detector.picture import PictureError, Pixels
 from eventsrc.adapters.detector.vision import check_installed, decode
+from eventsrc.adapters.detector.vision_models import Encoder, read_preparation
 from eventsrc.adapters.reembedding import DEFAULT_BATCH, DEFAULT_TOPIC, Reembedding, Vector, reembed
 from eventsrc.base.advised import advised
 from eventsrc.base.text import counted, visible

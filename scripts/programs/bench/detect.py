@@ -15,16 +15,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from eventsrc.adapters.detector import encoder as encoder_module
 from eventsrc.adapters.detector import files, finder, keyframes
-from eventsrc.adapters.detector.encoder import Encoder, read_preparation
-from eventsrc.adapters.detector.files import Timing, open_images
-from eventsrc.adapters.detector.finder import Finder, FinderOptions
-from eventsrc.adapters.detector.gate import GateLimits, KeyframeGate
-from eventsrc.adapters.detector.keyframes import Keyframes
+from eventsrc.adapters.detector import vision_models as encoder_module
+from eventsrc.adapters.detector.keyframes import GateLimits, KeyframeGate, Keyframes
 from eventsrc.adapters.detector.onnx_model import OnnxModel
-from eventsrc.adapters.detector.outputs import FileOutput
+from eventsrc.adapters.detector.picture_sources import Timing, open_images
 from eventsrc.adapters.detector.poses import poses_of_file
+from eventsrc.adapters.detector.service import FileOutput
+from eventsrc.adapters.detector.vision_models import (
+    Encoder,
+    Finder,
+    FinderOptions,
+    read_preparation,
+)
 from eventsrc.adapters.sim import build_house
 from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
 from eventsrc.envelope.model import RunId
