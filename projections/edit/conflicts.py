@@ -19,7 +19,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import DetId, KeyframeId, RunId
 from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.pair_groups import ApartPairs
-from projections.map.command_text import command_on
+from projections.map.phrases import command_on
 
 from .current import CurrentMap
 

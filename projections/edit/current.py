@@ -14,7 +14,7 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.history import NoSuchThing
-from projections.map.log_commands import read_commands
+from projections.map.own_events import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after

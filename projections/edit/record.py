@@ -19,7 +19,7 @@ from eventsrc.log.lock import is_held
 from eventsrc.record.recorder.edits import NewerCommand, NoAnswer, send_command
 from eventsrc.record.transport.session import Session
 from projections.fold.corrections import check_settings
-from projections.map.log_commands import read_commands
+from projections.map.own_events import read_commands
 
 from .conflicts import EditRefused
 from .current import CurrentMap, SettingsOf

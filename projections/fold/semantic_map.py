@@ -106,7 +106,7 @@ class SemanticMap:
         self.adjacency = Adjacency()
         self.current_map = CurrentMap(settings, self.floors)
         self.observation_count = 0
-        self.reembedded: Reembedded | None = None  # by `projections.map.space_vectors`
+        self.reembedded: Reembedded | None = None  # by `projections.map.own_events`
         self._has_vectors = bool(corrections.reembedded_for(settings))
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:

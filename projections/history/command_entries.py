@@ -24,7 +24,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
 from projections.fold.pose_corrections import PoseCorrection
-from projections.map.command_text import command_document, command_name, command_title
+from projections.map.phrases import command_document, command_name, command_title
 from projections.store.history import History
 from projections.store.records import Cause, PlaceHistory, Refusal
 

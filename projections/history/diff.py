@@ -13,8 +13,8 @@ import msgspec
 
 from eventsrc.envelope.model import Offset, RunId
 from projections.fold.corrections import RecordedCommand
-from projections.map.command_text import command_document
 from projections.map.digest import map_digest
+from projections.map.phrases import command_document
 from projections.map.records import Estimate, KeyframeRecord, Relocation
 from projections.map.view import MapView
 from projections.store.records import Cause

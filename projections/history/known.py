@@ -16,8 +16,9 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.errors import FoldError, LogPointError
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, FoldedEvent, fold_events
-from projections.map.space_vectors import new_map
+from projections.map.fold import FoldedEvent, fold_events
+from projections.map.own_events import new_map
+from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_recorder import HistoryRecorder

@@ -24,7 +24,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import RecordedCommand
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceLink, PlaceOrdinal
-from projections.map.command_text import command_document, command_on, command_title
+from projections.map.phrases import command_document, command_on, command_title
 from projections.store.history import History
 from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal
 

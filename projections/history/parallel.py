@@ -41,9 +41,9 @@ from projections.fold.deltas import (
 )
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import ParsedEvent, fold_parsed, read_ahead
-from projections.map.parsing import parsed_stretches
-from projections.map.space_vectors import new_map
+from projections.map.fold import fold_parsed, read_ahead
+from projections.map.own_events import new_map
+from projections.map.parsing import ParsedEvent, parsed_stretches
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter
 from projections.store.history import History

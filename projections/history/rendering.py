@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from eventsrc.base.text import counted, table
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
-from projections.map.command_text import command_title
+from projections.map.phrases import command_title
 from projections.map.records import Estimate
 from projections.store.history import History
 from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal

@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent
-from projections.map.log_commands import read_commands
+from projections.map.own_events import read_commands
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.records import Cause, Merge

@@ -12,8 +12,8 @@ from eventsrc.envelope.model import DetId, Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
-from projections.map.command_text import command_document, command_name
 from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
+from projections.map.phrases import command_document, command_name
 from projections.store.history_rows import NEVER
 
 from .known import Progress

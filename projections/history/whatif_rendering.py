@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from eventsrc.base.text import table
 from eventsrc.envelope.model import Offset
-from projections.map.command_text import command_title
 from projections.map.partitions import Regrouping
+from projections.map.phrases import command_title
 
 from .rendering import shortened
 from .whatif import Alternative, WhatIf

@@ -10,7 +10,7 @@ from projections.fold.exact import UM_PER_M
 from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
-from .command_text import command_document
+from .phrases import command_document
 from .records import ObjectRecord
 from .view import MapView
 

@@ -15,11 +15,8 @@ from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 
-from .parsing import READ_AHEAD as READ_AHEAD
-from .parsing import ParsedEvent as ParsedEvent
-from .parsing import parse_events as parse_events
-from .parsing import parsed_stretches
-from .space_vectors import new_map
+from .own_events import new_map
+from .parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from .view import MapView
 
 _MOST_AHEAD = 1024

@@ -1,4 +1,5 @@
-"""The records of a `MapView`: its runs, keyframes, observations, places and Objects.
+"""The records of a `MapView`: its runs, keyframes, observations, places and Objects, and what is in
+each place.
 
 Records are written by `MapView.apply` only. ``ordinal`` numbers the things of a kind in the order
 in which the fold met or founded them. Positions are integer micrometres (``_um``) and exact; ``_m``
@@ -6,6 +7,7 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import msgspec
@@ -21,6 +23,7 @@ from projections.fold.deltas import (
     UnitVector,
 )
 from projections.fold.exact import UM_PER_M, mean_m
+from projections.fold.place_types import ONCE
 from projections.fold.survivors import PlaceSurvivors
 
 _UM2_PER_M2 = UM_PER_M * UM_PER_M
@@ -209,3 +212,33 @@ class ObjectRecord:
     def mean_y(self) -> float:
         """Metres; the mean of the positions the robot observed it from."""
         return mean_m(self.sum_y_um, self.obs_count)
+
+
+class PlaceContents:
+    """Counts of Objects by place and class; `update` is to be called after every change of an
+    Object. One that was observed once is counted apart (`place_types.ONCE`). ``touched`` are the
+    places whose counts have changed since it was emptied last."""
+
+    def __init__(self) -> None:
+        # place → class → Objects observed once, and more often
+        self._counts: dict[PlaceOrdinal, dict[str, list[int]]] = {}
+        self.touched: set[PlaceOrdinal] = set()
+
+    def update(self, found: ObjectRecord) -> None:
+        """Replace the Object's earlier count by its current one."""
+        place = found.place
+        now = None if place is None else (place, found.class_name, found.obs_count > 1)
+        before = found.counted_as
+        if now == before:
+            return
+        found.counted_as = now
+        for key, change in ((before, -1), (now, 1)):
+            if key is not None:
+                in_place = self._counts.setdefault(key[0], {})
+                in_place.setdefault(key[1], [0, 0])[key[2]] += change
+                self.touched.add(key[0])
+
+    def of(self, place: PlaceOrdinal) -> Mapping[str, float]:
+        """The weight of each class in a place."""
+        counts = self._counts.get(place, {})
+        return {name: often + ONCE * once for name, (once, often) in counts.items()}

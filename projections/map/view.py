@@ -23,12 +23,12 @@ from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
 from projections.fold.survivors import ObjectSurvivors, PlaceSurvivors
 
-from .place_contents import PlaceContents
 from .records import (
     Estimate,
     KeyframeRecord,
     ObjectRecord,
     ObservationRecord,
+    PlaceContents,
     PlaceRecord,
     Relocation,
     RunRecord,

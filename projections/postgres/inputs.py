@@ -19,7 +19,7 @@ from projections.fold.corrections import (
 )
 from projections.fold.pair_groups import ApartPairs
 from projections.fold.settings import Settings
-from projections.map.log_commands import read_command, read_commands
+from projections.map.own_events import read_command, read_commands
 
 SettingsOf: TypeAlias = Callable[[Corrections], Settings]
 """The settings that a map is made with under a log's corrections, which may name some."""

@@ -14,7 +14,7 @@ from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader, event_hash, follow
 from projections.fold.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.fold.settings import Settings
-from projections.map.log_commands import read_command
+from projections.map.own_events import read_command
 from projections.store.column_rows import TableWriter
 from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
 from projections.store.timeline_cache import TimelineCache

@@ -23,8 +23,9 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_co
 from projections.fold.errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, fold_into, fold_log, parse_events
-from projections.map.space_vectors import new_map
+from projections.map.fold import fold_events, fold_into, fold_log
+from projections.map.own_events import new_map
+from projections.map.parsing import READ_AHEAD, parse_events
 from projections.map.view import MapView
 
 from .column_rows import TableWriter

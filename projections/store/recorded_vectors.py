@@ -12,8 +12,8 @@ from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.exact import Units
-from projections.map.fold import READ_AHEAD, parse_events
-from projections.map.space_vectors import vectors_of
+from projections.map.own_events import vectors_of
+from projections.map.parsing import READ_AHEAD, parse_events
 
 from .history import History
 

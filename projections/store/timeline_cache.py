@@ -43,7 +43,7 @@ from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.digest import VERSION
-from projections.map.space_vectors import with_vectors
+from projections.map.own_events import with_vectors
 
 from .columns import Stripe, joined_short
 from .part_file import FORMAT, Part, Unwritable, write_part

@@ -20,7 +20,7 @@ from eventsrc.envelope.system_events import COMMAND_KEY, MAP_KEY
 from eventsrc.log import LogReader
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.surfaces.cli.folded_log import settings_from
 from tests.docs.console import ROOT, Command, matches, read
 from tests.support.commands import Commands, Said

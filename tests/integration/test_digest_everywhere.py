@@ -31,7 +31,8 @@ import numpy as np
 from eventsrc.envelope.ingest import ingest
 from eventsrc.log import Event
 from projections.map.digest import map_digest
-from projections.map.fold import READ_AHEAD, fold_events
+from projections.map.fold import fold_events
+from projections.map.parsing import READ_AHEAD
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.view import MapView

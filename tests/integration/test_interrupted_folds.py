@@ -12,7 +12,7 @@ from mapfold import Settings, Timeline, fold, open_log
 from eventsrc.log import LogReader
 from projections.fold.errors import FoldInterrupted
 from projections.map.digest import map_digest
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.postgres.live_fold import LiveFold
 from tests.property.test_timeline_cache import kept_early
 from tests.support.commands import interrupt, moments_of

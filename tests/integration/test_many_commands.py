@@ -33,8 +33,7 @@ from projections.history.parallel import Rules, fold_in_this_process
 from projections.localize.calibrate.rounds import calibrate
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
-from projections.map.log_commands import read_corrections
-from projections.map.space_vectors import new_map
+from projections.map.own_events import new_map, read_corrections
 from projections.map.view import MapView
 from projections.postgres.connection import Targets
 from projections.postgres.inputs import LogInputs

@@ -10,7 +10,7 @@ from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, rank, read_crops
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher

@@ -19,7 +19,7 @@ import pytest
 from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter
-from projections.map import parsed_log, parsing_process
+from projections.map import parsed_log
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import parsed_stretches
 from tests.property.test_parsed_bytes import comparable
@@ -170,7 +170,7 @@ def test_processes_killed_at_random_moments(log: Path) -> None:
 
 @pytest.mark.slow
 def test_a_stopped_process_is_given_up(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parsing_process, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(parsed_log, "PATIENCE_S", 0.2)
     with parsing(log, 1) as parsed:
         os.kill(pids(parsed)[0], signal.SIGSTOP)
         assert gathered(parsed.stretches()) == one_process(log)
@@ -198,7 +198,7 @@ def test_entries_of_the_module_path_that_python_passes_over(
 
 @pytest.mark.slow
 def test_a_process_that_ends_at_once(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parsing_process, "_PROGRAM", "raise SystemExit(1)")
+    monkeypatch.setattr(parsed_log, "_PROGRAM", "raise SystemExit(1)")
     with parsing(log, 2) as parsed:
         assert gathered(parsed.stretches()) == one_process(log)
         assert (parsed.started, parsed.lost) == (2, 2)
@@ -208,13 +208,13 @@ def test_a_process_that_ends_at_once(log: Path, monkeypatch: pytest.MonkeyPatch)
 def test_events_that_no_slot_has_room_for(
     tmp_path: Path, here: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parsing_process, "SLOT_BYTES", 64 * 1024)
+    monkeypatch.setattr(parsed_log, "SLOT_BYTES", 64 * 1024)
     monkeypatch.setattr(
-        parsing_process,
+        parsed_log,
         "_PROGRAM",
-        parsing_process._PROGRAM.replace("main(", "m.SLOT_BYTES = 65536; m.main(").replace(
-            "from projections.map.parsing_process import main",
-            "import projections.map.parsing_process as m",
+        parsed_log._PROGRAM.replace("main(", "m.SLOT_BYTES = 65536; m.main(").replace(
+            "from projections.map.parsed_log import main",
+            "import projections.map.parsed_log as m",
         ),
     )
     path, vector = tmp_path / "log", [1.0] * 8000

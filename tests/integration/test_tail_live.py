@@ -206,7 +206,7 @@ def test_parked_events_are_tried_again(
 
     monkeypatch.setattr("projections.postgres.retry.read_envelope", lenient)
     monkeypatch.setattr(
-        "projections.map.parsing.read_envelopes",
+        "projections.map.fold.read_envelopes",
         lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
     )
     reports = retry(log, one_database, SETTINGS)

@@ -13,7 +13,7 @@ from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, LogReader
 from projections.fold.folded_ids import content_digest
-from projections.map.parsed_bytes import NoRoom, pack, unpack
+from projections.map.parsed_log import NoRoom, pack, unpack
 from projections.map.parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from tests.support.envelopes import fields_of
 from tests.support.logs import write_random_log

@@ -30,6 +30,7 @@ from projections.history.merges import merge_document, object_merge_document, re
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
 from projections.map.fold import fold_events
+from projections.map.own_events import new_map
 from projections.map.records import (
     Estimate,
     KeyframeRecord,
@@ -39,7 +40,6 @@ from projections.map.records import (
     Relocation,
     RunRecord,
 )
-from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.records import ObjectHistory, count_before, last_before

@@ -28,7 +28,7 @@ from projections.fold.exact import Q40
 from projections.fold.place_types import place_type
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.map.view import MapView
 from projections.postgres import TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets, connect

@@ -41,7 +41,7 @@ from eventsrc.log import Event, MessageFormat
 from eventsrc.log.format import schema_of
 from projections.fold.deltas import MapGiven, PlacesMerged
 from projections.fold.deltas import Pose as MapPose
-from projections.map.moments import format_of
+from projections.map.scenes import format_of
 from projections.map.view import MapView
 
 from .scene import FRAME, height, map_scene, timestamp

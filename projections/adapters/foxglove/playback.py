@@ -33,11 +33,12 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
-from projections.map.change_lines import change_lines
 from projections.map.digest import map_digest
-from projections.map.fold import READ_AHEAD, fold_events
-from projections.map.moments import Moments
-from projections.map.space_vectors import new_map
+from projections.map.fold import fold_events
+from projections.map.own_events import new_map
+from projections.map.parsing import READ_AHEAD
+from projections.map.phrases import change_lines
+from projections.map.scenes import Moments
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter
 from projections.store.history import History

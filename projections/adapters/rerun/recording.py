@@ -30,7 +30,7 @@ from eventsrc.base.errors import MapfoldError
 from eventsrc.base.output_files import OutputFile, written_whole
 from eventsrc.base.text import visible
 from eventsrc.log import Event
-from projections.map.change_lines import change_lines
+from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold
 from projections.map.view import MapView
 

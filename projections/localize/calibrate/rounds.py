@@ -22,8 +22,8 @@ from projections.fold.envelope_evidence import camera_of
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Camera, LocalizerConstants, Settings
 from projections.map.fold import fold_parsed, read_ahead
+from projections.map.own_events import new_map
 from projections.map.parsing import parsed_stretches
-from projections.map.space_vectors import new_map
 from projections.map.view import MapView
 
 from .geometry import camera_faults, errors, ranges, sizes

@@ -25,8 +25,7 @@ from projections.fold.exact import quantise, to_float32
 from projections.fold.settings import Settings
 from projections.localize import relocalize
 from projections.localize.relocalize import Crop, View
-from projections.map.log_commands import read_corrections
-from projections.map.space_vectors import vectors_of
+from projections.map.own_events import read_corrections, vectors_of
 
 from .truth import Key, Truth
 

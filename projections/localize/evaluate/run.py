@@ -18,7 +18,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.localize.relocalize import Camera, Method
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.map.parsed_log import default_workers
 from projections.map.view import MapView
 

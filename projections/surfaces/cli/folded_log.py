@@ -22,7 +22,7 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.errors import SettingsError
 from projections.fold.settings import PRESETS, Settings, read_settings
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 
 from .terminal import say
 

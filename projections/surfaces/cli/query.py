@@ -10,7 +10,7 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogReader
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.postgres.connection import connect
 from projections.postgres.queries.map_queries import (
     FoldedMap,

@@ -35,7 +35,7 @@ from projections.localize.relocalize import (
     read_moved,
     read_question,
 )
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults

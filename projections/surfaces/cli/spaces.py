@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 from eventsrc.base.text import counted, visible
 from eventsrc.log import LogReader
-from projections.map.space_vectors import log_spaces
+from projections.map.own_events import log_spaces
 
 from .folded_log import LogArgument
 from .options import JsonOption

@@ -22,7 +22,7 @@ from projections.history.whatif import (
 )
 from projections.history.whatif_rendering import whatif_text
 from projections.localize.evaluate.truth import read_truth
-from projections.map.log_commands import read_commands
+from projections.map.own_events import read_commands
 
 from .folded_log import (
     FoldSettings,

@@ -15,7 +15,7 @@ from projections.edit.make import Stamp, name_place, undo_merge
 from projections.edit.record import MakeCommand, record_command
 from projections.fold.corrections import RecordedCommand
 from projections.fold.settings import Settings
-from projections.map.command_text import command_document
+from projections.map.phrases import command_document
 from projections.postgres import RebuildReport, rebuild
 from projections.postgres.connection import Targets
 

@@ -18,8 +18,7 @@ from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
-from projections.map.log_commands import read_corrections
-from projections.map.space_vectors import new_map
+from projections.map.own_events import new_map, read_corrections
 from projections.map.view import MapView
 from projections.postgres.connection import Targets, connect, database_errors
 from projections.postgres.labels import GRAPH, LABELS, TABLE

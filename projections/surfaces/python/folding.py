@@ -13,7 +13,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.errors import SettingsError
 from projections.fold.settings import Settings, read_settings
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 
 from .map import Map
 

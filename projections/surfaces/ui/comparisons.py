@@ -20,7 +20,7 @@ from projections.history.parallel import Rules
 from projections.history.rendering import difference_text, search_text
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
 from projections.history.whatif_rendering import whatif_text
-from projections.map.log_commands import read_commands
+from projections.map.own_events import read_commands
 
 from .log_map import LogMap
 from .log_prefix import PrefixReader

@@ -18,7 +18,7 @@ from eventsrc.envelope.commands import InvalidCommand, UnknownKind, parse_comman
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, LOSS_KEY, REJECTED_KEY, Loss
 from eventsrc.log import Event, LogReader
-from projections.map.command_text import command_title
+from projections.map.phrases import command_title
 from projections.store.history import History
 
 from .binary import Column

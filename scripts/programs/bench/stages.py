@@ -26,7 +26,8 @@ from eventsrc.log import GROUP_COMMIT, Event, LogReader, LogWriter, NewEvent
 from eventsrc.record.append import check_payloads
 from eventsrc.record.robot.acks import payload_sha256
 from projections.fold.settings import Settings
-from projections.map.fold import fold_log, parse_events
+from projections.map.fold import fold_log
+from projections.map.parsing import parse_events
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer

@@ -15,7 +15,7 @@ from projections.fold.settings import PRESETS, Settings
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.map.fold import fold_log
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from tests.support.histories import whole
 
 CHOICES = [

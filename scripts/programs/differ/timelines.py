@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from projections.edit.current import CurrentMap
 from projections.history import Timeline
 from projections.history.parallel import Rules, fold_all
-from projections.map.log_commands import read_corrections
+from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
 from tests.support.histories import whole

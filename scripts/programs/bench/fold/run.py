@@ -21,7 +21,8 @@ from projections.fold.place_members import PosedKeyframe
 from projections.fold.places import Places
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD, fold_events, fold_log
+from projections.map.fold import fold_events, fold_log
+from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 from scripts.programs.bench.fold.plain import fold_plain
 from scripts.programs.bench.fold.streams import (

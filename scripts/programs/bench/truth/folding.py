@@ -10,7 +10,7 @@ from projections.fold.deltas import Delta
 from projections.fold.exact import unit_vectors
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import READ_AHEAD
+from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 
 

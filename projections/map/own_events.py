@@ -1,5 +1,9 @@
-"""Embedding spaces of a log: the vectors added by its ``reembed`` commands, and the number of
-detections with a vector of each space."""
+"""What mapfold's own events add to the fold of a log: commands, and vectors of another space.
+
+Commands are read by key: of sealed segments only the chunks that hold one, by their index. An event
+on ``mapfold/command`` that is no command is an error that names its offset: leaving it out would
+give another map than its author asked for.
+"""
 
 import hashlib
 import sys
@@ -13,20 +17,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.base.advised import advised
-from eventsrc.envelope.commands import Reembed
+from eventsrc.base.garbage import gc_paused
+from eventsrc.envelope.commands import (
+    InvalidCommand,
+    Reembed,
+    UnknownKind,
+    UseSettings,
+    parse_command,
+)
 from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
-from eventsrc.envelope.model import DetId
-from eventsrc.envelope.system_events import EMBEDDINGS_KEY
-from eventsrc.log import LogReader
-from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
+from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY
+from eventsrc.log import Event, LogReader
+from projections.fold.corrections import (
+    NO_CORRECTIONS,
+    Corrections,
+    RecordedCommand,
+    compile_corrections,
+)
 from projections.fold.embedding_space import Reembedded
-from projections.fold.errors import FoldError
+from projections.fold.errors import FoldError, SettingsError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 
-from .log_commands import read_corrections
+
+def read_command(event: Event) -> RecordedCommand:
+    """The command of an event on ``mapfold/command``. Raises FoldError."""
+    try:
+        command = parse_command(event.payload)
+        if isinstance(command, UseSettings):
+            Settings.from_document(command.settings)
+    except UnknownKind as error:
+        raise FoldError(
+            event.offset,
+            f"{error}; update mapfold, or look at the map before it: {_before(event.offset)}",
+        ) from None
+    except (InvalidCommand, SettingsError) as error:
+        raise FoldError(
+            event.offset,
+            f"it is on {COMMAND_KEY}, but no command that this version knows: {error}; update "
+            f"mapfold, or look at the map before it: {_before(event.offset)}",
+        ) from None
+    return RecordedCommand(event.offset, command)
+
+
+def _before(offset: Offset) -> str:
+    return f"`{advised('state', '--at', offset)}`"
+
+
+@gc_paused()
+def read_commands(
+    reader: LogReader, until: Offset | None = None, start: Offset = FIRST_OFFSET
+) -> list[RecordedCommand]:
+    """The commands from ``start`` to before ``until``, all for None, in order. Raises FoldError,
+    LogDamaged."""
+    events = reader.read(start, until, keys=(COMMAND_KEY,))
+    return [read_command(event) for event in events]
+
+
+@gc_paused()
+def read_corrections(reader: LogReader, known_at: Offset | None = None) -> Corrections:
+    """The corrections of the commands before ``known_at``, of all for None. Raises FoldError,
+    LogDamaged."""
+    return compile_corrections(read_commands(reader, known_at))
 
 
 def new_map(
