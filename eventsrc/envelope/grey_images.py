@@ -1,7 +1,7 @@
 """PNG and PGM images as numpy arrays; the only importer of Pillow.
 
 Images come from outside, so their size is checked before any pixel is decoded, and only these two
-formats are read. docs/decisions/map-images.md says why Pillow.
+formats are read. docs/decisions/dependencies.md says why Pillow.
 
 Pillow is imported when an image is read: every command imports this module, few need it.
 """

@@ -4,7 +4,7 @@
 
 The index is JSON: the JSON values, and for each numpy array its dtype, shape and position.
 Only plain number types are read; anything else is refused.
-docs/decisions/fold-container.md says why this is not `numpy.savez`.
+docs/decisions/history-cache.md says why this is not `numpy.savez`.
 """
 
 import hashlib

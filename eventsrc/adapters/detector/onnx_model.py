@@ -1,6 +1,6 @@
 """Run ONNX models by onnxruntime. Only this module imports it, when the first model is opened.
 
-docs/decisions/onnxruntime.md says why onnxruntime.
+docs/decisions/dependencies.md says why onnxruntime.
 """
 
 from collections.abc import Mapping

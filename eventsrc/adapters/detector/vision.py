@@ -1,6 +1,6 @@
 """Decode, resize, cut and encode pictures and read videos by OpenCV. Only this module imports it.
 
-docs/decisions/opencv.md says why OpenCV. It is imported when the first picture is decoded.
+docs/decisions/dependencies.md says why OpenCV. It is imported when the first picture is decoded.
 """
 
 import functools
