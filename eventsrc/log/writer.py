@@ -32,7 +32,7 @@ from .format import LOCK, leftovers, list_segments
 from .lock import WriterLock
 from .mcap_records import MAX_EVENT_BYTES
 from .restart import Restart, restart
-from .seal_worker import Sealer
+from .sealer import Sealer
 
 ROTATE_BYTES = 64 * 1024 * 1024
 ROTATE_EVENTS = 1_000_000

@@ -18,7 +18,6 @@ needs once it is decoded. A unit vector's -0.0 in float64 comes back as 0.0, whi
 product and no sum.
 """
 
-import contextlib
 import gc
 import mmap
 import os
@@ -189,7 +188,6 @@ SLOT_BYTES: Final = 8 * 1024 * 1024
 only as far as it is written."""
 PATIENCE_S: Final = 60.0
 """Seconds to wait for one range; an idle machine parses a hundred a second."""
-_PROGRAM: Final = "import sys; from projections.map.parsed_log import main; main(*sys.argv[1:])"
 _QUESTION: Final = struct.Struct("<qqq")
 """Slot, first offset, offset after the last one."""
 _ANSWER: Final = struct.Struct("<qq")
@@ -206,7 +204,7 @@ class ParsingProcess(WorkerProcess):
         try:
             with unnamed_memory(SLOTS * SLOT_BYTES) as shared:
                 self._memory = memoryview(mmap.mmap(shared, SLOTS * SLOT_BYTES))
-                super().__init__(_PROGRAM, str(log.absolute()), log_id, memory=shared)
+                super().__init__(_parse_ranges, str(log.absolute()), log_id, memory=shared)
         except OSError as error:
             raise ProcessGone(str(error)) from error
 
@@ -249,21 +247,17 @@ def _slot(memory: memoryview, slot: int) -> memoryview:
     return memory[slot * SLOT_BYTES : (slot + 1) * SLOT_BYTES]
 
 
-def main(log: str, log_id: str, connection: str, memory: str) -> None:
+def _parse_ranges(connection: Connection, memory: str, log: str, log_id: str) -> None:
     """Run in the process: parse range after range, until the connection is closed."""
     gc.disable()  # parsing makes no reference cycles
     slots = memoryview(mmap.mmap(int(memory), SLOTS * SLOT_BYTES))
-    with (
-        contextlib.suppress(EOFError, ConnectionError),
-        Connection(int(connection)) as asked,
-        LogReader(Path(log)) as reader,
-    ):
+    with LogReader(Path(log)) as reader:
         if reader.log_id != log_id:
             return
-        asked.send_bytes(b"ready")
+        connection.send_bytes(b"ready")
         while True:
-            slot, start, end = _QUESTION.unpack(asked.recv_bytes())
-            asked.send_bytes(_ANSWER.pack(*_parse(reader, start, end, _slot(slots, slot))))
+            slot, start, end = _QUESTION.unpack(connection.recv_bytes())
+            connection.send_bytes(_ANSWER.pack(*_parse(reader, start, end, _slot(slots, slot))))
 
 
 def _parse(reader: LogReader, start: Offset, end: Offset, slot: memoryview) -> Packed:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -116,7 +117,7 @@ def test_where_no_process_can_be_started_this_one_makes_all_calls(
 
 @pytest.mark.seconds
 def test_a_process_that_ends_at_once_is_not_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "_PROGRAM", "raise SystemExit(1)")
+    monkeypatch.setattr(parallel, "_make_calls", sys.exit)
     assert asked(POWERS, 2) == RESULTS
 
 

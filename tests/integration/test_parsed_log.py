@@ -69,7 +69,7 @@ def parsing(log: Path, workers: int, until: int | None = None) -> Iterator[Parse
         end = reader.next_offset if until is None else Offset(until)
         with ParsedLog(reader, end, workers) as parsed:
             for process in parsed._alive:
-                assert wait([process._connection], 60)
+                assert wait([process.connection], 60)
             yield parsed
 
 
@@ -198,10 +198,16 @@ def test_entries_of_the_module_path_that_python_passes_over(
 
 @pytest.mark.slow
 def test_a_process_that_ends_at_once(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parsed_log, "_PROGRAM", "raise SystemExit(1)")
+    monkeypatch.setattr(parsed_log, "_parse_ranges", sys.exit)
     with parsing(log, 2) as parsed:
         assert gathered(parsed.stretches()) == one_process(log)
         assert (parsed.started, parsed.lost) == (2, 2)
+
+
+def parse_into_small_slots(*arguments: Any) -> None:
+    """In a worker process: as `_parse_ranges`, with other slots."""
+    parsed_log.SLOT_BYTES = 64 * 1024  # type: ignore[misc]
+    parsed_log._parse_ranges(*arguments)
 
 
 @pytest.mark.seconds
@@ -209,14 +215,7 @@ def test_events_that_no_slot_has_room_for(
     tmp_path: Path, here: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parsed_log, "SLOT_BYTES", 64 * 1024)
-    monkeypatch.setattr(
-        parsed_log,
-        "_PROGRAM",
-        parsed_log._PROGRAM.replace("main(", "m.SLOT_BYTES = 65536; m.main(").replace(
-            "from projections.map.parsed_log import main",
-            "import projections.map.parsed_log as m",
-        ),
-    )
+    monkeypatch.setattr(parsed_log, "_parse_ranges", parse_into_small_slots)
     path, vector = tmp_path / "log", [1.0] * 8000
     with LogWriter(path, fsync=BY_HAND) as writer:
         for k in range(30):

@@ -38,7 +38,7 @@ def _small_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
     def ready(self: ParsedLog) -> ParsedLog:
         enter(self)
         for process in self._alive:
-            process._connection.poll(60)
+            process.connection.poll(60)
         return self
 
     monkeypatch.setattr(ParsedLog, "__enter__", ready)

@@ -25,7 +25,7 @@ from eventsrc.log import (
     verify_log,
 )
 from eventsrc.log import active_segment as _active
-from eventsrc.log import seal_worker as _sealer
+from eventsrc.log import sealer as _sealer
 from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.log.seal import SegmentPlan, seal

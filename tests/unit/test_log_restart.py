@@ -10,7 +10,7 @@ import pytest
 from eventsrc.base.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
-from eventsrc.log import seal_worker as _sealer
+from eventsrc.log import sealer as _sealer
 from eventsrc.log.active_segment import ActiveSegment
 from eventsrc.log.format import ACTIVE, SEALED, segment_path
 from tests.support.fixtures_log import BY_HAND, KEY, read_log

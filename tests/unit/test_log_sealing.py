@@ -12,9 +12,9 @@ from eventsrc.base.errors import LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log import seal as _seal
-from eventsrc.log import seal_worker as _sealer
+from eventsrc.log import sealer as _sealer
 from eventsrc.log.format import ACTIVE, HEAD_BYTES, SEALED, read_head, segment_path
-from eventsrc.log.seal_worker import Sealer
+from eventsrc.log.sealer import Sealer
 from tests.support.fixtures_log import KEY, flip, read_log
 
 

@@ -30,9 +30,6 @@ CALLS_PER_WORKER: Final = 100
 ten milliseconds, a start half a second."""
 _AHEAD: Final = 8
 """Calls assigned to a process at a time, so that it need not wait for this one."""
-_PROGRAM: Final = (
-    "import sys; from projections.localize.evaluate.parallel import main; main(*sys.argv[1:])"
-)
 _NUMBER: Final = struct.Struct("<q")
 
 
@@ -84,7 +81,7 @@ class _CallingProcess(WorkerProcess, Generic[T]):
     """A process that makes calls; ``given`` are the numbers of its unanswered calls, in order."""
 
     def __init__(self, memory: int) -> None:
-        super().__init__(_PROGRAM, memory=memory)
+        super().__init__(_make_calls, memory=memory)
         self.given: deque[int] = deque()
 
     def give(self, number: int) -> None:
@@ -122,14 +119,13 @@ def _start(
     return found
 
 
-def main(connection: str, memory: str) -> None:
+def _make_calls(connection: Connection, memory: str) -> None:
     """Run in the process: make call after call, until the connection is closed."""
     gc.disable()
     with mmap.mmap(int(memory), 0, access=mmap.ACCESS_READ) as pickled:
         calls = pickle.loads(pickled)  # noqa: S301 (from the process that started this one)
     gc.freeze()
     gc.enable()
-    with contextlib.suppress(EOFError, ConnectionError), Connection(int(connection)) as asked:
-        while True:
-            (number,) = _NUMBER.unpack(asked.recv_bytes())
-            asked.send_bytes(pickle.dumps(calls[number](), protocol=pickle.HIGHEST_PROTOCOL))
+    while True:
+        (number,) = _NUMBER.unpack(connection.recv_bytes())
+        connection.send_bytes(pickle.dumps(calls[number](), protocol=pickle.HIGHEST_PROTOCOL))

@@ -1,33 +1,111 @@
 """Seal finished segments in a background thread, in offset order.
 
-The thread does it itself at a lower priority, or, for a recorder, has a process do the work
-(`seal_process`). If the process cannot be started or dies, the thread goes on by itself. Sealing
-may fall behind: a waiting segment takes its full size on disk and is read as before. A failure
-costs no more than that; it is tried again with the next segment and on the next start. Being killed
-in the middle costs nothing, so the thread is a daemon.
+The thread does it itself at a lower priority, or, for a recorder, has a process do the work. If the
+process cannot be started or dies, the thread goes on by itself. Sealing may fall behind: a waiting
+segment takes its full size on disk and is read as before. A failure costs no more than that; it is
+tried again with the next segment and on the next start. Being killed in the middle costs nothing,
+so the thread is a daemon.
+
+Sealing takes half a processor at 20,000 events a second, and the thread that records would wait for
+the interpreter lock of a thread that seals. So the process, of lower priority, reads a finished
+segment and writes the sealed one beside it, under a name with its own process id. The writer, which
+holds the lock of the log, renames it. When the writer dies, the process finishes its segment,
+cannot send its reply, deletes its file and ends. So no process of a dead writer changes a log that
+the next writer holds.
+
+Synced bytes that the process sealed are dropped from the page cache. A long recording would
+otherwise fill the memory with segments that are not read soon, and new memory is slower to write to
+than memory just used: in a virtual machine each event took 3 to 7 µs more.
 """
 
 import contextlib
+import json
 import os
 import queue
 import threading
 from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.base.worker_process import ProcessGone, WorkerProcess
 from eventsrc.envelope.model import Offset
 
 from .active_file import ActiveFile
-from .durable_files import sync_directory
-from .format import ACTIVE, SEALED, head_of, origin_notes, segment_path
-from .seal import SegmentPlan, seal
-from .seal_process import ProcessGone, SealingProcess
+from .durable_files import replace_durably, sync_directory, unlink_quietly
+from .format import ACTIVE, SEALED, SEALING, head_of, origin_notes, segment_path
+from .seal import SegmentPlan, seal, write_sealed
 from .sealed_end import SealedEnd, note_sealed
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
 
 _NICE: Final = 10
 """Recording has priority, but not so much that sealing starves on a busy machine."""
+
+
+class SealingProcess(WorkerProcess):
+    """A running process that seals. Raises ProcessGone if it cannot be started."""
+
+    def __init__(self) -> None:
+        super().__init__(_seal_plans)
+
+    def seal(self, plan: SegmentPlan) -> str:
+        """Seal the active segment of ``plan``; returns the SHA-256 of the sealed file.
+
+        Raises OSError or LogDamaged as `eventsrc.log.seal.seal` does, and ProcessGone if the
+        process has died; the segment is then not sealed.
+        """
+        request = {**asdict(plan), "log": str(plan.log.absolute())}
+        try:
+            self.send(json.dumps(request).encode())
+            reply: dict[str, Any] = json.loads(self.receive())
+        except ProcessGone:
+            self.close()
+            unlink_quietly(_temporary(plan, self.pid))
+            raise
+        if "errno" in reply:
+            raise OSError(reply["errno"], reply["message"])
+        if "damaged" in reply:
+            raise LogDamaged(reply["damaged"])
+        replace_durably(_temporary(plan, self.pid), segment_path(plan.log, plan.base, SEALED))
+        return str(reply["sha256"])
+
+
+def _seal_plans(connection: "Connection") -> None:
+    """Run in the process: seal plan after plan, until the writer closes the connection."""
+    os.nice(_NICE)
+    while True:
+        request = json.loads(connection.recv_bytes())
+        plan = SegmentPlan(**{**request, "log": Path(request["log"])})
+        temporary = _temporary(plan, os.getpid())
+        try:
+            connection.send_bytes(json.dumps(_sealed(plan, temporary)).encode())
+        except OSError:  # the writer is gone
+            unlink_quietly(temporary)
+            raise
+
+
+def _temporary(plan: SegmentPlan, pid: int) -> Path:
+    return segment_path(plan.log, plan.base, f".{pid}{SEALING}")
+
+
+def _sealed(plan: SegmentPlan, temporary: Path) -> dict[str, Any]:
+    """Write the sealed segment to ``temporary``; the reply to the writer."""
+    try:
+        return {"sha256": write_sealed(plan, _bodies(plan), temporary, cached=False)}
+    except LogDamaged as error:
+        return {"damaged": str(error)}
+    except OSError as error:
+        return {"errno": error.errno, "message": error.strerror or str(error)}
+
+
+def _bodies(plan: SegmentPlan) -> Iterator[bytes]:
+    file = ActiveFile(segment_path(plan.log, plan.base, ACTIVE), plan.base)
+    return (file.read_chunk(chunk) for chunk in file.chunks)
 
 
 class Finished(NamedTuple):
@@ -120,7 +198,7 @@ class Sealer:
             notes = origin_notes(head_of(active, base))
             previous = self._previous_sha256
             plan = SegmentPlan(self._log, self._log_id, base, previous, following, notes)
-            self._sealed_sha256 = self._seal_in_process(plan) or self._seal_here(plan)
+            self._sealed_sha256 = self._seal_in_process(plan) or seal(plan, _bodies(plan))
             note_sealed(self._log, SealedEnd(self._log_id, base, following))
             active.unlink()
         elif not segment_path(self._log, base, SEALED).exists():
@@ -138,10 +216,6 @@ class Sealer:
         except ProcessGone:
             self._in_process, self._process = False, None
             return None
-
-    def _seal_here(self, plan: SegmentPlan) -> str:
-        file = ActiveFile(segment_path(self._log, plan.base, ACTIVE), plan.base)
-        return seal(plan, (file.read_chunk(chunk) for chunk in file.chunks))
 
 
 def _lower_priority() -> None:
