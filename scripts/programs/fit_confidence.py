@@ -32,9 +32,9 @@ from projections.localize.evaluate.scores import (
     instances_of,
 )
 from projections.localize.evaluate.trials import RIGHT_WITHIN_M
-from projections.localize.relocalize import ExactIndex, certainty, features
+from projections.localize.relocalize import ExactIndex, certainty
+from projections.localize.relocalize.constants import MODEL
 from projections.localize.relocalize.likelihood import Scene
-from projections.localize.relocalize.model import MODEL
 from projections.localize.relocalize.pose import locate
 from projections.map.view import MapView
 from scripts.programs.bench.truth.localising import asked, make_map, stranger_of
@@ -107,7 +107,7 @@ def ask_itself(
     weights: Weights, cache: Path, pair: tuple[str, str]
 ) -> list[tuple[float, bool, float, bool]]:
     """Of a map's own questions the logit of `known` and whether it was, and of `confidence`."""
-    certainty.KNOWN_WEIGHTS, features.WEIGHTS = weights  # type: ignore[misc, assignment]
+    certainty.KNOWN_WEIGHTS, certainty.CONFIDENCE_WEIGHTS = weights  # type: ignore[misc, assignment]
     view: MapView = make_map(cases(pair, cache)[0], "evidence", ask=False)
     answers = [each for crops in (1, 3) for each in ask_own_questions(view, crops)]
     return [

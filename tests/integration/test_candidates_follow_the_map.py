@@ -9,7 +9,7 @@ import pytest
 from eventsrc.envelope.commands import UseSettings
 from projections.fold.errors import ProjectionMismatch, QuestionError
 from projections.fold.settings import Settings
-from projections.localize.relocalize import Crop, ExactIndex, MapConstants, read_crops
+from projections.localize.relocalize import ExactIndex, MapConstants, QuestionCrop, read_question
 from projections.localize.relocalize import candidates as candidates_module
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
@@ -20,7 +20,7 @@ from tests.support.scenes import assert_equal, view_under_commands
 from tests.support.thorough import mostly_slow, rounds
 
 MANY = 500
-KNOWN = (Crop(None, None, "chair"), Crop(None, None, "oven"))
+KNOWN = (QuestionCrop(None, None, "chair"), QuestionCrop(None, None, "oven"))
 
 
 def settings_of(corrections: Any) -> Settings:
@@ -32,8 +32,8 @@ def documents() -> list[dict[str, Any]]:
     return flickering_house("a", 200)
 
 
-def questions() -> list[tuple[Crop, ...]]:
-    asked = [read_crops(d) for d in flickering_house("b", 40) if d["detections"]]
+def questions() -> list[tuple[QuestionCrop, ...]]:
+    asked = [read_question(d).crops for d in flickering_house("b", 40) if d["detections"]]
     return [*asked[:: rounds(9, 20)], KNOWN, (*asked[0], *KNOWN)]
 
 
@@ -150,7 +150,7 @@ class TestClasses:
         self, log: Path, targets: Targets
     ) -> None:
         rebuild(log, targets, Settings())
-        crops = (questions()[0][0], Crop(None, None, "lmap"))
+        crops = (questions()[0][0], QuestionCrop(None, None, "lmap"))
         with CandidateReader(targets) as reader:
             assert len(reader.candidates(crops).matches[0]) > 3
             assert reader.candidates(crops).matches[1] == ()
@@ -169,7 +169,7 @@ class TestClasses:
         self, log: Path, targets: Targets, name: str, said: str
     ) -> None:
         rebuild(log, targets, Settings())
-        asked = (Crop(None, None, "chair"), Crop(None, None, name))
+        asked = (QuestionCrop(None, None, "chair"), QuestionCrop(None, None, name))
         with (
             CandidateReader(targets) as reader,
             pytest.raises(QuestionError, match=said) as refused,
@@ -182,7 +182,7 @@ class TestClasses:
     def test_odd_names_are_found(self, tmp_path: Path, targets: Targets) -> None:
         log = write_log(tmp_path / "odd", walk(60, seed=2))
         rebuild(log, targets, Settings())
-        crops = tuple(Crop(None, None, name) for name in WEIRD)
+        crops = tuple(QuestionCrop(None, None, name) for name in WEIRD)
         with CandidateReader(targets) as reader:
             live = reader.candidates(crops)
         assert all(live.matches)

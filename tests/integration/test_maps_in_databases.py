@@ -15,7 +15,7 @@ from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.errors import DatabaseError
 from projections.fold.settings import Settings
-from projections.localize.relocalize import Candidates, Crop
+from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.map.fold import fold_log
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
@@ -178,9 +178,9 @@ def test_check_finds_a_changed_map_and_repairs_it(tmp_path: Path, one_database: 
         assert [r.differing for r in check(log, one_database, Settings())] == [0, 0], change
 
 
-def ask(targets: Targets) -> Candidates:
+def ask(targets: Targets) -> MapCandidates:
     with CandidateReader(targets) as reader:
-        return reader.candidates([Crop(np.array([1.0, 0.0, 0.0], np.float32), None, None)])
+        return reader.candidates([QuestionCrop(np.array([1.0, 0.0, 0.0], np.float32), None, None)])
 
 
 def test_a_map_that_killed_its_tail_is_written_by_the_next(

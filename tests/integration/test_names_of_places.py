@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.log import LogReader
 from projections.fold.settings import Settings
-from projections.localize.relocalize import ExactIndex, rank, read_crops
+from projections.localize.relocalize import ExactIndex, rank, read_question
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
 from projections.postgres import rebuild
@@ -84,7 +84,7 @@ def test_answers_to_where_is_this_show_the_name(
         _, view = fold_log(reader, SETTINGS, corrections=read_corrections(reader))
     seen = [d["detections"] for d in documents if d["detections"]]
     question = next(s for s in seen if all("embedding" in d for d in s))
-    crops = read_crops({"crops": question})
+    crops = read_question({"crops": question}).crops
     with CandidateReader(one_database) as reader_of_candidates:
         candidates = reader_of_candidates.candidates(crops)
     answer = rank(crops, candidates, top=9).document()

@@ -10,7 +10,7 @@ import pytest
 from eventsrc.log import LogReader
 from projections.fold.errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.fold.settings import Settings
-from projections.localize.relocalize import Crop, ExactIndex, Track, rank, read_crops
+from projections.localize.relocalize import ExactIndex, QuestionCrop, Track, rank, read_question
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild
@@ -54,10 +54,10 @@ def targets(targets: Targets, log: Path, rule: Settings) -> Targets:
     return targets
 
 
-def questions() -> Iterator[tuple[Crop, ...]]:
+def questions() -> Iterator[tuple[QuestionCrop, ...]]:
     for document in walk(12, seed=9, run_id="run-b"):
         if document["detections"]:
-            yield read_crops(document)
+            yield read_question(document).crops
 
 
 def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -> None:
@@ -109,10 +109,10 @@ def test_the_library_call_answers_and_refuses_another_embedding_space(
         assert [p.place_id for p in live.places] == [p.place_id for p in exact.places]
         assert live.confidence == pytest.approx(exact.confidence, abs=0.02)
     with pytest.raises(QuestionError, match="dimensions"):
-        relocalize(targets, read_crops([detection("cup", [1.0, 0.0, 0.0])]))
+        relocalize(targets, read_question([detection("cup", [1.0, 0.0, 0.0])]).crops)
     other = detection("cup", [1.0] * 8, embedding_model="another/model")
     with pytest.raises(QuestionError, match="another/model"):
-        relocalize(targets, read_crops([other]))
+        relocalize(targets, read_question([other]).crops)
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_graph_and_vectors_of_different_origin_are_refused(
 
 def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:
     with pytest.raises(ProjectionMissing, match="mapfold replay"):
-        relocalize(one_database, read_crops([detection("cup", [1.0] * 8)]))
+        relocalize(one_database, read_question([detection("cup", [1.0] * 8)]).crops)
 
 
 @pytest.mark.slow
@@ -256,7 +256,7 @@ class TestCommand:
                 continue
             moved = {"dx": 0.25 * number, "dy": 0.0, "dyaw": 0.5}
             asked = {"crops": document["detections"], **moved}
-            answer = rank(crops := read_crops(asked), index.search(crops))
+            answer = rank(crops := read_question(asked).crops, index.search(crops))
             found = track.step(
                 (0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence, answer.known
             )

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
-from projections.localize.relocalize import Camera
-from projections.localize.relocalize.camera import box_rows, views
+from projections.fold.settings import Camera
+from projections.localize.relocalize.camera import box_rows, focal_px, views
 from projections.localize.relocalize.triangulation import (
     Points,
     cluster_points,
@@ -161,7 +161,7 @@ def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> Non
     boxes, poses = [], []
     for quarter in range(8):
         angle, far = quarter * math.pi / 4, 2.0 + 0.25 * (quarter % 3)
-        half = 0.5 * 0.8 * Camera().focal_px / far
+        half = 0.5 * 0.8 * focal_px(Camera()) / far
         boxes.append((320.0 - half, 200.0 - half, 320.0 + half, 200.0 + half))
         poses.append((far * math.cos(angle), far * math.sin(angle), angle + math.pi))
     for usual in (1.0, 2.0, 4.0):

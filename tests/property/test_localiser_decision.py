@@ -7,15 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.fold.deltas import ObservationOrdinal
-from projections.localize.relocalize import Crop, Match
-from projections.localize.relocalize.decision import (
+from projections.localize.relocalize import Match, QuestionCrop
+from projections.localize.relocalize.pose import (
     MAX_ERROR_M,
     PLAIN_NEAREST,
     PLAIN_SHARE,
     least_error,
     stood_at,
 )
-from projections.localize.relocalize.question import View
+from projections.localize.relocalize.question import QuestionView
 
 Place = tuple[float, float]
 PLACES = st.tuples(st.integers(-40, 40), st.integers(-40, 40)).map(
@@ -66,14 +66,14 @@ def match(number: int, x: float | None) -> Match:
 
 
 def test_robots_stood_where_the_nearest_observations_of_crops_with_a_look_are_from() -> None:
-    look = Crop(np.ones(4, dtype=np.float32), None, "cup")
-    named = Crop(None, None, "cup")
+    look = QuestionCrop(np.ones(4, dtype=np.float32), None, "cup")
+    named = QuestionCrop(None, None, "cup")
     rows = [
         [match(n, None if n == 2 else float(n)) for n in range(15)],
         [match(n, 100.0) for n in range(3)],
         [match(n, 50.0) for n in range(2)],
     ]
-    views = [View(0.0, 0.0, 0.0, (look, named)), View(0.1, 0.0, 0.0, (look,))]
+    views = [QuestionView(0.0, 0.0, 0.0, (look, named)), QuestionView(0.1, 0.0, 0.0, (look,))]
     found = [tuple(each) for each in stood_at(views, rows).tolist()]
     first = [(float(n), -float(n)) for n in range(PLAIN_NEAREST) if n != 2]
     assert found == [*first, (50.0, -50.0), (50.0, -50.0)]

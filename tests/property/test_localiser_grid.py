@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.localize.relocalize.appearance import DIRECTIONS
-from projections.localize.relocalize.cues import Cue
-from projections.localize.relocalize.grid import (
+from projections.localize.relocalize.camera import Cue
+from projections.localize.relocalize.ground import (
     cells_near,
     distinct,
-    likely_spots,
     square_to_nearest,
 )
 from projections.localize.relocalize.landmarks import Landmarks, _spots
+from projections.localize.relocalize.pose import likely_spots
 
 _METRES = st.floats(-8.0, 8.0)
 _POINTS = st.lists(st.tuples(_METRES, _METRES), min_size=1, max_size=8)

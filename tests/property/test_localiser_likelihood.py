@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
-from projections.localize.relocalize import Camera, MapConstants
+from projections.fold.settings import Camera
+from projections.localize.relocalize import MapConstants
 from projections.localize.relocalize.appearance import DIRECTIONS, appearance_tables
-from projections.localize.relocalize.camera import Sights, box_rows, sights
-from projections.localize.relocalize.cues import Cue
+from projections.localize.relocalize.camera import Cue, SightLines, box_rows, half_field_rad, sights
+from projections.localize.relocalize.constants import MODEL, RankingModel
 from projections.localize.relocalize.landmarks import CropGroup, Landmarks
 from projections.localize.relocalize.likelihood import (
     Scene,
@@ -20,7 +21,6 @@ from projections.localize.relocalize.likelihood import (
     log_likelihood_unaimed,
     terms_at,
 )
-from projections.localize.relocalize.model import MODEL, Model
 from tests.support.thorough import examples
 
 TURN = 2.0 * math.pi
@@ -117,7 +117,7 @@ def fit_of(
             [*marks.ratios[i], marks.ratios[i][0]],
         )
     )
-    half = scene.camera.half_field_rad
+    half = half_field_rad(scene.camera)
     near = reach < model.twice * evidence.range_m
     if not crop.boxed:
         off = math.remainder(towards - yaw - scene.camera.yaw_rad, TURN)
@@ -141,7 +141,7 @@ def log_normal(off: float, variance: float) -> float:
     return -0.5 * off * off / variance - 0.5 * math.log(TURN * variance)
 
 
-def size_fit(crop, i, u, reach, covariance, pose2, model: Model) -> float:  # type: ignore[no-untyped-def]
+def size_fit(crop, i, u, reach, covariance, pose2, model: RankingModel) -> float:  # type: ignore[no-untyped-def]
     cue, sight = crop.landmarks.size, crop.sight
     if not math.isfinite(cue.variance[i]):
         return 0.0
@@ -154,7 +154,7 @@ def size_fit(crop, i, u, reach, covariance, pose2, model: Model) -> float:  # ty
     return min(max(ratio, -6.0), 6.0)
 
 
-def edge_fit(crop, edge, i, u, reach, covariance, pose2, model: Model) -> float:  # type: ignore[no-untyped-def]
+def edge_fit(crop, edge, i, u, reach, covariance, pose2, model: RankingModel) -> float:  # type: ignore[no-untyped-def]
     cue = crop.landmarks.edges[edge]
     if not math.isfinite(cue.variance[i]):
         return 0.0
@@ -312,7 +312,7 @@ def test_looks_are_those_written_out_for_each_observation(seed: int, counts: lis
     )
 )
 def test_whatever_a_box_holds_its_sights_are_finite(boxes: list[tuple[float, ...] | None]) -> None:
-    found: Sights = sights(Camera(), box_rows(boxes))  # type: ignore[arg-type]
+    found: SightLines = sights(Camera(), box_rows(boxes))  # type: ignore[arg-type]
     for values in (found.bearing, found.log_height, found.rise):
         assert np.isfinite(values).all()
     assert (np.abs(found.bearing) < math.pi / 2).all()

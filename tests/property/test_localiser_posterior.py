@@ -9,13 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.localize.relocalize import Candidates, MapConstants, Match, Question, View, rank
-from projections.localize.relocalize.grid import cells_near, distinct, log_prior
+from projections.localize.relocalize import (
+    MapCandidates,
+    MapConstants,
+    Match,
+    Question,
+    QuestionView,
+    rank,
+)
+from projections.localize.relocalize.constants import MODEL
+from projections.localize.relocalize.ground import cells_near, distinct, log_prior
 from projections.localize.relocalize.likelihood import Scene as Shared
 from projections.localize.relocalize.likelihood import log_likelihood, terms_at
-from projections.localize.relocalize.model import MODEL
-from projections.localize.relocalize.movements import poses_at_views
 from projections.localize.relocalize.pose import CELL_M, Posterior, _sighted, locate
+from projections.localize.relocalize.question import poses_at_views
 from tests.support.scenes import CONSTANTS, Pose, Scene, Thing, around, movement
 from tests.support.thorough import examples, rounds
 
@@ -40,14 +47,14 @@ def random_scene(seed: int, *, has_estimates: bool = True) -> tuple[Scene, Pose,
             return scene, at, shown[:3]
 
 
-def posterior_of(question: Question, candidates: Candidates) -> Posterior:
+def posterior_of(question: Question, candidates: MapCandidates) -> Posterior:
     shared = Shared(candidates.constants, candidates.constants.camera, MODEL)
     found = locate(question.views, candidates.matches, shared)
     assert found is not None
     return found
 
 
-def slow_posterior(question: Question, candidates: Candidates) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def slow_posterior(question: Question, candidates: MapCandidates) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
     """All cells within reach and their weights, summed over 72 headings."""
     shared = Shared(candidates.constants, candidates.constants.camera, MODEL)
     (view,) = _sighted(question.views, candidates.matches, shared)
@@ -156,7 +163,7 @@ def test_crops_in_two_views_from_one_pose_say_what_they_say_in_one(seed: int) ->
     one = posterior_of(*scene.ask([(at, shown)]))
     question, candidates = scene.ask([(at, shown)])
     (view,) = question.views
-    split = Question((View(0, 0, 0, view.crops[:1]), View(0, 0, 0, view.crops[1:])))
+    split = Question((QuestionView(0, 0, 0, view.crops[:1]), QuestionView(0, 0, 0, view.crops[1:])))
     two = posterior_of(split, candidates)
     assert math.hypot(two.x - one.x, two.y - one.y) < 0.35
 
@@ -173,9 +180,9 @@ def test_turning_around_finds_the_pose_that_one_look_leaves_open() -> None:
         m._replace(similarity=0.5 + 0.5 * 0.67) if m.object_id in ("o0", "o1") else m
         for m in candidates.matches[0]
     )
-    first = Candidates((alike,), {}, CONSTANTS)
+    first = MapCandidates((alike,), {}, CONSTANTS)
     alone = posterior_of(Question(question.views[:1]), first)
-    both = posterior_of(question, Candidates((alike, candidates.matches[1]), {}, CONSTANTS))
+    both = posterior_of(question, MapCandidates((alike, candidates.matches[1]), {}, CONSTANTS))
     assert alone.features.mass < 0.75
     assert both.features.mass > 0.9
     assert math.hypot(both.x - at[0], both.y - at[1]) < 0.5
@@ -275,5 +282,5 @@ def test_matches_without_poses_leave_the_pose_open() -> None:
     match = Match(0, "d0", "run", 0.9, None, None, "cup")
     scene, at, shown = random_scene(1)
     question, _ = scene.ask([(at, shown[:1])])
-    answer = rank(question, Candidates(((match,),), {}, MapConstants()))
+    answer = rank(question, MapCandidates(((match,),), {}, MapConstants()))
     assert answer.pose is None

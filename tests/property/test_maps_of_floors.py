@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold import current_map
 from projections.fold.settings import Settings
-from projections.localize.relocalize import CandidatePlace, Candidates, Match
-from projections.localize.relocalize.floors import STEP_M, Layout
-from projections.localize.relocalize.walls import WallMap
+from projections.localize.relocalize import CandidatePlace, MapCandidates, Match
+from projections.localize.relocalize.ground import WallMap
+from projections.localize.relocalize.layout import STEP_M, Layout
 from projections.map.digest import map_digest
 from tests.support.envelopes import envelope
 from tests.support.folds import Folded, resumed
@@ -193,11 +193,11 @@ def test_without_several_floors_the_map_of_the_only_one_counts() -> None:
     assert Layout.of(_candidates([])).walls({"0": one, "1": other}) is None
 
 
-def _candidates(floors: list[str | None]) -> Candidates:
+def _candidates(floors: list[str | None]) -> MapCandidates:
     """A match on each floor, and places of the map that no match is in."""
     matches = tuple(
         Match(n, f"d{n}", "r", 1.0, (0.0, 0.0, 0.0), None, "cup", None, None, n)
         for n in range(len(floors))
     )
     places = {n: CandidatePlace(f"p{n}", 0.0, 0.0, None, floor) for n, floor in enumerate(floors)}
-    return Candidates((matches,), {**places, 99: CandidatePlace("p99", 0.0, 0.0, None, "9")})
+    return MapCandidates((matches,), {**places, 99: CandidatePlace("p99", 0.0, 0.0, None, "9")})

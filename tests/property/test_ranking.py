@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.localize.relocalize import Answer, Candidates, Crop, rank
+from projections.localize.relocalize import Answer, MapCandidates, QuestionCrop, rank
 from tests.support.buildings import Building, Keyframe, drive
 from tests.support.scenes import RoomMap, crops_of
 from tests.support.thorough import examples, mostly_slow
@@ -144,7 +144,7 @@ def test_questions_from_another_building_are_unknown() -> None:
 
 
 def test_without_candidates_the_answer_is_empty() -> None:
-    crop: list[Crop] = crops_of(other_session(SEEDS[0])[0])[:1]
-    answer = rank(crop, Candidates(((),), {}))
+    crop: list[QuestionCrop] = crops_of(other_session(SEEDS[0])[0])[:1]
+    answer = rank(crop, MapCandidates(((),), {}))
     assert (answer.places, answer.pose, answer.confidence) == ((), None, 0.0)
     assert answer.unknown

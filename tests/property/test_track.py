@@ -13,12 +13,12 @@ from projections.localize.relocalize import (
     Answer,
     PoseHypothesis,
     Question,
+    QuestionView,
     Track,
-    View,
     movement_of,
     rank,
 )
-from projections.localize.relocalize.floors import Hypotheses
+from projections.localize.relocalize.layout import Hypotheses
 from projections.localize.relocalize.question import MAX_CROPS, Movement
 from projections.localize.relocalize.reading import MAX_MOVED_M, MAX_TURNED_RAD
 from projections.localize.relocalize.track import PARTICLES, _resampled
@@ -110,8 +110,8 @@ def test_resampling_takes_each_as_often_as_its_weight_says(
 @given(st.lists(moves, min_size=1, max_size=6))
 def test_movements_of_views_add_up(given_moves: list[Movement]) -> None:
     """Complex numbers as the oracle."""
-    views = tuple(View(*moved, ()) for moved in given_moves[1:])
-    question = Question((View(9.0, 9.0, 9.0, ()), *views))
+    views = tuple(QuestionView(*moved, ()) for moved in given_moves[1:])
+    question = Question((QuestionView(9.0, 9.0, 9.0, ()), *views))
     at, heading = 0j, 1 + 0j
     for dx, dy, dyaw in given_moves:
         at += heading * complex(dx, dy)

@@ -16,21 +16,21 @@ from typing import Any
 
 import numpy as np
 
-from projections.localize.relocalize import Answer, Candidates, Question, View, rank
+from projections.localize.relocalize import Answer, MapCandidates, Question, QuestionView, rank
 from tests.support.buildings import Building, Keyframe, drive
 from tests.support.scenes import RoomMap, Scene, Thing, around, crops_of, movement
 
 FILE = Path(__file__).with_name("recorded_answers.json")
 
 
-def questions() -> Iterator[tuple[str, Question, Candidates]]:
+def questions() -> Iterator[tuple[str, Question, MapCandidates]]:
     """Each with a name: of a building whose landmarks are triangulated, and of scenes with
     estimates."""
     yield from _of_a_building()
     yield from _of_scenes()
 
 
-def _of_a_building() -> Iterator[tuple[str, Question, Candidates]]:
+def _of_a_building() -> Iterator[tuple[str, Question, MapCandidates]]:
     building = Building(41, things=40)
     mapped = RoomMap(drive(building, "recorded-a", 41, 200))
     run = [k for k in drive(building, "recorded-b", 141, 160) if len(k.instances) >= 3]
@@ -42,7 +42,7 @@ def _of_a_building() -> Iterator[tuple[str, Question, Candidates]]:
         moved = [(0.0, 0.0, 0.0)]
         moved += [movement(_pose(a), _pose(b)) for a, b in itertools.pairwise(seen)]
         views = tuple(
-            View(*step, tuple(crops_of(keyframe)[:2]))
+            QuestionView(*step, tuple(crops_of(keyframe)[:2]))
             for step, keyframe in zip(moved, seen, strict=True)
         )
         question = Question(views)
@@ -54,7 +54,7 @@ def _pose(keyframe: Keyframe) -> tuple[float, float, float]:
     return at.map_x or 0.0, at.map_y or 0.0, at.map_yaw or 0.0
 
 
-def _of_scenes() -> Iterator[tuple[str, Question, Candidates]]:
+def _of_scenes() -> Iterator[tuple[str, Question, MapCandidates]]:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         wide = 3.0 if seed % 3 else 40.0

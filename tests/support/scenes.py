@@ -3,9 +3,9 @@
 No embeddings: a match's cosine is made from whether it shows the same thing and from the change of
 side, as `projections.fold.evidence` describes it.
 
-Candidates of the databases beside those of exact search, for tests.
+MapCandidates of the databases beside those of exact search, for tests.
 
-Candidates whose Places are the true rooms, so that ranking is tested without clustering.
+MapCandidates whose Places are the true rooms, so that ranking is tested without clustering.
 
 Which thing each detection on a drawn picture shows, from what the picture truly shows.
 """
@@ -24,19 +24,19 @@ from eventsrc.log import LogReader
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise, to_float32
 from projections.fold.semantic_map import SemanticMap
-from projections.fold.settings import Settings
+from projections.fold.settings import Camera, Settings
 from projections.localize.relocalize import (
-    Camera,
     CandidatePlace,
-    Candidates,
-    Crop,
     ExactIndex,
+    MapCandidates,
     MapConstants,
     Match,
     ObjectEstimate,
     Question,
-    View,
+    QuestionCrop,
+    QuestionView,
 )
+from projections.localize.relocalize.camera import focal_px
 from projections.localize.relocalize.question import Box
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
@@ -69,11 +69,11 @@ def box_of(thing: Thing, pose: Pose, camera: Camera) -> Box | None:
     left = math.cos(pose[2]) * dy - math.sin(pose[2]) * dx
     if not 0.3 < ahead < FARTHEST_M:
         return None
-    middle = camera.width_px / 2 - camera.focal_px * left / ahead
+    middle = camera.width_px / 2 - focal_px(camera) * left / ahead
     if not 0.0 < middle < camera.width_px:
         return None
-    half = 0.2 * camera.focal_px / ahead
-    rise = camera.focal_px / ahead
+    half = 0.2 * focal_px(camera) / ahead
+    rise = focal_px(camera) / ahead
     return (
         max(0.0, middle - half),
         max(0.0, camera.height_px / 2 - (thing.tall_m - UP_M) * rise),
@@ -133,11 +133,11 @@ class Scene:
                     found.append(match)
         return tuple(sorted(found, key=lambda m: (-m.similarity, m.observation)))
 
-    def crop(self, shown: int, at: Pose, *, boxed: bool = True) -> Crop:
+    def crop(self, shown: int, at: Pose, *, boxed: bool = True) -> QuestionCrop:
         """Thing ``shown`` as seen from ``at``. The vector only tells crops apart."""
         box = box_of(self.things[shown], at, self.camera) if boxed else None
         vector = np.full(4, shown, dtype=np.float32)
-        return Crop(vector, box, self.things[shown].name, f"crop-{shown}")
+        return QuestionCrop(vector, box, self.things[shown].name, f"crop-{shown}")
 
     def in_view(self, at: Pose) -> list[int]:
         """Things that a picture from a pose shows."""
@@ -145,14 +145,14 @@ class Scene:
 
     def ask(
         self, ats: Sequence[tuple[Pose, Sequence[int]]], noise: float = 0.0, *, boxed: bool = True
-    ) -> tuple[Question, Candidates]:
+    ) -> tuple[Question, MapCandidates]:
         """A question whose views show things from poses, with the movement between them."""
         views, rows = [], []
         for number, (at, shown) in enumerate(ats):
             moved = (0.0, 0.0, 0.0) if number == 0 else movement(ats[number - 1][0], at)
-            views.append(View(*moved, tuple(self.crop(i, at, boxed=boxed) for i in shown)))
+            views.append(QuestionView(*moved, tuple(self.crop(i, at, boxed=boxed) for i in shown)))
             rows += [self.row(i, at, noise, seed=i + 100 * number) for i in shown]
-        return Question(tuple(views)), Candidates(tuple(rows), {}, self.constants)
+        return Question(tuple(views)), MapCandidates(tuple(rows), {}, self.constants)
 
 
 def movement(before: Pose, after: Pose) -> Pose:
@@ -171,7 +171,7 @@ def around(thing: Thing, count: int, far_m: float = 2.0, start: float = 0.0) -> 
     ]
 
 
-def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
+def found(candidates: MapCandidates) -> list[list[tuple[object, ...]]]:
     """All that matches say but their similarity, in the order of the fold."""
     return [
         [
@@ -192,7 +192,7 @@ def found(candidates: Candidates) -> list[list[tuple[object, ...]]]:
     ]
 
 
-def assert_equal(live: Candidates, exact: Candidates) -> None:
+def assert_equal(live: MapCandidates, exact: MapCandidates) -> None:
     """Both have the same matches, places and constants; cosines but for rounding."""
     assert found(live) == found(exact)
     assert live.constants == exact.constants
@@ -221,10 +221,10 @@ def fold(run: Sequence[Keyframe], **settings: float) -> MapView:
     return view
 
 
-def crops_of(keyframe: Keyframe, *, boxes: bool = True) -> list[Crop]:
+def crops_of(keyframe: Keyframe, *, boxes: bool = True) -> list[QuestionCrop]:
     """A keyframe's detections as crops."""
     return [
-        Crop(
+        QuestionCrop(
             to_float32(quantise(vector)),
             detection.bbox if boxes else None,
             detection.class_name,
@@ -250,11 +250,11 @@ class RoomMap:
         self.rooms = sorted({keyframe.room for keyframe in run})
         self._places = {i: CandidatePlace(room, float(i), 0.0) for i, room in enumerate(self.rooms)}
 
-    def search(self, crops: Sequence[Crop]) -> Candidates:
+    def search(self, crops: Sequence[QuestionCrop]) -> MapCandidates:
         """As `ExactIndex.search`, each match in the room its keyframe is in."""
         found = self._index.search(crops)
         rows = tuple(tuple(self._in_room(m) for m in row) for row in found.matches)
-        return Candidates(rows, self._places)
+        return MapCandidates(rows, self._places)
 
     def _in_room(self, match: Match) -> Match:
         keyframe = self.view.observations[match.observation].keyframe

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from eventsrc.envelope.model import RunId
 from projections.fold.deltas import ObservationOrdinal
 from projections.fold.settings import LocalizerConstants
-from projections.localize.relocalize import Crop, MapConstants, Match, rank
-from projections.localize.relocalize.candidates import Candidates
+from projections.localize.relocalize import MapConstants, Match, QuestionCrop, rank
+from projections.localize.relocalize.candidates import MapCandidates
 from projections.localize.relocalize.certainty import known_features, known_probability
 
-CROP = Crop(np.ones(1, dtype=np.float32))
-NAMED = Crop(None, class_name="chair")
+CROP = QuestionCrop(np.ones(1, dtype=np.float32))
+NAMED = QuestionCrop(None, class_name="chair")
 TEXT = replace(CROP, is_text=True)
 
 likenesses = st.lists(st.floats(-0.5, 1.0), min_size=1, max_size=6).map(
@@ -31,7 +31,7 @@ def _matches(cosines: list[float]) -> tuple[Match, ...]:
     )
 
 
-def _known(rows: list[list[float]], constants: MapConstants, crop: Crop = CROP) -> float:
+def _known(rows: list[list[float]], constants: MapConstants, crop: QuestionCrop = CROP) -> float:
     return known_probability([crop] * len(rows), [_matches(row) for row in rows], constants)
 
 
@@ -91,7 +91,7 @@ def test_crops_without_a_look_or_matches_are_left_out() -> None:
 
 def test_unknown_follows_from_known() -> None:
     for cosine, unknown in ((0.95, False), (0.55, True)):
-        answer = rank([CROP], Candidates((_matches([cosine] * 4),), {}))
+        answer = rank([CROP], MapCandidates((_matches([cosine] * 4),), {}))
         assert answer.unknown is unknown
         document = answer.document()
         assert (document["known"], document["unknown"]) == (answer.known, unknown)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from projections.fold.exact import to_float32
 from projections.fold.settings import Settings
-from projections.localize.relocalize import Crop, ExactIndex, MapConstants
+from projections.localize.relocalize import ExactIndex, MapConstants, QuestionCrop
 from projections.localize.relocalize.constants import FOLLOWERS, SAMPLED, Cosines, Sample
 from projections.map.view import MapView
 from tests.support.folds import fold
@@ -117,4 +117,4 @@ def test_an_objects_estimate_is_that_of_the_fold() -> None:
 
 
 def matches(view: MapView, like: Any) -> Any:
-    return ExactIndex(view).search([Crop(to_float32(like.embedding))], 200).matches[0]
+    return ExactIndex(view).search([QuestionCrop(to_float32(like.embedding))], 200).matches[0]

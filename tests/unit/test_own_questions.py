@@ -12,7 +12,7 @@ import projections.localize.evaluate.own_questions as own
 from eventsrc.envelope.ingest import Accepted, ingest_all
 from projections.fold.settings import Settings
 from projections.localize.evaluate.questions import spread
-from projections.localize.relocalize import Candidates, Crop, ExactIndex
+from projections.localize.relocalize import ExactIndex, MapCandidates, QuestionCrop
 from projections.map.view import MapView
 from scripts.programs.bench.truth.folding import fold_into
 from tests.support.envelopes import payload
@@ -36,7 +36,7 @@ def view() -> MapView:
 class _Recorder(ExactIndex):
     """Records each search: the crops, what was taken out, and the result."""
 
-    searches: list[tuple[list[str], set[int], Candidates]]
+    searches: list[tuple[list[str], set[int], MapCandidates]]
 
     def search(self, crops, neighbours=64, without=()):  # type: ignore[no-untyped-def]
         found = super().search(crops, neighbours, without)
@@ -45,9 +45,9 @@ class _Recorder(ExactIndex):
 
 
 @pytest.fixture
-def searches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], set[int], Candidates]]:
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], set[int], MapCandidates]]:
     """What every search of the index was given and gave."""
-    found: list[tuple[list[str], set[int], Candidates]] = []
+    found: list[tuple[list[str], set[int], MapCandidates]] = []
     monkeypatch.setattr(_Recorder, "searches", found, raising=False)
     monkeypatch.setattr(own, "ExactIndex", _Recorder)
     return found
@@ -94,7 +94,7 @@ def test_a_search_without_some_observations_is_that_of_a_map_without_them(view) 
     index = ExactIndex(view)
     first = view.observations[0]
     assert first.embedding is not None
-    crop = Crop(first.embedding / np.float32(1 << 20))
+    crop = QuestionCrop(first.embedding / np.float32(1 << 20))
     every = index.search([crop], len(view.observations)).matches[0]
     without = {m.observation for m in every[::3]}
     left = index.search([crop], 7, without).matches[0]
@@ -104,7 +104,7 @@ def test_a_search_without_some_observations_is_that_of_a_map_without_them(view) 
 
 
 def test_cosines_of_its_own_run_are_lowered_by_the_session_shift(view, monkeypatch) -> None:
-    ranked: list[Candidates] = []
+    ranked: list[MapCandidates] = []
     real = own.rank
     monkeypatch.setattr(
         own, "rank", lambda crops, found, **k: ranked.append(found) or real(crops, found, **k)

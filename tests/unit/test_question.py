@@ -9,11 +9,10 @@ import pytest
 
 from eventsrc.envelope.readers import EnvelopeCamera
 from projections.fold.errors import QuestionError
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
-    Camera,
     parse_question,
     question_schema,
-    read_crops,
     read_moved,
     read_question,
 )
@@ -26,7 +25,7 @@ VECTOR = [3.0, 4.0, 0.0]
 
 def test_an_envelope_its_detections_and_crops_are_the_same_question() -> None:
     seen = [detection("cup", VECTOR, det_id="d0"), detection("chair", [0.0, 1.0, 0.0])]
-    asked = [read_crops(q) for q in (envelope(1, detections=seen), seen, {"crops": seen})]
+    asked = [read_question(q).crops for q in (envelope(1, detections=seen), seen, {"crops": seen})]
     for crops in asked:
         assert [c.class_name for c in crops] == ["cup", "chair"]
         assert crops[0].bbox == (120.0, 80.0, 250.0, 310.0)
@@ -43,7 +42,9 @@ def test_a_crop_may_be_nothing_but_numbers() -> None:
 
 
 def test_a_crop_without_an_embedding_is_one_of_its_class() -> None:
-    crops = read_crops([detection("cup"), detection("chair", VECTOR), {"bbox": [1, 2, 3, 4]}])
+    crops = read_question(
+        [detection("cup"), detection("chair", VECTOR), {"bbox": [1, 2, 3, 4]}]
+    ).crops
     assert [c.class_name for c in crops] == ["cup", "chair"]
     assert [c.vector is None for c in crops] == [True, False]
 
@@ -54,7 +55,7 @@ def test_a_text_says_that_it_is_one() -> None:
         {"embedding": VECTOR},
         {"class": "a", "text": True},
     ]
-    assert [c.is_text for c in read_crops(asked)] == [True, False, False]
+    assert [c.is_text for c in read_question(asked).crops] == [True, False, False]
 
 
 def test_views_have_movements_between_them() -> None:
@@ -80,7 +81,9 @@ def test_one_picture_is_one_view() -> None:
 def test_a_question_may_state_its_camera() -> None:
     camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720, "yaw_rad": 0.5}
     asked = envelope(1, detections=[detection("cup", VECTOR)], camera=camera)
-    assert read_question(asked).camera == Camera(1280.0, 720.0, 90.0, 0.5)
+    assert read_question(asked).camera == Camera(
+        width_px=1280.0, height_px=720.0, hfov_deg=90.0, yaw_rad=0.5
+    )
     assert read_question([detection("cup", VECTOR)]).camera is None
 
 
@@ -134,7 +137,7 @@ def test_the_service_says_what_else_it_reads() -> None:
 def test_a_view_may_repeat_the_camera_of_its_question() -> None:
     camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720}
     question = read_question({"views": [{**ONE, "camera": camera}], "camera": camera})
-    assert question.camera == Camera(1280.0, 720.0, 90.0)
+    assert question.camera == Camera(width_px=1280.0, height_px=720.0, hfov_deg=90.0)
 
 
 ONE = {"crops": [{"embedding": VECTOR}]}

@@ -9,8 +9,8 @@ import pytest
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import MapGiven
 from projections.fold.occupancy import wall_blocks
-from projections.localize.relocalize import Crop, ExactIndex, rank
-from projections.localize.relocalize.walls import _AT_POSE_M, _AT_THING_M, WallMap
+from projections.localize.relocalize import ExactIndex, QuestionCrop, rank
+from projections.localize.relocalize.ground import _AT_POSE_M, _AT_THING_M, WallMap
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import fold
 from tests.support.maps import drawn_map
@@ -93,7 +93,9 @@ def test_an_answer_keeps_out_of_walls_and_does_not_look_through_them() -> None:
         seen = [detection("chair", [1.0, 0.2, 0.0], det_id=f"c{k}", bbox=[280, 150, 360, 250])]
         documents.append(envelope(k, x, 0.0, detections=seen))
     view = fold(documents).view
-    crop = Crop(np.array([1.0, 0.2, 0.0], np.float32), (280.0, 150.0, 360.0, 250.0), "chair")
+    crop = QuestionCrop(
+        np.array([1.0, 0.2, 0.0], np.float32), (280.0, 150.0, 360.0, 250.0), "chair"
+    )
     open_ = rank([crop], ExactIndex(view).search([crop]))
     room = OccupancyMap(None, 0.1, (-3.0, -3.0, 0.0), "s", np.zeros((60, 110), np.uint8))
     view.maps[None] = MapGiven(0, room)

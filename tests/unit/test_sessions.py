@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from projections.localize.relocalize import Match
+from projections.localize.relocalize.appearance import session_shifts, subtract_shifts
 from projections.localize.relocalize.camera import Floats
-from projections.localize.relocalize.sessions import session_shifts, subtract_shifts
 
 USUAL, MOST = 0.7, 0.15
 

@@ -7,7 +7,7 @@ import pytest
 
 from projections.fold.errors import QuestionError
 from projections.localize.relocalize import Answer, PoseHypothesis, Track
-from projections.localize.relocalize.floors import Hypotheses
+from projections.localize.relocalize.layout import Hypotheses
 from projections.surfaces.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name
 
 STILL = (0.0, 0.0, 0.0)

@@ -5,11 +5,11 @@ import pytest
 
 from eventsrc.envelope.model import RunId
 from projections.fold.deltas import ObservationOrdinal
-from projections.localize.relocalize import NEIGHBOURS, Crop, Match, rank
-from projections.localize.relocalize.candidates import Candidates
+from projections.localize.relocalize import NEIGHBOURS, Match, QuestionCrop, rank
+from projections.localize.relocalize.candidates import MapCandidates
 from projections.localize.relocalize.certainty import thinness
 
-CROP = Crop(np.ones(1, dtype=np.float32))
+CROP = QuestionCrop(np.ones(1, dtype=np.float32))
 
 
 def _row(spots: list[float | None], first: int = 0) -> tuple[Match, ...]:
@@ -57,13 +57,13 @@ def test_observations_of_several_crops_count_once() -> None:
 
 
 def test_classes_tell_nothing_of_it() -> None:
-    assert thinness([Crop(None, class_name="chair")], [_row([0.0])]) is None
+    assert thinness([QuestionCrop(None, class_name="chair")], [_row([0.0])]) is None
     assert thinness([], []) is None
 
 
 @pytest.mark.parametrize("method", ["joint", "plain"])
 def test_answers_say_so(method: str) -> None:
-    answer = rank([CROP], Candidates((_row([0.0]),), {}), method=method)  # type: ignore[arg-type]
+    answer = rank([CROP], MapCandidates((_row([0.0]),), {}), method=method)  # type: ignore[arg-type]
     assert answer.document()["thin"] == "1 observation from 1 spot"
-    full = rank([CROP], Candidates((_row(FULL),), {}), method=method)  # type: ignore[arg-type]
+    full = rank([CROP], MapCandidates((_row(FULL),), {}), method=method)  # type: ignore[arg-type]
     assert full.document()["thin"] is None

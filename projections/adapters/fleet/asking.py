@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MapfoldError
 from eventsrc.log.reader import segments_of
-from projections.localize.relocalize import Answer, Camera, Question, rank
+from projections.fold.settings import Camera
+from projections.localize.relocalize import Answer, Question, rank
 from projections.postgres.queries.relocalize import CandidateReader
 
 from .site_databases import SiteDatabases, exists

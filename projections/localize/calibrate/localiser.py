@@ -23,7 +23,7 @@ from typing import NamedTuple
 from projections.fold.exact_functions import exp, log
 from projections.fold.settings import LocalizerConstants
 from projections.localize.evaluate.own_questions import OwnAnswer, ask_own_questions
-from projections.localize.relocalize.certainty import corrected, probability
+from projections.localize.relocalize.certainty import probability
 from projections.map.view import MapView
 
 CROPS = (1, 3)
@@ -148,4 +148,4 @@ def _stepped(p: float) -> float:
 
 
 def _corrected(p: float, scale: float, shift: float) -> float:
-    return probability(corrected(logit(p), scale, shift))
+    return probability(logit(p), scale, shift)

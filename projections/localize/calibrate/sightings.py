@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from projections.fold.deltas import Pose, UnitVector
 from projections.fold.exact import Q40
 from projections.fold.settings import Camera
-from projections.localize.relocalize import camera as pinhole
+from projections.localize.relocalize.camera import box_rows, focal_px, views
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -91,11 +91,10 @@ def sightings_of(rows: Iterable[Row]) -> Sightings:
     for i, row in enumerate(rows):
         by_camera.setdefault(row.camera, []).append(i)
     for camera, of in by_camera.items():
-        lens = pinhole.Camera(camera.width_px, camera.height_px, camera.hfov_deg)
-        read = pinhole.views(lens, pinhole.box_rows([rows[i].bbox for i in of]))
+        read = views(camera, box_rows([rows[i].bbox for i in of]))
         off_axis[of], cut[of], boxed[of] = np.arctan(read.slope), read.cut_x, read.known
         whole = read.known & ~read.cut_y
-        height[of] = np.where(whole, read.height_px / lens.focal_px, np.nan)
+        height[of] = np.where(whole, read.height_px / focal_px(camera), np.nan)
         mounted[of] = camera.yaw_rad
         boxes = np.array([rows[i].bbox for i in of])
         over = boxes - [0.0, 0.0, camera.width_px, camera.height_px]

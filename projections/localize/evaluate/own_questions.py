@@ -21,7 +21,7 @@ from eventsrc.envelope.model import RunId
 from eventsrc.log.seek import Note
 from projections.fold.deltas import ObservationOrdinal
 from projections.fold.exact import to_float32
-from projections.localize.relocalize import Answer, Crop, ExactIndex, Match, rank
+from projections.localize.relocalize import Answer, ExactIndex, Match, QuestionCrop, rank
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 
@@ -188,10 +188,10 @@ def _may_be_one(one: ObjectRecord, other: ObjectRecord) -> bool:
     return math.hypot(one.mean_x - other.mean_x, one.mean_y - other.mean_y) < SEEN_APART_M
 
 
-def _crop(observation: ObservationRecord) -> Crop:
+def _crop(observation: ObservationRecord) -> QuestionCrop:
     assert observation.embedding is not None  # noqa: S101 - drawn among those that have one
     look = to_float32(observation.embedding)
-    return Crop(look, observation.bbox, observation.class_name, observation.det_id)
+    return QuestionCrop(look, observation.bbox, observation.class_name, observation.det_id)
 
 
 def _another_day(row: Sequence[Match], run_id: RunId, lowered: float) -> tuple[Match, ...]:

@@ -24,7 +24,7 @@ from projections.fold.embedding_space import Reembedded
 from projections.fold.exact import quantise, to_float32
 from projections.fold.settings import Settings
 from projections.localize import relocalize
-from projections.localize.relocalize import Crop, View
+from projections.localize.relocalize import QuestionCrop, QuestionView
 from projections.map.own_events import read_corrections, vectors_of
 
 from .truth import Key, Truth
@@ -53,7 +53,7 @@ class Question:
     instances: tuple[str | None, ...]
 
     @property
-    def crops(self) -> tuple[Crop, ...]:
+    def crops(self) -> tuple[QuestionCrop, ...]:
         """The crops of all views."""
         return self.asked.crops
 
@@ -169,7 +169,7 @@ def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> 
     before = drawn[0][0]
     for keyframe, indices in drawn:
         crops = tuple(_crop(keyframe, index) for index in indices)
-        views.append(View(*_moved(_pose(before), _pose(keyframe)), crops))
+        views.append(QuestionView(*_moved(_pose(before), _pose(keyframe)), crops))
         before = keyframe
     key = _key(before)
     return Question(
@@ -196,10 +196,10 @@ def _moved(
     return cos * dx + sin * dy, cos * dy - sin * dx, turned
 
 
-def _crop(keyframe: Accepted, index: int) -> Crop:
+def _crop(keyframe: Accepted, index: int) -> QuestionCrop:
     detection, vector = keyframe.envelope.detections[index], keyframe.vectors[index]
     assert vector is not None  # noqa: S101 - drawn among those that have one
-    return Crop(
+    return QuestionCrop(
         to_float32(quantise(vector)),
         detection.bbox,
         detection.class_name,

@@ -15,8 +15,8 @@ from typing import Any
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from projections.fold.corrections import Corrections
-from projections.fold.settings import Settings
-from projections.localize.relocalize import Camera, Method
+from projections.fold.settings import Camera, Settings
+from projections.localize.relocalize import Method
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
 from projections.map.parsed_log import default_workers

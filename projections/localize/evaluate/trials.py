@@ -11,8 +11,9 @@ import numpy as np
 
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.log.seek import Note
+from projections.fold.settings import Camera
 from projections.localize import relocalize
-from projections.localize.relocalize import Answer, Camera, ExactIndex, Method, rank
+from projections.localize.relocalize import Answer, ExactIndex, Method, rank
 from projections.map.view import MapView
 
 from .baselines import best_cosine, plain_position

@@ -4,13 +4,12 @@
 (`projections.postgres.queries.relocalize`) or from a folded map (`ExactIndex`).
 """
 
-from .camera import Camera
-from .candidates import NEIGHBOURS, CandidatePlace, Candidates, ExactIndex, Match, ObjectEstimate
+from .candidates import NEIGHBOURS, CandidatePlace, ExactIndex, MapCandidates, Match, ObjectEstimate
 from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
-from .question import Crop, Question, View, describe_value
+from .ground import WallMap
+from .question import Question, QuestionCrop, QuestionView, describe_value
 from .ranking import (
-    DEFAULT_CAMERA,
     Answer,
     Evidence,
     Method,
@@ -22,36 +21,32 @@ from .reading import (
     MAX_QUESTION_BYTES,
     parse_json,
     parse_question,
-    read_crops,
+    question_schema,
     read_moved,
     read_question,
 )
-from .schema import question_schema
 from .track import Track, Tracked, movement_of
-from .walls import WallMap
 
 __all__ = [
-    "DEFAULT_CAMERA",
     "MAX_QUESTION_BYTES",
     "NEIGHBOURS",
     "UNKNOWN_BELOW",
     "Answer",
-    "Camera",
     "CandidatePlace",
-    "Candidates",
-    "Crop",
     "Evidence",
     "ExactIndex",
+    "MapCandidates",
     "MapConstants",
     "Match",
     "Method",
     "ObjectEstimate",
     "PoseHypothesis",
     "Question",
+    "QuestionCrop",
+    "QuestionView",
     "RankedPlace",
     "Track",
     "Tracked",
-    "View",
     "WallMap",
     "describe_value",
     "movement_of",
@@ -59,7 +54,6 @@ __all__ = [
     "parse_question",
     "question_schema",
     "rank",
-    "read_crops",
     "read_moved",
     "read_question",
 ]

@@ -16,9 +16,17 @@ directions: its mean is 1.
 
 An observation with a likeness of nearly 1 is the crop's own picture. Then its landmark is the
 thing, and the robot is on that side of it.
+
+*Session shifts* are taken off likenesses first: the excess within one session over those between
+two. Light, lens and clutter of a session are in all of its embeddings, so a crop is more similar to
+what its own session has mapped than the same thing is on another day: by ``session_shift`` of
+`projections.fold.evidence`. A map may hold a part of the lost robot's own session beside other
+runs. Each run therefore has a shift of its own: with one shift subtracted from all, the other runs'
+matches would be as dissimilar as views from behind.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -28,8 +36,8 @@ from numpy.typing import NDArray
 from projections.fold.evidence import EvidenceConstants
 
 from .camera import Floats
-from .constants import MapConstants
-from .model import Model
+from .candidates import Match
+from .constants import MapConstants, RankingModel
 
 DIRECTIONS: Final = 36
 """The number of directions in a landmark's table, 10° apart."""
@@ -54,7 +62,7 @@ def usual_likeness(evidence: EvidenceConstants) -> float:
 
 
 def appearance_tables(
-    likeness: Floats, side: Floats, starts: Indices, constants: MapConstants, model: Model
+    likeness: Floats, side: Floats, starts: Indices, constants: MapConstants, model: RankingModel
 ) -> Floats:
     """Log-likelihood ratios of shape (landmarks, DIRECTIONS). ``likeness`` and ``side``, the angle
     from which it was seen in radians, are of the observations, grouped by landmark; ``starts`` has
@@ -75,7 +83,7 @@ def appearance_tables(
 
 
 def _which_thing(
-    likeness: Floats, cosines: Floats, starts: Indices, constants: MapConstants, model: Model
+    likeness: Floats, cosines: Floats, starts: Indices, constants: MapConstants, model: RankingModel
 ) -> Floats:
     place = np.rint((likeness - _LEAST_LIKENESS) * _PER_LIKENESS)
     place = np.minimum(np.maximum(place, 0.0), _LIKENESSES - 1.0)
@@ -106,7 +114,7 @@ def _key(evidence: EvidenceConstants) -> _Key:
 
 
 @lru_cache(maxsize=16)
-def _ratios(key: _Key, different_spread: float, model: Model) -> Floats:
+def _ratios(key: _Key, different_spread: float, model: RankingModel) -> Floats:
     """The table of log-likelihood ratios of single pairs, by change of side and by likeness."""
     back, side, kappa, spread, shift, of_class, class_spread = key
     sides = np.exp(kappa * (np.arange(_STEPS + 1) * (2.0 / _STEPS) - 2.0))
@@ -129,7 +137,11 @@ def _bell(z: Floats) -> Floats:
 
 
 def _which_side(
-    likeness: Floats, cosines: Floats, starts: Indices, evidence: EvidenceConstants, model: Model
+    likeness: Floats,
+    cosines: Floats,
+    starts: Indices,
+    evidence: EvidenceConstants,
+    model: RankingModel,
 ) -> Floats:
     """Log-likelihoods of shape (landmarks, DIRECTIONS), whose exponentials have the mean 1."""
     mean = usual_likeness(evidence) + evidence.same_side * (
@@ -146,3 +158,34 @@ def _which_side(
     fit = np.maximum(fit - fit.max(0), -_WORST)
     density: Floats = (fit - np.log(np.exp(fit).mean(0))).T
     return density
+
+
+_THIRD = 2
+
+
+def session_shifts(
+    rows: Sequence[Sequence[Match]], likenesses: Sequence[Floats], usual: float, most: float
+) -> dict[str, float]:
+    """The shift of each run: the excess of its likenesses over ``usual``, at most ``most``; mostly
+    0.
+
+    Measured on a crop's third best match in the run, not the best, which is too similar if the very
+    crop is in the map. A run with fewer matches of every crop has shift 0.
+    """
+    thirds: dict[str, float] = {}
+    for row, likeness in zip(rows, likenesses, strict=True):
+        by_run: dict[str, list[float]] = {}
+        for match, value in zip(row, likeness.tolist(), strict=True):
+            by_run.setdefault(match.run_id, []).append(value)
+        for run_id, values in by_run.items():
+            third = sorted(values)[-_THIRD - 1] if len(values) > _THIRD else usual
+            thirds[run_id] = max(third, thirds.get(run_id, usual))
+    return {run_id: min(third - usual, max(0.0, most)) for run_id, third in thirds.items()}
+
+
+def subtract_shifts(row: Sequence[Match], likeness: Floats, shifts: Mapping[str, float]) -> Floats:
+    """A crop's likenesses less their runs' shifts."""
+    if not any(shifts.values()):
+        return likeness
+    less: Floats = likeness - np.array([shifts[match.run_id] for match in row])
+    return less

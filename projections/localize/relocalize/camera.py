@@ -5,16 +5,30 @@ metres is the same for one thing from wherever it is seen (its *size*, in pixel 
 upper and its lower edge: the rise of the line of sight to an edge times the distance is the height
 of that edge above the camera. A box that touches the picture's border is cut off there: such an
 edge is not used, and the bearing counts less.
+
+*Cues* are the evidence of boxes for the distance of a landmark: two quantities, each the mean over
+the observations whose boxes the picture's border does not cut there:
+
+size        logarithm of the box's height in metres, log(height at 1 m) + log(distance)
+elevation   of the upper or lower edge above the camera: rise of the line of sight × distance
+
+Both are computed from the estimated position, so they contain its error; each comes with its
+gradient with respect to the position. A thing seen from one spot may be farther away than
+estimated, but then it is larger, too, and looks the same from that spot.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.base.errors import MisuseError
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.settings import Camera
+
+from .constants import RankingModel
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -26,33 +40,14 @@ _FARTHEST_PX = 1e6
 """The limit of coordinates, which keeps squares in the geometry finite."""
 
 
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """Picture size in pixels, horizontal field of view in degrees, and the angle from the robot's
-    heading to where the camera looks, radians to the left."""
+def focal_px(camera: Camera) -> float:
+    """The focal length in pixels."""
+    return camera.width_px / 2.0 / math.tan(half_field_rad(camera))
 
-    width_px: float = 640.0
-    height_px: float = 400.0
-    hfov_deg: float = 69.4
-    yaw_rad: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not (self.width_px > 0 and self.height_px > 0 and 1.0 <= self.hfov_deg <= 170.0):
-            raise MisuseError(
-                f"no camera has {self.width_px:g} × {self.height_px:g} pixels and"
-                f" {self.hfov_deg:g}°; give positive sizes and a horizontal field of view of 1"
-                " to 170 degrees"
-            )
-
-    @property
-    def focal_px(self) -> float:
-        """The focal length in pixels."""
-        return self.width_px / 2.0 / math.tan(math.radians(self.hfov_deg) / 2.0)
-
-    @property
-    def half_field_rad(self) -> float:
-        """Half the horizontal field of view."""
-        return math.radians(self.hfov_deg) / 2.0
+def half_field_rad(camera: Camera) -> float:
+    """Half the horizontal field of view."""
+    return math.radians(camera.hfov_deg) / 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +79,7 @@ def views(camera: Camera, rows: Floats) -> Views:
     """The slopes and heights of boxes of `box_rows`."""
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -_FARTHEST_PX), _FARTHEST_PX)
     known = (x1 > x0) & (y1 > y0)
-    slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
+    slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / focal_px(camera)
     return Views(
         slope=np.where(known, slope, 0.0),
         height_px=np.where(known, np.maximum(y1 - y0, _MIN_HEIGHT_PX), _UNKNOWN_HEIGHT_PX),
@@ -98,7 +93,7 @@ UPPER, LOWER = 0, 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sights:
+class SightLines:
     """Lines of sight to n boxes. Distances are along the ground.
 
     ``bearing`` is radians to the left of the robot's heading, 0 without a box; ``log_height`` the
@@ -120,9 +115,9 @@ class Sights:
         both: Flags = self.whole[UPPER] & self.whole[LOWER]
         return both
 
-    def take(self, index: NDArray[np.intp] | slice) -> "Sights":
+    def take(self, index: NDArray[np.intp] | slice) -> "SightLines":
         """The lines of sight at ``index``."""
-        return Sights(
+        return SightLines(
             self.bearing[index],
             self.log_height[index],
             self.rise[:, index],
@@ -132,17 +127,17 @@ class Sights:
         )
 
 
-def sights(camera: Camera, rows: Floats) -> Sights:
+def sights(camera: Camera, rows: Floats) -> SightLines:
     """The lines of sight of boxes of `box_rows`; parts farther outside the picture than the picture
     is large are cut off."""
     most = np.array((camera.width_px, camera.height_px) * 2)[:, None]
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -most), 2.0 * most)
     known = (x1 > x0) & (y1 > y0)
-    tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / camera.focal_px
-    per_px = 1.0 / (camera.focal_px * np.sqrt(1.0 + tangent * tangent))
+    tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / focal_px(camera)
+    per_px = 1.0 / (focal_px(camera) * np.sqrt(1.0 + tangent * tangent))
     rise = (camera.height_px / 2.0 - np.stack((y0, y1))) * per_px
     inside = np.stack((y0 > _EDGE_PX, y1 < camera.height_px - _EDGE_PX))
-    return Sights(
+    return SightLines(
         bearing=np.where(known, np.arctan(tangent) + camera.yaw_rad, 0.0),
         log_height=np.log(np.maximum(y1 - y0, _MIN_HEIGHT_PX) * per_px),
         rise=rise,
@@ -150,3 +145,81 @@ def sights(camera: Camera, rows: Floats) -> Sights:
         cut=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
         known=known,
     )
+
+
+Indices = NDArray[np.intp]
+
+_NEAREST_M: Final = 0.3
+_PRIOR_EDGES: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cue:
+    """A quantity of n landmarks, its gradient with respect to their position, and its variance at a
+    given position, infinite where nothing is known."""
+
+    mean: Floats
+    by_x: Floats
+    by_y: Floats
+    variance: Floats
+
+    def part(self, rows: slice) -> "Cue":
+        """The cue of some of the landmarks."""
+        return Cue(self.mean[rows], self.by_x[rows], self.by_y[rows], self.variance[rows])
+
+
+def cues(
+    boxes: SightLines,
+    poses: Floats,
+    sight: Floats,
+    at: Floats,
+    starts: Indices,
+    model: RankingModel,
+) -> tuple[Cue, tuple[Cue, Cue]]:
+    """The cues of landmarks: size, and the elevations of the upper and the lower edge. Of each
+    observation, ``at`` (m, 2) is the position of its landmark and ``sight`` (m,) its direction in
+    the map."""
+    ux, uy = np.cos(sight), np.sin(sight)
+    ahead = (at[:, 0] - poses[:, 0]) * ux + (at[:, 1] - poses[:, 1]) * uy
+    ahead = np.maximum(ahead, _NEAREST_M)
+    per = 1.0 / ahead
+    tall = boxes.tall.astype(np.float64)
+    size, _, count = _mean_cue(boxes.log_height + np.log(ahead), ux * per, uy * per, tall, starts)
+    size = Cue(
+        size.mean, size.by_x, size.by_y, np.where(count > 0.0, model.size_spread**2, math.inf)
+    )
+    edges = []
+    for edge in (UPPER, LOWER):
+        rise, whole = boxes.rise[edge], boxes.whole[edge].astype(np.float64)
+        cue, scatter, count = _mean_cue(rise * ahead, rise * ux, rise * uy, whole, starts)
+        part = model.edge_part * cue.mean
+        prior = _PRIOR_EDGES * (model.edge_m**2 + part * part)
+        variance = np.where(count > 0.0, (scatter + prior) / (count + _PRIOR_EDGES), math.inf)
+        edges.append(Cue(cue.mean, cue.by_x, cue.by_y, variance))
+    return size, (edges[0], edges[1])
+
+
+def _mean_cue(
+    value: Floats, by_x: Floats, by_y: Floats, weight: Floats, starts: Indices
+) -> tuple[Cue, Floats, Floats]:
+    """Weighted means over each landmark's observations, the sum of squared deviations, and the
+    weight; the variance is left 0."""
+    count = np.add.reduceat(weight, starts)
+    safe = np.maximum(count, 1e-9)
+    rows = np.stack((value, value * value, by_x, by_y)) * weight
+    mean, square, x, y = np.add.reduceat(rows, starts, axis=1) / safe
+    scatter = np.maximum(square - mean * mean, 0.0) * count
+    return Cue(mean, x, y, np.zeros_like(mean)), scatter, count
+
+
+def with_class_sizes(
+    size: Cue, classes: Sequence[str], evidence: EvidenceConstants, model: RankingModel
+) -> Cue:
+    """``size``, with the known size of the class for landmarks that have no box with a height."""
+    mean, variance = size.mean.copy(), size.variance.copy()
+    for index in np.flatnonzero(~np.isfinite(variance)).tolist():
+        height = evidence.sizes_m.get(classes[index])
+        if height is not None:
+            mean[index] = math.log(height)
+            variance[index] = evidence.size_spread**2 + model.size_spread**2
+    return Cue(mean, size.by_x, size.by_y, variance)

@@ -1,6 +1,6 @@
 """Candidates: the map's observations most similar to each crop, and their Places.
 
-`Candidates` is the whole input of the ranking. The databases make it with one query
+`MapCandidates` is the whole input of the ranking. The databases make it with one query
 (`projections.postgres.queries.relocalize`), a folded map by exact search (`ExactIndex`). The
 ranking treats both alike.
 
@@ -27,8 +27,8 @@ from projections.map.records import Estimate
 from projections.map.view import MapView
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
-from .question import Box, Crop, Vector, describe_value
-from .walls import WallMap
+from .ground import WallMap
+from .question import Box, QuestionCrop, Vector, describe_value
 
 NEIGHBOURS = 64
 """Observations fetched per crop. From 48 on, the measures in docs/relocalization.md stay the same;
@@ -95,7 +95,7 @@ class CandidatePlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class MapCandidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
 
     Those of a crop without an embedding are observations of Objects of its class, with the
@@ -162,7 +162,7 @@ class ExactIndex:
         ]
         return Cosines(len(products), float(np.mean(products)), float(np.std(products)))
 
-    def check_spaces(self, crops: Sequence[Crop]) -> None:
+    def check_spaces(self, crops: Sequence[QuestionCrop]) -> None:
         """Raise QuestionError when a crop is not of the map's embedding space."""
         if len(self._ordinals):
             for crop in crops:
@@ -170,10 +170,10 @@ class ExactIndex:
 
     def search(
         self,
-        crops: Sequence[Crop],
+        crops: Sequence[QuestionCrop],
         neighbours: int = NEIGHBOURS,
         without: Collection[ObservationOrdinal] = (),
-    ) -> Candidates:
+    ) -> MapCandidates:
         """The nearest observations of each crop, as if the map had none of those ``without``.
         Raises QuestionError for another space."""
         self.check_spaces(crops)
@@ -186,7 +186,7 @@ class ExactIndex:
             for crop in crops
         )
         refuse_unknown_classes(crops, matches, self._class_names)
-        return Candidates(matches, self.places, self.constants, self._walls)
+        return MapCandidates(matches, self.places, self.constants, self._walls)
 
     def _nearest(
         self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None
@@ -252,14 +252,14 @@ def _in_metres(estimate: Estimate | None) -> ObjectEstimate | None:
     )
 
 
-def objects_of_a_class(crops: Sequence[Crop]) -> int:
+def objects_of_a_class(crops: Sequence[QuestionCrop]) -> int:
     """The number of Objects to fetch for each crop of which only the class is known."""
     classes = {crop.class_name for crop in crops if crop.vector is None}
     return min(OBJECTS_OF_A_CLASS, MOST_OBJECTS // max(len(classes), 1))
 
 
 def refuse_unknown_classes(
-    crops: Sequence[Crop],
+    crops: Sequence[QuestionCrop],
     matches: Sequence[Sequence[Match]],
     class_names: Callable[[], Iterable[str]],
 ) -> None:
@@ -286,7 +286,7 @@ def refuse_unknown_classes(
 _SHOWN = 12
 
 
-def check_space(crop: Crop, dimension: int, model: str | None) -> None:
+def check_space(crop: QuestionCrop, dimension: int, model: str | None) -> None:
     """Raise QuestionError when the crop is not of the map's embedding space."""
     if crop.vector is None:
         return

@@ -1,6 +1,6 @@
-"""Certainty of an answer: `known`, the probability that the map has the things shown, and
-`thinness`, what the map has too little of for reliable probabilities. `features` has `confidence`,
-the probability that the pose is within 1.5 m.
+"""Certainty of an answer: `known`, the probability that the map has the things shown, `confidence`,
+that the pose is within 1.5 m of the truth, and `thinness`, what the map has too little of for
+reliable probabilities.
 
 `known` and `confidence` are logistic models. Their inputs depend neither on the embedding model nor
 on the size of the map: likenesses are relative, (cosine - different) / (1 - different), 0 for what
@@ -15,18 +15,28 @@ map's own questions.
 Nothing measured on other maps holds for one that a robot has just begun: the few things it has seen
 are the most similar to any crop, and every pose is near the few spots they were seen from. The
 candidates show that, so `thinness` costs a question nothing.
+
+In the fit of `confidence`, an answer to crops of things that the map lacks counts as wrong. Where
+only classes are known, there is no likeness by which to decide whether the things are those of the
+map; `confidence` is then the posterior's weight near the answer, which assumes that they are.
 """
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass
 from typing import Final
+
+import numpy as np
 
 from eventsrc.base.text import counted
 from projections.fold.exact_functions import exp
+from projections.fold.settings import LocalizerConstants
 
+from .camera import Floats
 from .candidates import NEIGHBOURS, Match
-from .constants import MapConstants
-from .question import Crop
+from .constants import MapConstants, RankingModel
+from .landmarks import Landmarks
+from .question import QuestionCrop
 
 UNKNOWN_BELOW: Final = 0.5
 """Below this probability of `known` the answer is 'unknown'."""
@@ -40,7 +50,7 @@ _NO_LOOK: Final = 0.5
 
 
 def known_probability(
-    crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
+    crops: Sequence[QuestionCrop], matches: Sequence[Sequence[Match]], constants: MapConstants
 ) -> float:
     """The probability that the map has one of the things shown; ``matches`` run parallel to
     ``crops``, each row most similar first. 0 where nothing is similar to any crop."""
@@ -49,11 +59,11 @@ def known_probability(
         return _NO_LOOK if any(matches) else 0.0
     localizer = constants.localizer
     logit = logit_of(KNOWN_WEIGHTS, features)
-    return probability(corrected(logit, localizer.known_scale, localizer.known_shift))
+    return probability(logit, localizer.known_scale, localizer.known_shift)
 
 
 def known_features(
-    crops: Sequence[Crop], matches: Sequence[Sequence[Match]], constants: MapConstants
+    crops: Sequence[QuestionCrop], matches: Sequence[Sequence[Match]], constants: MapConstants
 ) -> tuple[float, ...] | None:
     """The greatest relative likeness of any crop to an observation, and the mean over the crops of
     each crop's greatest. Then, of each crop's mean likeness to its four most similar observations:
@@ -87,14 +97,10 @@ def logit_of(weights: Sequence[float], features: Sequence[float]) -> float:
     )
 
 
-def corrected(logit: float, scale: float, shift: float) -> float:
-    """A logit corrected by a map's own scale and shift."""
-    return scale * logit + shift
-
-
-def probability(logit: float) -> float:
-    """The logistic function of a logit; the same bits on every machine."""
-    return 1.0 / (1.0 + exp(-max(-40.0, min(40.0, logit))))
+def probability(logit: float, scale: float = 1.0, shift: float = 0.0) -> float:
+    """The logistic function of a logit, corrected by a map's own scale and shift; the same bits on
+    every machine."""
+    return 1.0 / (1.0 + exp(-max(-40.0, min(40.0, scale * logit + shift))))
 
 
 LEAST_SPOTS: Final = 5
@@ -103,7 +109,7 @@ around."""
 SPOT_M: Final = 0.35
 
 
-def thinness(crops: Sequence[Crop], matches: Sequence[Sequence[Match]]) -> str | None:
+def thinness(crops: Sequence[QuestionCrop], matches: Sequence[Sequence[Match]]) -> str | None:
     """A clause that names what the map has too little of; None if it has enough or no crop has an
     embedding.
 
@@ -138,3 +144,67 @@ def _spots(matches: Iterable[Match]) -> int:
             if len(spots) == LEAST_SPOTS:
                 break
     return len(spots)
+
+
+_ELSEWHERE_M: Final = 2.5
+_MOST_MARGIN: Final = 0.5
+CONFIDENCE_WEIGHTS: Final = (-10.01, 18.17, 1.607, -0.882, -2.168, -0.407, 0.406)
+"""Intercept, then one for each of `Features`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """``likeness`` is the greatest relative likeness of any crop's match, ``margin`` what it is
+    above that of a landmark more than 2.5 m away, the greatest of any crop and at most 0.5. Crops
+    of which only the class is known do not count; without any other both are None.
+
+    ``mass`` is the weight within 1.5 m of the answer, ``loss`` the expected error in metres, 2.5 m
+    at most. ``best_crop`` and ``mean_crop`` are log-likelihood ratios of the crops at the likeliest
+    pose; a crop without evidence counts as explained by nothing.
+    """
+
+    likeness: float | None
+    margin: float | None
+    mass: float
+    loss: float
+    best_crop: float
+    mean_crop: float
+
+
+def features_of(
+    landmarks: Sequence[Landmarks],
+    crops: Floats,
+    asked: int,
+    mass: float,
+    loss: float,
+    model: RankingModel,
+) -> Features:
+    """The features of a posterior. ``crops`` are the log-likelihoods of crops with evidence,
+    ``landmarks`` those of crops that have an embedding too; ``asked`` counts all crops."""
+    missing = (asked - len(crops)) * math.log(1.0 - model.in_map)  # their things are not in the map
+    return Features(
+        max((float(each.likeness.max()) for each in landmarks), default=None),
+        max((_margin(each) for each in landmarks), default=None),
+        mass,
+        loss,
+        float(crops.max()),
+        (float(crops.sum()) + missing) / asked,
+    )
+
+
+def _margin(landmarks: Landmarks) -> float:
+    best = int(np.argmax(landmarks.likeness))
+    dx, dy = (landmarks.xy - landmarks.xy[best]).T
+    others = landmarks.likeness[dx * dx + dy * dy > _ELSEWHERE_M * _ELSEWHERE_M]
+    if not len(others):
+        return _MOST_MARGIN
+    return min(_MOST_MARGIN, float(landmarks.likeness[best]) - float(others.max()))
+
+
+def confidence_of(features: Features, constants: LocalizerConstants) -> float:
+    """The probability that the pose is within 1.5 m."""
+    if features.likeness is None:
+        return min(features.mass, 1.0)
+    logit = logit_of(CONFIDENCE_WEIGHTS, astuple(features))
+    score = constants.confidence_scale * logit + constants.confidence_shift
+    return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, score))))

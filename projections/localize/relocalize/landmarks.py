@@ -14,14 +14,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .appearance import DIRECTIONS, appearance_tables, relative
-from .camera import Camera, Floats, Sights, box_rows, sights, views
+from projections.fold.settings import Camera
+
+from .appearance import DIRECTIONS, appearance_tables, relative, subtract_shifts
+from .camera import Cue, Floats, SightLines, box_rows, cues, sights, views, with_class_sizes
 from .candidates import Match, ObjectEstimate
-from .constants import MapConstants
-from .cues import Cue, cues, with_class_sizes
-from .model import Model
-from .question import Crop
-from .sessions import subtract_shifts
+from .constants import MapConstants, RankingModel
+from .question import QuestionCrop
 from .triangulation import Triangulated, triangulate
 
 Indices = NDArray[np.intp]
@@ -77,7 +76,7 @@ class CropGroup:
 
     landmarks: Landmarks
     first: Indices
-    sight: Sights
+    sight: SightLines
     has_embedding: tuple[bool, ...]
     owner: Indices = field(init=False)
     """The index of each landmark's crop."""
@@ -110,7 +109,7 @@ class CropGroup:
         ]
 
 
-def likeness_of(crop: Crop, row: Sequence[Match], constants: MapConstants) -> Floats:
+def likeness_of(crop: QuestionCrop, row: Sequence[Match], constants: MapConstants) -> Floats:
     """Relative likenesses of a crop's matches; those of a text have the map's shift added."""
     cosines = np.array([match.similarity for match in row], dtype=np.float64)
     if crop.is_text:
@@ -122,14 +121,14 @@ class Seen(NamedTuple):
     """A crop, its matches that have a pose, and their relative likenesses: ``raw``, and with the
     shifts of their runs subtracted."""
 
-    crop: Crop
+    crop: QuestionCrop
     matches: Sequence[Match]
     raw: Floats
     likeness: Floats
 
     @classmethod
     def of(
-        cls, crop: Crop, row: Sequence[Match], likeness: Floats, shifts: Mapping[str, float]
+        cls, crop: QuestionCrop, row: Sequence[Match], likeness: Floats, shifts: Mapping[str, float]
     ) -> "Seen | None":
         """The crop with its posed matches; None if no match has a pose. ``likeness`` is of
         `likeness_of`."""
@@ -142,7 +141,10 @@ class Seen(NamedTuple):
 
 
 def crop_groups(
-    views_seen: Sequence[Sequence[Seen]], constants: MapConstants, camera: Camera, model: Model
+    views_seen: Sequence[Sequence[Seen]],
+    constants: MapConstants,
+    camera: Camera,
+    model: RankingModel,
 ) -> list[list[CropGroup]]:
     """The evidence of the crops of each view, in two groups at most; there is at least one crop.
 
@@ -179,7 +181,7 @@ class _Thing:
 
 
 def _landmarks(
-    seen: Sequence[Seen], constants: MapConstants, model: Model
+    seen: Sequence[Seen], constants: MapConstants, model: RankingModel
 ) -> tuple[Landmarks, Indices]:
     """The landmarks of all crops, and the index of each crop's first one, with the total at the
     end."""
@@ -305,7 +307,7 @@ def _ratios(
     sides: Floats,
     starts: Indices,
     constants: MapConstants,
-    model: Model,
+    model: RankingModel,
 ) -> Floats:
     if all(each.crop.vector is None for each in seen):
         return np.full((len(starts), DIRECTIONS), math.exp(model.class_ratio))

@@ -29,12 +29,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from projections.fold.settings import Camera
+
 from .appearance import DIRECTIONS
-from .camera import Camera, Floats
-from .constants import MapConstants
+from .camera import Floats, half_field_rad
+from .constants import MapConstants, RankingModel
+from .ground import WallLookup
 from .landmarks import CropGroup
-from .model import Model
-from .walls import Walls
 
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
@@ -109,8 +110,8 @@ class Scene:
 
     constants: MapConstants
     camera: Camera
-    model: Model
-    walls: Walls | None = None
+    model: RankingModel
+    walls: WallLookup | None = None
 
 
 class _Pairs:
@@ -218,7 +219,7 @@ def terms_at(
     )
 
 
-def _hidden(group: CropGroup, pairs: _Pairs, xy: Floats, looks: Floats, walls: Walls) -> Flags:
+def _hidden(group: CropGroup, pairs: _Pairs, xy: Floats, looks: Floats, walls: WallLookup) -> Flags:
     """Flags of the pairs that have a wall in between; False, unchecked, where the landmark looks
     little like the crop."""
     crop, place = np.divmod(pairs.slot, len(xy))
@@ -254,7 +255,7 @@ def _ratio_towards(ratios: Floats, row: Indices, towards: Floats) -> Floats:
     return found
 
 
-def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Floats:
+def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: RankingModel) -> Floats:
     """The log ratio by the box's height; a cut box is only evidence against things too far away for
     it."""
     size, per = group.landmarks.size, offset.per
@@ -277,7 +278,7 @@ def _by_size(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> 
     return np.where(pairs.of(known), fit, 0.0)
 
 
-def _by_edges(group: CropGroup, pairs: _Pairs, offset: _Offset, model: Model) -> Any:
+def _by_edges(group: CropGroup, pairs: _Pairs, offset: _Offset, model: RankingModel) -> Any:
     """The log ratio by the upper and the lower edge, where the picture's border does not cut
     them."""
     edges, per = group.edges, offset.per
@@ -314,7 +315,7 @@ def log_likelihood(
 ) -> Floats:
     """Log-likelihoods of the crops, shape (c, k, h), at the terms' positions with the headings
     ``yaw`` (k, h)."""
-    half = scene.camera.half_field_rad
+    half = half_field_rad(scene.camera)
     at = yaw[:, None] if terms.looks.ndim == 2 else yaw.take(terms.slot % terms.positions, axis=1)
     off = terms.heading - at
     off -= _TURN * np.rint(off / _TURN)
@@ -334,7 +335,7 @@ def log_likelihood_of_place(group: CropGroup, terms: Terms, scene: Scene) -> Flo
     fit: Any = terms.box
     if group.boxed:
         wide = terms.variance + _ROUGH_BEARING
-        fit = fit * (2.0 * scene.camera.half_field_rad / np.sqrt(_TURN * wide))
+        fit = fit * (2.0 * half_field_rad(scene.camera) / np.sqrt(_TURN * wide))
     found: Floats = _mixture(terms, fit + scene.model.tail * terms.near, scene)[0]
     return found
 
@@ -342,7 +343,7 @@ def log_likelihood_of_place(group: CropGroup, terms: Terms, scene: Scene) -> Flo
 def log_likelihood_unaimed(terms: Terms, scene: Scene) -> Floats:
     """Approximate log-likelihoods of the crops at headings that fit no landmark's bearing, shape
     (c, h)."""
-    in_view = scene.camera.half_field_rad / math.pi
+    in_view = half_field_rad(scene.camera) / math.pi
     tail: Floats = terms.near.astype(np.float64) * (scene.model.tail * in_view)
     found: Floats = _mixture(terms, tail, scene)[0]
     return found
@@ -366,10 +367,5 @@ def headings(group: CropGroup, terms: Terms, scene: Scene) -> tuple[Floats, Floa
     its variance, and how likely it is, up to a factor that all crops share."""
     variance = terms.variance
     if not group.boxed:
-        variance = np.full_like(variance, (0.5 * scene.camera.half_field_rad) ** 2)
+        variance = np.full_like(variance, (0.5 * half_field_rad(scene.camera)) ** 2)
     return terms.heading, variance, terms.looks * terms.box / np.sqrt(variance)
-
-
-def unexplained(model: Model) -> float:
-    """The log-likelihood of a crop without evidence: its thing is not in the map."""
-    return math.log(1.0 - model.in_map)

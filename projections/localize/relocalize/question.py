@@ -1,8 +1,14 @@
 """Questions: the object crops a lost robot sees, in one picture or in several.
 
-The crops of a view come from one picture: their boxes give the direction of each.
+The crops of a view come from one picture: their boxes give the direction of each. Where views are
+of several poses, the robot's pose at each is known given that at the last one.
+
+The movement between two views is known but for a small error that grows with it: 2 cm and a
+twentieth of the way, and 0.01 rad and a twentieth of the turn. The errors of all movements up to
+the last view add up, and a turn's error moves what lies behind it sideways.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,7 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Camera
+from projections.fold.settings import Camera
+
+from .camera import Floats
 
 MAX_CROPS: Final = 32
 """More crops than this are refused: each one costs a search."""
@@ -26,7 +34,7 @@ STILL: Final[Movement] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Crop:
+class QuestionCrop:
     """One crop: a unit vector, float32 of shape (dim,), and what else is known about it.
 
     ``vector`` is None when only the class is known; ``is_text`` is whether it is the embedding of a
@@ -49,14 +57,14 @@ class Crop:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class QuestionView:
     """The crops of one picture, and the robot's movement since the view before: metres ahead and to
     the left, and radians to the left, in its frame at that view; all 0 in the first view."""
 
     dx: float
     dy: float
     dyaw: float
-    crops: tuple[Crop, ...]
+    crops: tuple[QuestionCrop, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,18 +74,18 @@ class Question:
     ``camera`` is None where the question does not state it.
     """
 
-    views: tuple[View, ...]
+    views: tuple[QuestionView, ...]
     camera: Camera | None = None
 
     @property
-    def crops(self) -> tuple[Crop, ...]:
+    def crops(self) -> tuple[QuestionCrop, ...]:
         """The crops of all views, in order."""
         return tuple(crop for view in self.views for crop in view.crops)
 
     @classmethod
-    def of(cls, crops: Sequence[Crop]) -> "Question":
+    def of(cls, crops: Sequence[QuestionCrop]) -> "Question":
         """The question of one picture."""
-        return cls((View(0.0, 0.0, 0.0, tuple(crops)),))
+        return cls((QuestionView(0.0, 0.0, 0.0, tuple(crops)),))
 
 
 def describe_value(value: Any) -> str:
@@ -86,3 +94,45 @@ def describe_value(value: Any) -> str:
         return f"a {'list' if isinstance(value, list) else 'JSON object'}"
     text = repr(value[:_MAX_DESCRIBED] if isinstance(value, str) else value)
     return text if len(text) <= _MAX_DESCRIBED else f"{text[:_MAX_DESCRIBED]}…"
+
+
+_STEP_M, _STEP_PART = 0.02, 0.05
+_TURN_RAD, _TURN_PART = 0.01, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Behind:
+    """The error of the pose at a view, given the pose at the last one, and its distance from
+    that."""
+
+    m2: float
+    yaw2: float
+    away_m: float
+    turn: float
+
+
+def behind_last(movements: Sequence[Movement]) -> list[Behind]:
+    """For each view the movement and its error between it and the last one."""
+    m2 = yaw2 = turn = 0.0
+    x = y = 0.0
+    found = [Behind(0.0, 0.0, 0.0, 0.0)]
+    for dx, dy, dyaw in reversed(movements[1:]):
+        length = math.hypot(dx, dy)
+        yaw2 += _TURN_RAD**2 + (_TURN_PART * dyaw) ** 2
+        m2 += _STEP_M**2 + (_STEP_PART * length) ** 2 + yaw2 * length * length
+        turn += dyaw
+        cos, sin = math.cos(-turn), math.sin(-turn)
+        x, y = x - (cos * dx - sin * dy), y - (sin * dx + cos * dy)
+        found.append(Behind(m2, yaw2, math.hypot(x, y), turn))
+    return found[::-1]
+
+
+def poses_at_views(poses: Floats, movements: Sequence[Movement]) -> list[Floats]:
+    """Poses (h, 3) at every view from those at the last one; ``movements`` as in `QuestionView`."""
+    found = [poses]
+    for dx, dy, dyaw in reversed(movements[1:]):
+        x, y, yaw = found[-1].T
+        yaw = yaw - dyaw
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        found.append(np.column_stack((x - (cos * dx - sin * dy), y - (sin * dx + cos * dy), yaw)))
+    return found[::-1]

@@ -18,18 +18,17 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from projections.fold.deltas import PlaceOrdinal
+from projections.fold.settings import Camera
 
-from .camera import Camera
-from .candidates import Candidates, Match
+from .candidates import MapCandidates, Match
 from .certainty import UNKNOWN_BELOW, known_probability, thinness
-from .floors import Hypotheses, Layout
+from .constants import MODEL, RankingModel
+from .layout import Hypotheses, Layout
 from .likelihood import Scene
-from .model import MODEL, Model
 from .pose import Posterior, locate
-from .question import Crop, Question, View
+from .question import Question, QuestionCrop, QuestionView
 
 Method = Literal["joint", "plain"]
-DEFAULT_CAMERA: Final = Camera()
 PLAIN_NEIGHBOURS: Final = 10
 
 
@@ -135,13 +134,13 @@ class Answer:
 
 
 def rank(
-    question: Question | Sequence[Crop],
-    candidates: Candidates,
+    question: Question | Sequence[QuestionCrop],
+    candidates: MapCandidates,
     *,
     top: int = 3,
     method: Method = "joint",
     camera: Camera | None = None,
-    model: Model = MODEL,
+    model: RankingModel = MODEL,
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
     to the crops. The camera is that of the question, else ``camera``, else that of the map."""
@@ -160,7 +159,9 @@ def rank(
     return replace(_answer(candidates, crops, posterior, top, floors), known=known, thin=thin)
 
 
-def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], Candidates]:
+def _in_order(
+    question: Question, candidates: MapCandidates
+) -> tuple[list[QuestionView], MapCandidates]:
     """The views with sorted crops, and their candidates in that order."""
     views, rows, start = [], [], 0
     for view in question.views:
@@ -173,8 +174,8 @@ def _in_order(question: Question, candidates: Candidates) -> tuple[list[View], C
 
 
 def _answer(
-    candidates: Candidates,
-    crops: Sequence[Crop],
+    candidates: MapCandidates,
+    crops: Sequence[QuestionCrop],
     posterior: Posterior | None,
     top: int,
     floors: Layout,
@@ -193,7 +194,7 @@ def _answer(
     return Answer(places, pose, posterior.confidence, hypotheses=floors.hypotheses(posterior))
 
 
-def _place_shares(candidates: Candidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
+def _place_shares(candidates: MapCandidates, posterior: Posterior) -> dict[PlaceOrdinal, float]:
     """The weight of the poses by the Place of the nearest placed candidate keyframe; at most 1,
     which a rounded sum may exceed."""
     placed = sorted(
@@ -225,8 +226,8 @@ def _either(first: PlaceOrdinal | None, second: PlaceOrdinal | None) -> PlaceOrd
 
 
 def _ranked_places(
-    candidates: Candidates,
-    crops: Sequence[Crop],
+    candidates: MapCandidates,
+    crops: Sequence[QuestionCrop],
     order: Sequence[PlaceOrdinal],
     scores: Mapping[PlaceOrdinal, float],
 ) -> tuple[RankedPlace, ...]:
@@ -250,7 +251,7 @@ def _ranked_places(
 
 
 def _evidence(
-    matches: Sequence[Sequence[Match]], crops: Sequence[Crop], place: PlaceOrdinal
+    matches: Sequence[Sequence[Match]], crops: Sequence[QuestionCrop], place: PlaceOrdinal
 ) -> tuple[Evidence, ...]:
     """The best match of each crop whose Object is located in the place, or was seen from it."""
     best = [
@@ -267,7 +268,7 @@ def _evidence(
     )
 
 
-def _rank_plain(candidates: Candidates, crops: Sequence[Crop], top: int) -> Answer:
+def _rank_plain(candidates: MapCandidates, crops: Sequence[QuestionCrop], top: int) -> Answer:
     """The plain method's answer. Its confidence is the winner's share of all similarity."""
     sums = _similarity_sums(candidates.matches)
     if not sums:
@@ -291,7 +292,7 @@ def _similarity_sums(matches: Sequence[Sequence[Match]]) -> dict[PlaceOrdinal, f
     return {place: math.fsum(values) for place, values in given.items()}
 
 
-def _spread(candidates: Candidates, place: PlaceOrdinal, x: float, y: float) -> float:
+def _spread(candidates: MapCandidates, place: PlaceOrdinal, x: float, y: float) -> float:
     """Root mean square distance from (x, y) of the poses whose matches support the place."""
     squared = [
         (m.pose[0] - x) ** 2 + (m.pose[1] - y) ** 2

@@ -13,9 +13,9 @@ in an envelope is *not* read: it is the answer that is sought.
 
 import binascii
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -27,9 +27,18 @@ from eventsrc.envelope.model import MAX_DIMENSION, Text, describe_error
 from eventsrc.envelope.readers import EnvelopeCamera
 from projections.fold.errors import QuestionError
 from projections.fold.exact import quantise, to_float32
+from projections.fold.settings import Camera
 
-from .camera import Camera
-from .question import MAX_CROPS, MAX_VIEWS, STILL, Crop, Movement, Question, Vector, View
+from .question import (
+    MAX_CROPS,
+    MAX_VIEWS,
+    STILL,
+    Movement,
+    Question,
+    QuestionCrop,
+    QuestionView,
+    Vector,
+)
 
 MAX_MARKS: Final = 20_000
 """More of ``[``, ``{`` and ``:`` than this are refused before the JSON is parsed. Empty lists and
@@ -102,11 +111,6 @@ def parse_json(payload: bytes) -> Any:
         raise QuestionError(f"the question is not JSON: {fault}") from None
 
 
-def read_crops(document: Any) -> tuple[Crop, ...]:
-    """The crops of a parsed question, of all its views in order; at least one."""
-    return read_question(document).crops
-
-
 def read_question(document: Any) -> Question:
     """A parsed question: at least one crop, and all embeddings of one space."""
     if isinstance(document, dict) and "views" in document:
@@ -120,18 +124,25 @@ def read_question(document: Any) -> Question:
         question = Question.of(_read_crops(document, "crops"))
     _check_crops(question.crops)
     if isinstance(document, dict) and document.get("camera") is not None:
-        return replace(question, camera=_camera(document["camera"]))
+        given = _checked(EnvelopeCamera, document["camera"], "camera")
+        camera = Camera.model_validate(given, from_attributes=True)
+        return replace(question, camera=camera)
     return question
 
 
-def _camera(document: Any) -> Camera:
+_M = TypeVar("_M", bound=BaseModel)
+
+
+def _checked(model: type[_M], document: Any, path: str, if_missing: str = "") -> _M:
+    """A part of a document, which is at ``path`` of it. ``if_missing`` is said of a key that is not
+    there."""
     try:
-        given = EnvelopeCamera.model_validate(document)
+        return model.model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in ("camera", *first["loc"]))
-        raise QuestionError(f"{key}: {describe_error(first).lower()}") from None
-    return Camera(given.width_px, given.height_px, given.hfov_deg, given.yaw_rad)
+        key = ".".join(str(part) for part in (path, *first["loc"]) if part)
+        missing = if_missing if first["type"] == "missing" else ""
+        raise QuestionError(f"{key}: {missing or describe_error(first).lower()}") from None
 
 
 def _read_views(items: Any, camera: Any) -> Question:
@@ -152,7 +163,7 @@ def _read_views(items: Any, camera: Any) -> Question:
                 f"{name}.camera: the views of a question have one camera; give it beside views"
             )
         moved = _movement(item, name, "view") if index else STILL
-        view = View(*moved, _read_crops(item, f"{name}.crops"))
+        view = QuestionView(*moved, _read_crops(item, f"{name}.crops"))
         crops += len(view.crops)
         if crops > MAX_CROPS:
             raise QuestionError(
@@ -176,21 +187,12 @@ def read_moved(document: Any) -> Movement:
 
 def _movement(document: dict[str, Any], name: str, since: str) -> Movement:
     """A movement; ``since`` is ``view`` or ``question``, for messages."""
-    try:
-        moved = MovementModel.model_validate(document)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in (name, *first["loc"]) if part)
-        what = (
-            f"is missing; give the metres and radians moved since the {since} before"
-            if first["type"] == "missing"
-            else describe_error(first).lower()
-        )
-        raise QuestionError(f"{key}: {what}") from None
+    missing = f"is missing; give the metres and radians moved since the {since} before"
+    moved = _checked(MovementModel, document, name, missing)
     return moved.dx, moved.dy, moved.dyaw
 
 
-def _read_crops(document: Any, name: str) -> tuple[Crop, ...]:
+def _read_crops(document: Any, name: str) -> tuple[QuestionCrop, ...]:
     """The crops that have an embedding or a class; ``name`` is their path in the document, for
     messages."""
     try:
@@ -198,15 +200,14 @@ def _read_crops(document: Any, name: str) -> tuple[Crop, ...]:
     except QuestionError as error:
         view = name.removesuffix("crops").removesuffix(".")
         raise QuestionError(f"{view}: {error}" if view else str(error)) from None
-    models = _validated(items, name)
     return tuple(
         _crop(f"{name}.{index}", model)
-        for index, model in enumerate(models)
+        for index, model in enumerate(_validated(items, name))
         if model.embedding is not None or model.class_name is not None
     )
 
 
-def _check_crops(crops: Sequence[Crop]) -> None:
+def _check_crops(crops: Sequence[QuestionCrop]) -> None:
     if not crops:
         raise QuestionError(
             "the question has no crops with an embedding or a class; send at least one"
@@ -222,10 +223,8 @@ def _check_crops(crops: Sequence[Crop]) -> None:
 
 def _crop_list(document: Any) -> list[Any]:
     if isinstance(document, dict):
-        for key in ("detections", "crops"):
-            if isinstance(document.get(key), list):
-                document = document[key]
-                break
+        lists = (document.get(key) for key in ("detections", "crops"))
+        document = next((each for each in lists if isinstance(each, list)), document)
     if not isinstance(document, list):
         raise QuestionError(
             "the question is neither an envelope, nor a list of detections, nor an object with"
@@ -246,18 +245,15 @@ def _validated(items: list[Any], name: str) -> list[CropModel]:
         # The error of an embedding as a list comes after that as a text, and has more details.
         first = next((e for e in errors if e["loc"][-1] != "str"), errors[0])
         place = ".".join(str(p) for p in first["loc"] if not str(p).startswith("list["))
-        what = (
-            "should be a JSON object"
-            if first["type"] == "model_type"
-            else describe_error(first).lower()
-        )
+        is_object = first["type"] != "model_type"
+        what = describe_error(first).lower() if is_object else "should be a JSON object"
         raise QuestionError(f"{name}.{place}: {what}") from None
 
 
-def _crop(name: str, model: CropModel) -> Crop:
+def _crop(name: str, model: CropModel) -> QuestionCrop:
     box = None if model.bbox is None else (model.bbox[0], model.bbox[1], *model.bbox[2:])
     vector = None if model.embedding is None else _unit_vector(name, model)
-    return Crop(
+    return QuestionCrop(
         vector,
         box,  # type: ignore[arg-type]  # four numbers: the model has checked it
         model.class_name,
@@ -298,3 +294,107 @@ def _floats(name: str, given: str | list[float] | None) -> Vector:
         raise QuestionError(f"{name}.embedding: is empty")
     with np.errstate(over="ignore"):  # an overflow becomes infinity and is refused as such
         return np.asarray(given, dtype=np.float64).astype(np.float32)
+
+
+_SEARCHABLE: Final = {
+    "anyOf": [
+        {"required": ["embedding"], "properties": {"embedding": {"type": ["string", "array"]}}},
+        {"required": ["class"], "properties": {"class": {"type": "string"}}},
+    ]
+}
+"""The schema of a crop with an embedding or a class."""
+_EMBEDDING_TEXT: Final = {
+    "type": "string",
+    "contentEncoding": "base64",
+    "pattern": "^(S{16})*(S{16}|S{11}=|S{6}==)$".replace("S", "[A-Za-z0-9+/]"),
+    "description": "base64 of little-endian float32",
+}
+
+
+def question_schema(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The JSON schema of questions; ``options`` are properties that the answering side reads beside
+    those of the question.
+
+    It states all checks, except those that a schema cannot express: that embeddings are of the
+    map's space and classes those of its Objects, and that `MAX_CROPS` counts the crops of all views
+    together.
+    """
+    crops = _crops_schema() | {"minItems": 1, "contains": _SEARCHABLE}
+    camera = EnvelopeCamera.model_json_schema()
+    common = {"camera": {"anyOf": [camera, {"type": "null"}]}, **(options or {})}
+    movement = MovementModel.model_json_schema()["properties"]
+    moved = {
+        key: {**value, "description": "Since the previous question; only read with a session."}
+        for key, value in movement.items()
+    }
+    together = {key: [other for other in moved if other != key] for key in moved}
+    one_picture = {"not": {"required": ["views"]}, "dependentRequired": together}
+    not_list, null = {"not": {"type": "array"}}, {"type": "null"}
+
+    def one(key: str, *rules: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "type": "object",
+            "properties": {key: crops, **moved, **common},
+            "required": [key],
+            "allOf": [one_picture, *rules],
+        }
+
+    return {
+        "title": "Question",
+        "anyOf": [
+            one("crops", {"properties": {"detections": not_list}}),
+            one("detections"),
+            {
+                "type": "object",
+                "properties": {"views": _views_schema(movement, together), **common},
+                "required": ["views"],
+                "allOf": [{"properties": {"crops": null, "detections": null}}],
+            },
+            crops,
+        ],
+    }
+
+
+def _crops_schema() -> dict[str, Any]:
+    crop = CropModel.model_json_schema(by_alias=True)
+    float32 = np.finfo(np.float32)
+    largest, least = float(float32.max), float(float32.smallest_subnormal)
+    numbers = {
+        "type": "array",
+        "items": {"type": "number", "minimum": -largest, "maximum": largest},
+        "minItems": 1,
+        "maxItems": MAX_DIMENSION,
+        "contains": {"anyOf": [{"minimum": least}, {"maximum": -least}]},  # not only zeros
+    }
+    crop["properties"]["embedding"]["anyOf"] = [_EMBEDDING_TEXT, numbers, {"type": "null"}]
+    crop |= {
+        "title": "Crop",
+        "description": "An object in a picture; it needs an embedding or a class.",
+    }
+    return {"type": "array", "items": crop, "maxItems": MAX_CROPS}
+
+
+def _views_schema(movement: dict[str, Any], together: dict[str, Any]) -> dict[str, Any]:
+    view = {
+        "title": "View",
+        "type": "object",
+        "description": "The movement since the view before, and the crops of this view.",
+        "properties": {**movement, "crops": _crops_schema()},
+        "required": ["crops", *movement],
+    }
+    first = {
+        **view,
+        "title": "First view",
+        "description": "The movement is that since the previous question, only read with a"
+        " session.",
+        "required": ["crops"],
+        "dependentRequired": together,
+    }
+    return {
+        "type": "array",
+        "prefixItems": [first],
+        "items": view,
+        "minItems": 1,
+        "maxItems": MAX_VIEWS,
+        "contains": {"required": ["crops"], "properties": {"crops": {"contains": _SEARCHABLE}}},
+    }

@@ -19,7 +19,7 @@ last question, and 1 after 3 m or most of a turn.
 
 The filter is a pure function of the session's name and its questions: no clock, and the random
 numbers follow from the name and the number of the question. Floors lie side by side, as in
-`projections.localize.relocalize.floors`.
+`projections.localize.relocalize.layout`.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Floats
-from .floors import STEP_M, Hypotheses
+from .layout import STEP_M, Hypotheses
 from .question import Movement, Question
 from .ranking import PoseHypothesis
 

@@ -24,10 +24,10 @@ from projections.fold.errors import ProjectionMismatch, ProjectionMissing, Quest
 from projections.localize.relocalize import (
     NEIGHBOURS,
     CandidatePlace,
-    Candidates,
-    Crop,
+    MapCandidates,
     Match,
     ObjectEstimate,
+    QuestionCrop,
 )
 from projections.localize.relocalize.candidates import (
     OBSERVATIONS_OF_EACH,
@@ -85,7 +85,9 @@ class CandidateSearch:
         self._vectors, self._graph = vectors, graph
         self._known: KnownConstants = memory.known
 
-    def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+    def candidates(
+        self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
+    ) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places; of a crop
         without embedding observations of its class."""
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
@@ -112,9 +114,9 @@ class CandidateSearch:
                 "SELECT embedding::real[] FROM public.detection_embeddings LIMIT 1", binary=True
             ).fetchone()
         if row is not None:
-            self.candidates([Crop(np.array(row[0], np.float32))])
+            self.candidates([QuestionCrop(np.array(row[0], np.float32))])
 
-    def _nearest(self, crops: Sequence[Crop], neighbours: int) -> "tuple[_Rows, _Linked]":
+    def _nearest(self, crops: Sequence[QuestionCrop], neighbours: int) -> "tuple[_Rows, _Linked]":
         """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
         Places."""
         one = self._vectors is self._graph
@@ -133,7 +135,9 @@ class CandidateSearch:
         of_graph = next((row[_NEAR:] for row in rows if row[_NEAR] is not None), None)
         return near, _NOTHING if of_graph is None else self._linked(of_graph, origin)
 
-    def _of_classes(self, crops: Sequence[Crop], named: Sequence[int]) -> "tuple[_Rows, _Linked]":
+    def _of_classes(
+        self, crops: Sequence[QuestionCrop], named: Sequence[int]
+    ) -> "tuple[_Rows, _Linked]":
         """As `_nearest`, for crops of which only the class is known; ``named`` are their
         indices."""
         names = sorted({crops[number].class_name or "" for number in named})
@@ -284,7 +288,7 @@ class _Linked(NamedTuple):
 _NOTHING: Final = _Linked({}, {}, {})
 
 
-def _assemble(crops: int, near: _Rows, linked: _Linked, known: KnownConstants) -> Candidates:
+def _assemble(crops: int, near: _Rows, linked: _Linked, known: KnownConstants) -> MapCandidates:
     ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
     matches: list[list[Match]] = [[] for _ in range(crops)]
     ordinals = {place: ordinal for place, (ordinal, _) in linked.places.items()}
@@ -307,7 +311,7 @@ def _assemble(crops: int, near: _Rows, linked: _Linked, known: KnownConstants) -
             )
         )
     rows = tuple(map(tuple, matches))
-    return Candidates(rows, dict(linked.places.values()), known.constants, known.walls)
+    return MapCandidates(rows, dict(linked.places.values()), known.constants, known.walls)
 
 
 def _box(array: str) -> Box:

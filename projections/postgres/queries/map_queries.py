@@ -10,7 +10,7 @@ from eventsrc.base.advised import advised
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.errors import QuestionError
 from projections.fold.place_types import type_of_name
-from projections.localize.relocalize import CandidatePlace, Candidates, Crop
+from projections.localize.relocalize import CandidatePlace, MapCandidates, QuestionCrop
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 from projections.postgres.connection import Connection
@@ -216,7 +216,7 @@ def path_between(source: MapSource, start: str, goal: str) -> list[dict[str, Any
 
 
 def similar_objects(
-    crops: Sequence[Crop], candidates: Candidates, top: int
+    crops: Sequence[QuestionCrop], candidates: MapCandidates, top: int
 ) -> list[dict[str, Any]]:
     """Objects most like any of the crops, by their most similar observation."""
     best: dict[str, dict[str, Any]] = {}

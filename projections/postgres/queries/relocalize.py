@@ -14,14 +14,14 @@ from psycopg import sql
 
 from eventsrc.base.advised import advised
 from projections.fold.errors import DatabaseError, ExtensionMissing
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
     NEIGHBOURS,
     Answer,
-    Camera,
-    Candidates,
-    Crop,
+    MapCandidates,
     Method,
     Question,
+    QuestionCrop,
     rank,
 )
 from projections.postgres.connection import (
@@ -41,7 +41,7 @@ _EF_SEARCH = max(100, NEIGHBOURS)
 
 def relocalize(
     targets: Targets,
-    question: Question | Sequence[Crop],
+    question: Question | Sequence[QuestionCrop],
     *,
     top: int = 3,
     method: Method = "joint",
@@ -113,7 +113,9 @@ class CandidateReader:
             self.close()
             raise
 
-    def candidates(self, crops: Sequence[Crop], neighbours: int = NEIGHBOURS) -> Candidates:
+    def candidates(
+        self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
+    ) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places."""
         return self._search().candidates(crops, neighbours)
 

@@ -18,7 +18,8 @@ from projections.fold.errors import QuestionError
 
 if TYPE_CHECKING:
     from eventsrc.record.transport.session import Session
-    from projections.localize.relocalize import Camera, Question
+    from projections.fold.settings import Camera
+    from projections.localize.relocalize import Question
     from projections.postgres.connection import Targets
 
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
@@ -208,19 +209,19 @@ class CameraOptions:
     def camera(self) -> "Camera | None":
         """The camera that these describe; None without either of them, and with one alone the other
         is that of mapfold's defaults. Raises QuestionError for a bad size."""
-        from projections.localize.relocalize import DEFAULT_CAMERA, Camera
+        from projections.fold.settings import Camera
 
-        hfov, image = self.hfov, self.image
-        if hfov is None and image is None:
-            return None
-        hfov = DEFAULT_CAMERA.hfov_deg if hfov is None else hfov
-        if image is None:
-            return Camera(DEFAULT_CAMERA.width_px, DEFAULT_CAMERA.height_px, hfov)
-        width, _, height = image.lower().partition("x")
+        given = {} if self.hfov is None else {"hfov_deg": self.hfov}
         try:
-            return Camera(float(width), float(height), hfov)
+            if self.image is not None:
+                width, _, height = self.image.lower().partition("x")
+                given |= {"width_px": float(width), "height_px": float(height)}
+            return Camera.model_validate(given) if given else None
         except ValueError:
-            raise QuestionError(f"--image {image}: write it as 640x400, in pixels") from None
+            raise QuestionError(
+                "no such camera: write --image as 640x400, in pixels, and --hfov as 1 to 170, in"
+                " degrees"
+            ) from None
 
 
 # Pictures

@@ -18,15 +18,15 @@ from eventsrc.base.text import counted
 from eventsrc.base.user_files import FileFault, open_file
 from eventsrc.log import LogReader
 from projections.fold.errors import QuestionError
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
     UNKNOWN_BELOW,
     Answer,
-    Camera,
-    Candidates,
-    Crop,
     ExactIndex,
+    MapCandidates,
     Method,
     Question,
+    QuestionCrop,
     RankedPlace,
     Track,
     movement_of,
@@ -213,7 +213,7 @@ def register(app: typer.Typer) -> None:
     app.command()(relocalize)
 
 
-Search = Callable[[Sequence[Crop]], Candidates]
+Search = Callable[[Sequence[QuestionCrop]], MapCandidates]
 _MAX_LINE: Final = 16 * 1024 * 1024
 
 

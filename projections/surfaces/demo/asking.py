@@ -19,7 +19,7 @@ from eventsrc.adapters.sim import SimulatedRun
 from eventsrc.base.output_files import write_files
 from eventsrc.envelope.model import RunId
 from projections.adapters.drawing import LostRobot, Spot
-from projections.localize.relocalize import Answer, rank, read_crops
+from projections.localize.relocalize import Answer, rank, read_question
 from projections.map.view import MapView
 from projections.postgres.connection import Targets
 from projections.postgres.queries.relocalize import CandidateReader
@@ -134,7 +134,7 @@ def _ask(
         asked = json.dumps(question) + "\n"
         write_files({folder.question(len(detections)): asked.encode()})
     started = time.monotonic()
-    crops = read_crops(question)
+    crops = read_question(question).crops
     answer = rank(crops, reader.candidates(crops))
     seconds = time.monotonic() - started
     true, pose = run.true_poses[index], answer.pose

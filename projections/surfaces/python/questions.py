@@ -7,9 +7,9 @@ from weakref import WeakKeyDictionary
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.user_files import FileFault, read_file
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
     Answer,
-    Camera,
     ExactIndex,
     Method,
     Question,

@@ -22,8 +22,8 @@ from projections.fold.errors import (
     ProjectionMissing,
     QuestionError,
 )
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
-    Camera,
     Method,
     Question,
     describe_value,

@@ -15,7 +15,7 @@ from psycopg_pool import ConnectionPool, PoolTimeout
 
 from eventsrc.base.advised import advised
 from projections.fold.errors import DatabaseUnavailable, ProjectionMissing
-from projections.localize.relocalize import Candidates, Crop
+from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.postgres import checkpoints
 from projections.postgres.connection import (
     Connection,
@@ -118,7 +118,7 @@ class Pools:
         _require_map("graph", self._targets.graph_url)
         _require_map("vectors", self._targets.vector_url)
 
-    def candidates(self, crops: Sequence[Crop]) -> Candidates:
+    def candidates(self, crops: Sequence[QuestionCrop]) -> MapCandidates:
         """`CandidateSearch.candidates` over pooled connections."""
         return self._ask(lambda wait_s: self._candidates(crops, wait_s))
 
@@ -131,7 +131,7 @@ class Pools:
 
         return self._ask(once)
 
-    def _candidates(self, crops: Sequence[Crop], wait_s: float) -> Candidates:
+    def _candidates(self, crops: Sequence[QuestionCrop], wait_s: float) -> MapCandidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
             if self._graph is self._vectors:
                 return self._search(vectors, vectors).candidates(crops)

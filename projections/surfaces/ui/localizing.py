@@ -24,14 +24,14 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import map_fingerprint
 from projections.fold.errors import QuestionError
 from projections.localize.relocalize import (
-    Candidates,
-    Crop,
     ExactIndex,
+    MapCandidates,
     Match,
+    QuestionCrop,
     parse_question,
     rank,
 )
-from projections.localize.relocalize.floors import Hypotheses
+from projections.localize.relocalize.layout import Hypotheses
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 
@@ -128,7 +128,9 @@ def _floors(found: Hypotheses | None) -> dict[str, Any]:
     return {"pose_floors": list(found.floors)} if found is not None and named else {}
 
 
-def _crop(crop: Crop, matches: tuple[Match, ...], candidates: Candidates) -> dict[str, Any]:
+def _crop(
+    crop: QuestionCrop, matches: tuple[Match, ...], candidates: MapCandidates
+) -> dict[str, Any]:
     return {
         "det_id": crop.det_id,
         "class_name": crop.class_name,
@@ -137,7 +139,7 @@ def _crop(crop: Crop, matches: tuple[Match, ...], candidates: Candidates) -> dic
     }
 
 
-def _match(match: Match, candidates: Candidates) -> dict[str, Any]:
+def _match(match: Match, candidates: MapCandidates) -> dict[str, Any]:
     place = match.keyframe_place if match.object_place is None else match.object_place
     return {
         "det_id": match.det_id,

@@ -28,7 +28,7 @@ import numpy as np
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from projections.fold.settings import Settings
-from projections.localize.relocalize import Crop, Question, View, rank
+from projections.localize.relocalize import Question, QuestionCrop, QuestionView, rank
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
@@ -81,9 +81,9 @@ def prepare(data: Path, observations: int) -> None:
         print(f"prepared in {time.perf_counter() - began:.0f} s", file=sys.stderr)
 
 
-def questions(data: Path) -> list[tuple[Crop, ...]]:
+def questions(data: Path) -> list[tuple[QuestionCrop, ...]]:
     """Crops of other sessions through some of the buildings."""
-    found: list[tuple[Crop, ...]] = []
+    found: list[tuple[QuestionCrop, ...]] = []
     for number in range(min(10, int((data / "ready").read_text()))):
         session = drive(building(number), f"lost-{number}", 9_000 + number, 150)
         found += [tuple(crops_of(k)[:CROPS]) for k in session if len(k.instances) >= CROPS]
@@ -97,7 +97,7 @@ def percentiles(seconds: Sequence[float]) -> str:
     return f"p50 {1000 * cuts[49]:.1f} ms, p99 {1000 * cuts[98]:.1f} ms"
 
 
-def library(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
+def library(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
     """Candidates and ranking in this process, one question after the other."""
     with CandidateReader(targets) as reader:
         for crops in asked[:20]:
@@ -113,9 +113,9 @@ def library(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
     print(f"library call, {CROPS} crops: {both}{load()}")
 
 
-def other_questions(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
+def other_questions(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
     """Questions of several views with `CROPS` crops each, and of one class or two."""
-    views = [View(0.3, 0.0, 0.5, crops) for crops in asked]
+    views = [QuestionView(0.3, 0.0, 0.5, crops) for crops in asked]
     kinds = {
         f"library call, {count} views": [
             Question((replace(views[start], dx=0.0, dyaw=0.0), *views[start + 1 : start + count]))
@@ -124,7 +124,7 @@ def other_questions(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None
         for count in (1, 2, 3)
     }
     names = sorted({crop.class_name for crops in asked for crop in crops if crop.class_name})
-    classes = [Crop(None, None, name) for name in names]
+    classes = [QuestionCrop(None, None, name) for name in names]
     for count in (1, 2):
         kinds[f"library call, classes alone, {count}"] = [
             Question.of(tuple(classes[start : start + count]))
@@ -147,7 +147,7 @@ def load() -> str:
     return f", at a load of {os.getloadavg()[0]:.1f}"
 
 
-def recall(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
+def recall(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
     """Share of the true nearest that the index finds, at ten and at all that are fetched."""
     with CandidateReader(targets) as reader:
         indexed = [reader.candidates(crops) for crops in asked[:40]]
@@ -162,7 +162,7 @@ def recall(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
         print(f"recall at {count}: {statistics.mean(shares):.4f}")
 
 
-def payload(crops: Sequence[Crop]) -> bytes:
+def payload(crops: Sequence[QuestionCrop]) -> bytes:
     """A question as a robot sends it."""
     seen: list[dict[str, Any]] = [
         {
@@ -175,7 +175,7 @@ def payload(crops: Sequence[Crop]) -> bytes:
     return json.dumps({"crops": seen}).encode()
 
 
-def over_zenoh(targets: Targets, asked: Sequence[tuple[Crop, ...]]) -> None:
+def over_zenoh(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
     """One client, then eight, against ``mapfold serve`` in a process of its own."""
     command = [sys.executable, "-m", "projections.surfaces.cli", "serve", "--listen", ENDPOINT]
     command += ["--db", targets.graph_url, "--rate", "100000"]

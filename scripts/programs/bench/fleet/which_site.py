@@ -22,7 +22,7 @@ from projections.localize.evaluate.scores import (
     expected_calibration_error,
     instances_of,
 )
-from projections.localize.relocalize import Answer, Camera, ExactIndex, rank
+from projections.localize.relocalize import Answer, ExactIndex, rank
 from scripts.programs.bench.truth.localising import later_runs, make_map
 from scripts.programs.bench.truth.worlds import Case, load_generator, make_case, pairs
 
@@ -64,7 +64,7 @@ def _ask(half: str, questions: int) -> Iterator[Asked]:
             maps[world] = ExactIndex(view)
             instances[world] = {i for _, i in instances_of(view, case.truth) if i is not None}
         for world, case in cases.items():
-            camera = Camera(case.camera.width_px, case.camera.height_px, case.camera.hfov_deg)
+            camera = case.camera
             for kind, question in _questions(case, questions):
                 found = {name: index.search(question.crops) for name, index in maps.items()}
                 yield Asked(

@@ -27,7 +27,6 @@ from projections.localize.evaluate.scores import (
     percentile,
 )
 from projections.localize.evaluate.trials import RIGHT_WITHIN_M, Trial, TrialRunner
-from projections.localize.relocalize import Camera
 from projections.map.view import MapView
 
 from .calibrating import calibrated_settings
@@ -142,7 +141,7 @@ def asked(
 
 def localise(case: Case, stranger: Case, rules: Sequence[str], every: int) -> list[LocaliseRow]:
     """Map, ask and score."""
-    camera = Camera(case.camera.width_px, case.camera.height_px, case.camera.hfov_deg)
+    camera = case.camera
     kinds = asked(case, stranger, every)
     rows = []
     for rule in rules:

@@ -15,9 +15,9 @@ import numpy as np
 from projections.fold.deltas import PlaceOrdinal
 
 from .camera import Floats
-from .candidates import CandidatePlace, Candidates, Match, ObjectEstimate
+from .candidates import CandidatePlace, MapCandidates, Match, ObjectEstimate
+from .ground import Flags, WallLookup, WallMap
 from .pose import Posterior
-from .walls import Flags, WallMap, Walls
 
 STEP_M = 1e8
 
@@ -65,7 +65,7 @@ class Layout:
     numbers: Mapping[str | None, int]
 
     @classmethod
-    def of(cls, candidates: Candidates) -> "Layout":
+    def of(cls, candidates: MapCandidates) -> "Layout":
         """The floors of these matches: named ones in the order of their names, then the unnamed
         one."""
         ordinals = {
@@ -84,7 +84,7 @@ class Layout:
         """Whether there are several floors, so that positions are moved."""
         return len(self.numbers) > 1
 
-    def laid_out(self, candidates: Candidates) -> Candidates:
+    def laid_out(self, candidates: MapCandidates) -> MapCandidates:
         """The candidates with their positions laid out."""
         if not self.has_several:
             return candidates
@@ -92,7 +92,7 @@ class Layout:
         moved = tuple(tuple(self._moved(m, candidates.places) for m in row) for row in rows)
         return replace(candidates, matches=moved)
 
-    def walls(self, walls: Mapping[str | None, WallMap]) -> Walls | None:
+    def walls(self, walls: Mapping[str | None, WallMap]) -> WallLookup | None:
         """The walls of each floor, laid out; None where there are none."""
         if not self.numbers:  # no match is in a Place, so all may be on any floor
             return next(iter(walls.values())) if len(walls) == 1 else None

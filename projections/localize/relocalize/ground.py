@@ -1,43 +1,95 @@
-"""Grids of positions, and how likely robots are there before any crop is seen."""
+"""The ground: grids of positions, how likely robots are there before a crop is seen, and walls.
+
+Walls are looked up in blocks of 8 cm or more (`projections.fold.occupancy`), at points a block
+apart along a line. Both ends are left out: poses have errors, and things stand at walls.
+"""
 
 import itertools
 import math
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.occupancy import wall_blocks
+
 from .camera import Floats
-from .landmarks import Landmarks
-from .model import Model
-from .walls import Walls
+from .constants import RankingModel
+
+_AT_POSE_M: Final = 0.3
+_AT_THING_M: Final = 0.5
+_MOST_POINTS: Final = 200
+"""The most points on a line; a longer one is checked in larger steps."""
+
+Flags = NDArray[np.bool_]
+
+
+class WallLookup(Protocol):
+    """The interface of walls: look-ups for many positions at once."""
+
+    def contains(self, xy: Floats) -> Flags:
+        """Which positions (h, 2), in metres, are inside walls."""
+
+    def hides(self, things: Floats, xy: Floats, asked: Flags) -> Flags:
+        """Whether a wall is between a thing (n, 2) and a position (h, 2): shape (n, h), false where
+        it is not ``asked``."""
+
+
+class WallMap:
+    """The walls of an occupancy map as a grid of blocks."""
+
+    def __init__(self, source: OccupancyMap) -> None:
+        cells, blocks = wall_blocks(source)
+        self._padded = np.pad(blocks, 1)  # all around is no wall
+        self._side_m = cells * source.resolution
+        self._corner = np.array(source.origin[:2])
+        cos, sin = math.cos(source.origin[2]), math.sin(source.origin[2])
+        self._turn = np.array([[cos, -sin], [sin, cos]])
+
+    def contains(self, xy: Floats) -> Flags:
+        """Which positions (h, 2), in metres, are inside walls."""
+        return self._is_wall(*self._in_blocks(xy).T)
+
+    def hides(self, things: Floats, xy: Floats, asked: Flags) -> Flags:
+        """Whether a wall is between a thing (n, 2) and a position (h, 2): shape (n, h), false where
+        it is not ``asked``."""
+        hidden = np.zeros(asked.shape, bool)
+        rows, columns = np.nonzero(asked)
+        if not len(rows):
+            return hidden
+        start = self._in_blocks(xy)[columns]
+        way = self._in_blocks(things)[rows] - start
+        length = np.sqrt((way * way).sum(axis=1))
+        first, last = _AT_POSE_M / self._side_m, length - _AT_THING_M / self._side_m
+        far = float(last.max())
+        if far <= first:
+            return hidden
+        at = np.linspace(first, far, min(math.ceil(far - first) + 1, _MOST_POINTS))
+        part = at[:, None] / np.maximum(length, 1.0)[None]
+        met = self._is_wall(start[:, 0] + part * way[:, 0], start[:, 1] + part * way[:, 1])
+        met &= at[:, None] <= last[None]
+        hidden[rows, columns] = met.any(axis=0)
+        return hidden
+
+    def _in_blocks(self, xy: Floats) -> Floats:
+        """Positions in blocks from the map's corner: columns and rows."""
+        turned: Floats = ((xy - self._corner) @ self._turn) / self._side_m
+        return turned
+
+    def _is_wall(self, column: Floats, row: Floats) -> Flags:
+        rows, columns = self._padded.shape
+        down = np.clip(row + 1.0, 0.0, rows - 1.0).astype(np.intp)  # truncated, so as floor
+        across = np.clip(column + 1.0, 0.0, columns - 1.0).astype(np.intp)
+        found: Flags = self._padded.ravel().take(down * columns + across)
+        return found
+
 
 Indices = NDArray[np.intp]
 Keys = NDArray[np.uint64]
-Flags = NDArray[np.bool_]
 
 _LEAST_PRIOR: Final = 1e-9
-_LANDMARKS, _LEAST_LANDMARKS = 48, 3
-_MOST_SPOTS: Final = 600
-
-
-def likely_spots(marks: Sequence[Landmarks], grid_m: float) -> Floats:
-    """Positions from which a landmark was seen, one for each square of a grid, at most
-    `_MOST_SPOTS`. With many crops, only the landmarks that look most like each crop are used, which
-    bounds the cost of a question with many views."""
-    most = max(_LEAST_LANDMARKS, _LANDMARKS // len(marks))
-    found = []
-    for each in marks:
-        looks = each.ratios.max(1)
-        chosen = np.argsort(-looks, kind="stable")
-        ends = np.append(each.starts[1:], len(each.seen_from))
-        for rank, landmark in enumerate(chosen.tolist()):
-            if rank < most or looks[landmark] == looks[chosen[0]]:
-                found.append(each.seen_from[each.starts[landmark] : ends[landmark]])
-    spots = distinct(np.concatenate(found), grid_m)
-    return spots[:: -(-len(spots) // _MOST_SPOTS)]
 
 
 def distinct(points: Floats, grid_m: float) -> Floats:
@@ -112,7 +164,9 @@ def square_to_nearest(xy: Floats, points: Floats) -> Floats:
     return squared
 
 
-def log_prior(xy: Floats, squared: Floats, model: Model, walls: Walls | None = None) -> Floats:
+def log_prior(
+    xy: Floats, squared: Floats, model: RankingModel, walls: WallLookup | None = None
+) -> Floats:
     """The log prior of robot positions ``xy``: by the squared distance from earlier robot
     positions, and lower inside walls."""
     squared = -0.5 * squared
