@@ -21,8 +21,8 @@ from .messages import (
     TEXT,
     BadMessage,
     Detected,
-    Embeddings,
     Lens,
+    StampedEmbeddings,
     detections_of,
     embeddings_of_floats,
     embeddings_of_text,
@@ -177,7 +177,7 @@ class _StreamState:
         self.counts = Counts()
         self.poses = PoseSource(stream, buffer, self.counts)
         self._lens: Lens | None = None
-        self._embeddings: dict[int, Embeddings] = {}
+        self._embeddings: dict[int, StampedEmbeddings] = {}
         self._next = stream.first_keyframe
 
     def handlers(self, *, with_transforms: bool) -> dict[str, _Handler]:

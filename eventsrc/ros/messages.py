@@ -73,7 +73,7 @@ class Lens(NamedTuple):
     height_px: float
 
 
-class Embeddings(NamedTuple):
+class StampedEmbeddings(NamedTuple):
     """The embeddings of one Detection2DArray: base64 of float32 by index, or by Detection2D.id."""
 
     stamp_ns: int
@@ -172,7 +172,7 @@ def detections_of(message: Any, labels: Mapping[str, str]) -> Detected:
     return Detected(stamp_of(header.stamp), frame_name(header.frame_id), made, ids, unclassified)
 
 
-def embeddings_of_text(message: Any) -> Embeddings:
+def embeddings_of_text(message: Any) -> StampedEmbeddings:
     """The embeddings of a std_msgs/String of JSON; docs/ros.md has the form."""
     document = from_json(message.data, cache_strings="keys")
     if not isinstance(document, dict) or "stamp" not in document:
@@ -182,14 +182,14 @@ def embeddings_of_text(message: Any) -> Embeddings:
     model, dim = document.get("model"), document.get("dim")
     if isinstance(given, list):
         by_index = [_base64(each) for each in given]
-        return Embeddings(stamp_ns, model, dim, by_index, None)
+        return StampedEmbeddings(stamp_ns, model, dim, by_index, None)
     if isinstance(given, dict):
         by_id = {name: _base64(each) for name, each in given.items()}
-        return Embeddings(stamp_ns, model, dim, (), by_id)
+        return StampedEmbeddings(stamp_ns, model, dim, (), by_id)
     raise BadMessage('"embeddings" is neither a list nor an object')
 
 
-def embeddings_of_floats(message: Any) -> Embeddings:
+def embeddings_of_floats(message: Any) -> StampedEmbeddings:
     """The embeddings of a std_msgs/Float32MultiArray, a row for each detection. The label of its
     first dimension is the stamp, as ``1714557600.250000000``; that of its second, the model."""
     rows, columns = message.layout.dim
@@ -207,7 +207,7 @@ def embeddings_of_floats(message: Any) -> Embeddings:
     by_index = [
         pybase64.b64encode(raw[at * size : (at + 1) * size]).decode() for at in range(count)
     ]
-    return Embeddings(
+    return StampedEmbeddings(
         int(seconds) * _NS + int(fraction), columns.label or None, dim, by_index, None
     )
 

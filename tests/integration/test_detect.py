@@ -16,7 +16,7 @@ from eventsrc.adapters.detector.keyframes import CROP_SIDE, GateLimits, Keyframe
 from eventsrc.adapters.detector.onnx_model import OnnxModel
 from eventsrc.adapters.detector.picture_sources import LivePictures
 from eventsrc.adapters.detector.poses import NoPoses
-from eventsrc.adapters.detector.service import Detection, FileOutput
+from eventsrc.adapters.detector.service import DetectionRun, FileOutput
 from eventsrc.adapters.detector.vision import decode, encode_jpeg, shrunk
 from eventsrc.adapters.detector.vision_models import (
     Encoder,
@@ -181,7 +181,7 @@ def test_a_camera_has_no_last_picture(
     encoder = Encoder(OnnxModel(stage.encoder), read_preparation(stage.encoder))
     gate = KeyframeGate(GateLimits())
     keyframes = Keyframes(finder, encoder, gate, NoPoses(), RunId("r"), note=lambda _line: None)
-    detection = Detection(keyframes, FileOutput(tmp_path / "out"), live, stop)
+    detection = DetectionRun(keyframes, FileOutput(tmp_path / "out"), live, stop)
     running = threading.Thread(target=detection.run, args=(live, lambda _report: looked.set()))
     running.start()
     message = Received("robot/image", b"no picture")

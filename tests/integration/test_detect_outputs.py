@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from eventsrc.adapters.detector.keyframes import Crop, Keyframe
+from eventsrc.adapters.detector.keyframes import CropJpeg, Keyframe
 from eventsrc.adapters.detector.service import CropSender, ZenohOutput
 from eventsrc.envelope.model import DetId
 from eventsrc.record.robot.publisher import EnvelopePublisher
@@ -67,7 +67,7 @@ def test_a_full_spool_makes_files_wait_until_they_are_stopped(tmp_path: Path) ->
 def test_crops_are_lost_or_taken(connected: Callable[[], Session]) -> None:
     said: list[str] = []
     sender = CropSender(connected(), "tb/crops", said.append)
-    crop = Crop(DetId("run/1 ?*#_kf1_d0"), b"jpeg")
+    crop = CropJpeg(DetId("run/1 ?*#_kf1_d0"), b"jpeg")
     assert not sender.send(crop)
     assert not sender.send(crop)
     assert len(said) == 1

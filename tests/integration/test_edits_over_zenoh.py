@@ -27,12 +27,12 @@ from eventsrc.record.recorder import Recorder
 from eventsrc.record.recorder.edits import (
     MAX_EDITS_WAITING,
     CommandRefused,
+    Declined,
     EditRequest,
     Edits,
     KnownCommands,
     NewerCommand,
     NoAnswer,
-    Refused,
     edit_key,
     send_command,
 )
@@ -223,7 +223,7 @@ def test_what_is_no_command_is_refused_and_the_recorder_goes_on(
     with recording(connected(), log) as log_id:
         ((good, reply),) = session.get_replies(edit_key(log_id), sent, timeout_s=DEADLINE_S)
         assert not good
-        assert says in Refused.model_validate_json(reply).error
+        assert says in Declined.model_validate_json(reply).error
         assert _send(session, log_id, _forget("after"), 0) == 0
     assert _commands(log) == [_forget("after")]
 
@@ -237,7 +237,7 @@ def test_a_command_that_is_too_large_is_not_read(connected: Sessions, tmp_path: 
         ):
             ((good, reply),) = session.get_replies(selector, b"x" * size, timeout_s=DEADLINE_S)
             assert not good
-            assert "are taken" in Refused.model_validate_json(reply).error
+            assert "are taken" in Declined.model_validate_json(reply).error
     assert _events(log) == []
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.system_events import REJECTED_KEY
 from eventsrc.log import verify_log
-from eventsrc.record.importers.run import CLOCK_SET_NS, TOGETHER_NS, LogTimes
+from eventsrc.record.importers.sources import CLOCK_SET_NS, TOGETHER_NS, LogTimes
 from eventsrc.record.log_info import log_info
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eventsrc.adapters.sim import SimulatedRun, simulate_run
 from eventsrc.adapters.sim.detector import DIM
-from eventsrc.adapters.sim.run import truth_path, write_run
+from eventsrc.adapters.sim.simulation import truth_path, write_run
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
 from tests.support.logs import simulated

@@ -74,7 +74,7 @@ _MOST_NOTES: Final = 5
 
 
 @dataclass
-class Counts:
+class PictureCounts:
     """Counts of pictures by outcome. Each is one of ``between`` (too near the last keyframe),
     ``unreadable`` or ``keyframes``."""
 
@@ -100,7 +100,7 @@ class Counts:
         return self.unreadable + self.not_encoded + self.not_finite + self.cut
 
 
-class Crop(NamedTuple):
+class CropJpeg(NamedTuple):
     """The JPEG of a detection's box."""
 
     det_id: DetId
@@ -111,7 +111,7 @@ class Keyframe(NamedTuple):
     """The JSON document of an envelope, and the crops of its detections if they are kept."""
 
     envelope: dict[str, Any]
-    crops: list[Crop]
+    crops: list[CropJpeg]
 
 
 class Keyframes:
@@ -133,7 +133,7 @@ class Keyframes:
         self._run_id, self._hfov_deg, self._keep_crops = run_id, hfov_deg, keep_crops
         self._note = note
         self._noted: dict[str, int] = {}
-        self.counts = Counts()
+        self.counts = PictureCounts()
 
     def process(self, picture: Picture) -> Keyframe | None:
         """The keyframe of a picture; None if it is left out. Raises ModelError."""
@@ -211,7 +211,7 @@ class Keyframes:
         crops = []
         if self._keep_crops:
             jpegs = [encode_jpeg(shrunk(pixels, CROP_SIDE)) for pixels in cut_out]
-            crops = [Crop(*each) for each in zip(ids, jpegs, strict=True)]
+            crops = [CropJpeg(*each) for each in zip(ids, jpegs, strict=True)]
         return Keyframe(envelope, crops)
 
     def _detection(

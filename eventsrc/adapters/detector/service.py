@@ -17,7 +17,7 @@ from eventsrc.base.text import counted
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session
 
-from .keyframes import Counts, Crop, Keyframe, Keyframes
+from .keyframes import CropJpeg, Keyframe, Keyframes, PictureCounts
 from .picture import Picture
 from .picture_sources import LivePictures
 
@@ -153,7 +153,7 @@ class CropSender:
         self._heard = session.publisher(f"{prefix}/*")
         self._noted = False
 
-    def send(self, crop: Crop) -> bool:
+    def send(self, crop: CropJpeg) -> bool:
         """Publish a crop; return False if there is no subscriber."""
         if not self._heard.has_subscriber:
             if not self._noted:
@@ -181,7 +181,7 @@ def _encode(envelope: dict[str, Any]) -> bytes:
 class Report:
     """Counts of pictures, of keyframes by delivery, and of messages received over Zenoh."""
 
-    counts: Counts
+    counts: PictureCounts
     delivered: Delivered
     dropped: int = 0
     """Pictures dropped for newer ones."""
@@ -202,7 +202,7 @@ class Report:
         return not lost and not self.stopped
 
 
-class Detection:
+class DetectionRun:
     """One run of the detector; `report` may be called from any thread."""
 
     def __init__(

@@ -6,6 +6,6 @@ millimetre, so that the same seed gives the same payloads on every machine.
 """
 
 from .house import House, build_house, occupancy_map
-from .run import DEFAULT_SEED, SimulatedRun, simulate_run
+from .simulation import DEFAULT_SEED, SimulatedRun, simulate_run
 
 __all__ = ["DEFAULT_SEED", "House", "SimulatedRun", "build_house", "occupancy_map", "simulate_run"]

@@ -172,7 +172,7 @@ CLASSES = tuple(sorted({model.class_name for model in MODELS.values()}))
 
 
 @dataclass(frozen=True, slots=True)
-class Detection:
+class SimulatedDetection:
     """The fields of a detection in the envelope, without its id, and the true instance, None for a
     phantom."""
 
@@ -182,7 +182,7 @@ class Detection:
 
 def detect(
     objects: Iterator[VisibleObject], session: str, rng: np.random.Generator
-) -> Iterator[Detection]:
+) -> Iterator[SimulatedDetection]:
     """The detections of one keyframe."""
     for visible in objects:
         if not bernoulli(rng, MISS_RATE):
@@ -191,7 +191,9 @@ def detect(
         yield _phantom(session, rng)
 
 
-def _detection(visible: VisibleObject, session: str, rng: np.random.Generator) -> Detection:
+def _detection(
+    visible: VisibleObject, session: str, rng: np.random.Generator
+) -> SimulatedDetection:
     model, instance = visible.thing.model, visible.thing.instance
     vector = embed(model.class_name, model.name, instance, visible.side_rad, session, rng)
     label = (
@@ -202,16 +204,18 @@ def _detection(visible: VisibleObject, session: str, rng: np.random.Generator) -
     confidence = 0.93 - 0.22 * visible.distance_m / RANGE_M[1] + 0.06 * normal(rng)
     if label != model.class_name:
         confidence -= 0.25
-    return Detection(_fields(label, confidence, _noisy_box(visible.box, rng), vector), instance)
+    return SimulatedDetection(
+        _fields(label, confidence, _noisy_box(visible.box, rng), vector), instance
+    )
 
 
-def _phantom(session: str, rng: np.random.Generator) -> Detection:
+def _phantom(session: str, rng: np.random.Generator) -> SimulatedDetection:
     label = CLASSES[int(rng.integers(0, len(CLASSES)))]
     phantom = f"phantom-{int(rng.integers(0, 2**62))}"
     x, y = uniform(rng, 0, WIDTH_PX - 120), uniform(rng, 0, HEIGHT_PX - 120)
     box = (x, y, x + uniform(rng, 30, 120), y + uniform(rng, 30, 120))
     vector = embed(label, phantom, phantom, 0.0, session, rng)
-    return Detection(_fields(label, uniform(rng, 0.3, 0.55), box, vector), None)
+    return SimulatedDetection(_fields(label, uniform(rng, 0.3, 0.55), box, vector), None)
 
 
 def _wrong_class(class_name: str, rng: np.random.Generator) -> str:

@@ -38,7 +38,7 @@ from .detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, Box
 from .floorplan import Rect
 from .house import House, build_house
 from .random_streams import stream
-from .run import DEFAULT_SEED, encode, noisy_pose, start_of
+from .simulation import DEFAULT_SEED, encode, noisy_pose, start_of
 from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
 
 Colour = tuple[int, int, int]

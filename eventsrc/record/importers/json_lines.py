@@ -29,7 +29,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.envelope.ingest import check_cost
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 
-from .sources import ImportedMessage
+from .sources import ImportedMessage, Source
 
 _DECODER = json.JSONDecoder()
 _SPACE = " \t\r\n"
@@ -151,19 +151,16 @@ _PIECE_BYTES = 1024 * 1024
 GZIP_MAGIC = b"\x1f\x8b"
 
 
-class JsonLines:
+class JsonLines(Source):
     """One message a line; blank lines are skipped, and so is a byte order mark at the start.
     Gzip is recognised by its first bytes."""
 
+    unit = "line"
+
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None, start: bytes) -> None:
-        self.name = name
-        self.unit = "line"
-        self.at: int | None = None
-        self.size_bytes = size_bytes
-        self.skipped = 0
+        super().__init__(name, size_bytes)
         self._file = file
         self._compressed = start.startswith(GZIP_MAGIC)
-        self._read = 0
 
     def bytes_read(self) -> int:
         """Bytes of the file read."""

@@ -17,7 +17,7 @@ from eventsrc.ros.stream import Counts
 
 from .bag_files import Bag, BagContents, bag_name
 from .bag_streams import BagOptions, Choice, choose, sampled
-from .sources import ImportedMessage
+from .sources import ImportedMessage, Source
 
 
 @dataclass(frozen=True)
@@ -50,19 +50,15 @@ class BagReport:
     """Whether nothing of the bag can be imported: no detections, no occupancy grid."""
 
 
-class RosBag:
-    """A bag of ROS 2 as a `Source`. Messages are read when `messages` is called."""
+class RosBag(Source):
+    """A bag of ROS 2 as a source. Messages are read when `messages` is called."""
 
     def __init__(self, path: Path, files: ExitStack, options: BagOptions) -> None:
-        self.name = str(path)
-        self.unit = "message"
-        self.at: int | None = None
-        self.skipped = 0
+        self._bag = Bag(path, files)
+        super().__init__(str(path), self._bag.size_bytes)
         self.report: BagReport | None = None
         self._path = path
         self._options = options
-        self._bag = Bag(path, files)
-        self.size_bytes: int | None = self._bag.size_bytes
         self._types = MessageTypes()
         self._known: dict[str, bytes] = {}
         self._numbers: deque[int] = deque()

@@ -5,13 +5,12 @@ duplicate keyframes, so the map is the same.
 """
 
 import sys
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple
+from typing import BinaryIO
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.forms import BARE_LIST_VERSION
@@ -22,17 +21,17 @@ from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.envelope.system_events import EMBEDDINGS_KEY, LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
 from eventsrc.log.format import list_segments
-from eventsrc.record.append import Checked, NewMap, check_payloads, checked_event, rejected_event
+from eventsrc.record.append import NewMap, check_payloads, checked_event, rejected_event
 
-from .bag_files import METADATA, START_BYTES, is_bag, is_file_of_a_bag
+from .bag_files import MCAP_MAGIC, METADATA, START_BYTES, is_bag, is_file_of_a_bag
 from .bag_streams import BagOptions
 from .json_lines import JsonLines
 from .ros_bags import BagReport, RosBag
 from .sources import (
-    MCAP_MAGIC,
     NO_ENVELOPES,
     NOT_CHOSEN,
     ImportedMessage,
+    LogTimes,
     McapFile,
     OtherLog,
     PassedOver,
@@ -123,7 +122,7 @@ def import_files(
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
     refused = on_reject or (lambda _place, _reason: None)
-    run = _Import(writer, key, refused, given_map, topics, ledger)
+    run = _Import(writer, key, refused, topics, ledger, given_map)
     try:
         with ExitStack() as files:
             for name in names:
@@ -148,61 +147,48 @@ def import_files(
     return run.report()
 
 
-class _Keyframe(NamedTuple):
-    run_id: RunId
-    stamp_ns: int
-
-
-def _keyframe(checked: Checked) -> _Keyframe | None:
-    """Run and stamp of a payload; None if it is no envelope, or of a version without them."""
-    stamp_ns, envelope = checked.stamp_ns, checked.result
-    if stamp_ns is None or not isinstance(envelope, CheckedEnvelope):
-        return None
-    return _Keyframe(envelope.run_id, stamp_ns)
-
-
+@dataclass(slots=True)
 class _Import:
-    """Counts of what has been appended, and the place of the last message."""
+    """What has been appended, and the place of the last message."""
 
-    def __init__(
-        self,
-        writer: LogWriter,
-        key: str,
-        on_reject: OnReject,
-        given_map: OccupancyMap | None,
-        topics: TopicChoice,
-        ledger: GapLedger[RunId] | None,
-    ) -> None:
-        self._ledger = ledger
-        self._repeated_before = 0 if ledger is None else ledger.duplicates
-        self._writer = writer
-        self._key = key
-        self._on_reject = on_reject
-        self._given_map = given_map
-        self._topics = topics
-        self._passed_over: Counter[tuple[str, str]] = Counter()
-        self._times = LogTimes()
-        self.begins = False
-        """Whether no message of the source had a time yet. If log times go back there, a new
-        segment is begun."""
-        self._logged_ns: int | None = None
-        self._first = writer.next_offset
-        self._last: tuple[Source, int | None] | None = None
-        self.accepted = self.rejected = self.system = self.skipped = self.maps = 0
-        self.verbatim = 0
-        self.bags: list[BagReport] = []
+    writer: LogWriter
+    key: str
+    on_reject: OnReject
+    topics: TopicChoice
+    ledger: GapLedger[RunId] | None
+    given_map: OccupancyMap | None
+    begins: bool = False
+    """Whether no message of the source had a time yet. If log times go back there, a new segment
+    is begun."""
+    accepted: int = 0
+    rejected: int = 0
+    system: int = 0
+    skipped: int = 0
+    maps: int = 0
+    verbatim: int = 0
+    bags: list[BagReport] = field(default_factory=list)
+    passed_over: Counter[tuple[str, str]] = field(default_factory=Counter)
+    times: LogTimes = field(default_factory=LogTimes)
+    logged_ns: int | None = None
+    last: tuple[Source, int | None] | None = None
+    first_offset: Offset = field(init=False)
+    repeated_before: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.first_offset = self.writer.next_offset
+        self.repeated_before = 0 if self.ledger is None else self.ledger.duplicates
 
     def append(self, source: Source, message: ImportedMessage) -> None:
         """Append one message: a system event or a verbatim message unchanged, anything else after
         validation."""
-        topic = message.key or self._key
+        topic = message.key or self.key
         self.begins |= message.begins
-        if not self._topics.takes(topic):
-            self._passed_over[topic, NOT_CHOSEN] += 1
+        if not self.topics.takes(topic):
+            self.passed_over[topic, NOT_CHOSEN] += 1
         elif message.refused is not None:
             self._append_refused(source, message, message.refused)
         elif message.unread is not None:
-            self._passed_over[topic, message.unread] += 1
+            self.passed_over[topic, message.unread] += 1
         elif message.form is not None:
             self._append_verbatim(message, message.form)
         elif message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY, EMBEDDINGS_KEY):
@@ -211,34 +197,35 @@ class _Import:
             self._append_map_event(source, message)
         else:
             self._append_envelope(source, message)
-        self._last = source, source.at
+        self.last = source, source.at
 
     def append_given_map(self, next_ns: int | None) -> None:
         """Append the given map, once. ``next_ns`` is the log time of the message after it, which
         the map gets too unless it is in the future, so that log times do not go back."""
-        if self._given_map is None:
+        if self.given_map is None:
             return
-        now_ns = self._writer.now_ns()
+        now_ns = self.writer.now_ns()
         logged_ns = now_ns if next_ns is None else min(now_ns, next_ns)
-        self._writer.append(MAP_KEY, self._given_map.encode(), logged_ns=logged_ns)
+        self.writer.append(MAP_KEY, self.given_map.encode(), logged_ns=logged_ns)
         self.maps += 1
-        self._given_map = None
+        self.given_map = None
 
-    def _time_of(self, message: ImportedMessage, keyframe: _Keyframe | None = None) -> int:
-        """The log time of the next message. Appends the given map before it."""
+    def _time_of(self, message: ImportedMessage, keyframe: tuple[RunId, int] | None = None) -> int:
+        """The log time of the next message, of which ``keyframe`` is run and stamp. Appends the
+        given map before it."""
         if message.logged_ns is not None:
-            logged_ns = self._times.add(message.logged_ns)
+            logged_ns = self.times.add(message.logged_ns)
         elif keyframe is not None:
-            logged_ns = self._times.add_stamped(*keyframe)
-        elif self._times.last_ns is not None:
-            logged_ns = self._times.last_ns
+            logged_ns = self.times.add_stamped(*keyframe)
+        elif self.times.last_ns is not None:
+            logged_ns = self.times.last_ns
         else:
-            logged_ns = self._writer.now_ns()
-        if self.begins and self._logged_ns is not None and logged_ns < self._logged_ns:
-            self._writer.begin_segment()
+            logged_ns = self.writer.now_ns()
+        if self.begins and self.logged_ns is not None and logged_ns < self.logged_ns:
+            self.writer.begin_segment()
         if message.logged_ns is not None or keyframe is not None:
             self.begins = False
-        self._logged_ns = logged_ns
+        self.logged_ns = logged_ns
         self.append_given_map(logged_ns)
         return logged_ns
 
@@ -247,35 +234,35 @@ class _Import:
         try:
             decode_map(message.payload)
         except InvalidMap as error:
-            logged_ns = self._time_of(message)
-            event = rejected_event(MAP_KEY, message.payload, str(error), logged_ns)
-            self._writer.append_all([event])
-            self._count_rejected(source, str(error))
+            self._reject(source, message, str(error))
         else:
             self._append_system_event(MAP_KEY, message)
             self.maps += 1
 
     def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
         if self._is_for_others(message):
-            self._passed_over[message.key or self._key, NO_ENVELOPES] += 1
-            return
+            self.passed_over[message.key or self.key, NO_ENVELOPES] += 1
+        else:
+            self._reject(source, message, reason)
+
+    def _reject(self, source: Source, message: ImportedMessage, reason: str) -> None:
         payload = message.payload if message.excerpt is None else message.excerpt
-        event = rejected_event(message.key or self._key, payload, reason, self._time_of(message))
-        self._writer.append_all([event])
+        key, logged_ns = message.key or self.key, self._time_of(message)
+        self.writer.append_all([rejected_event(key, payload, reason, logged_ns)])
         self._count_rejected(source, reason)
 
     def _count_rejected(self, source: Source, reason: str) -> None:
         self.rejected += 1
-        self._on_reject(f"{source.name}: {source.unit} {source.at}", reason)
+        self.on_reject(f"{source.name}: {source.unit} {source.at}", reason)
 
     def _append_system_event(self, key: str, message: ImportedMessage) -> None:
         logged_ns = self._time_of(message)
-        self._writer.append(key, message.payload, logged_ns=logged_ns, stamp_ns=message.stamp_ns)
+        self.writer.append(key, message.payload, logged_ns=logged_ns, stamp_ns=message.stamp_ns)
         self.system += 1
 
     def _append_verbatim(self, message: ImportedMessage, form: MessageFormat) -> None:
-        self._writer.append(
-            message.key or self._key,
+        self.writer.append(
+            message.key or self.key,
             message.payload,
             logged_ns=self._time_of(message),
             stamp_ns=message.stamp_ns,
@@ -284,56 +271,58 @@ class _Import:
         self.verbatim += 1
 
     def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
-        key = message.key or self._key
+        key = message.key or self.key
         (checked,) = check_payloads(
             [(key, message.payload)],
-            first=self._writer.next_offset,
-            logged_ns=self._writer.now_ns() if message.logged_ns is None else message.logged_ns,
+            first=self.writer.next_offset,
+            logged_ns=self.writer.now_ns() if message.logged_ns is None else message.logged_ns,
             max_bytes=DEFAULT_MAX_PAYLOAD_BYTES,
             version=BARE_LIST_VERSION if message.version == BARE_LIST_VERSION else None,
             are_grids=message.is_grid,
         )
-        is_rejected = isinstance(checked.result, Rejected)
-        if is_rejected and self._is_for_others(message):
-            self._passed_over[key, NO_ENVELOPES] += 1
+        result, stamp_ns = checked.result, checked.stamp_ns
+        if isinstance(result, Rejected) and self._is_for_others(message):
+            self.passed_over[key, NO_ENVELOPES] += 1
             return
-        logged_ns = self._time_of(message, _keyframe(checked))
-        self._writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
-        if isinstance(checked.result, Rejected):
-            self._count_rejected(source, checked.result.reason)
-        elif isinstance(checked.result, NewMap):
+        keyframe = None
+        if isinstance(result, CheckedEnvelope) and stamp_ns is not None:
+            keyframe = result.run_id, stamp_ns
+        logged_ns = self._time_of(message, keyframe)
+        self.writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
+        if isinstance(result, Rejected):
+            self._count_rejected(source, result.reason)
+        elif isinstance(result, NewMap):
             self.maps += 1
         else:
             self.accepted += 1
-            if self._ledger is not None and has_keyframe_id(checked.version):
-                envelope = checked.result
-                self._ledger.record(envelope.run_id, envelope.keyframe_id, 0)
+            if self.ledger is not None and has_keyframe_id(checked.version):
+                self.ledger.record(result.run_id, result.keyframe_id, 0)
 
     def _is_for_others(self, message: ImportedMessage) -> bool:
         """Whether to pass over a message that is no envelope and does not look like one."""
-        return message.is_foreign and not self._topics and not looks_like_envelope(message.payload)
+        return message.is_foreign and not self.topics and not looks_like_envelope(message.payload)
 
     @property
     def place(self) -> str | None:
         """The last message's place, such as ``line 17 of run.jsonl``."""
-        if self._last is None:
+        if self.last is None:
             return None
-        source, at = self._last
+        source, at = self.last
         return f"{source.unit} {at} of {source.name}"
 
     def report(self) -> ImportReport:
         """Sync the log and count what was appended."""
-        skipped = self.skipped + self._passed_over.total()
+        skipped = self.skipped + self.passed_over.total()
         counts = (self.accepted, self.rejected, self.system, skipped)
         return ImportReport(
             *counts,
-            self._first,
-            self._writer.sync(),
+            self.first_offset,
+            self.writer.sync(),
             self.maps,
             self.verbatim,
-            tuple(PassedOver(*what, count) for what, count in self._passed_over.items()),
+            tuple(PassedOver(*what, count) for what, count in self.passed_over.items()),
             tuple(self.bags),
-            None if self._ledger is None else self._ledger.duplicates - self._repeated_before,
+            None if self.ledger is None else self.ledger.duplicates - self.repeated_before,
         )
 
 
@@ -385,52 +374,3 @@ def _open_file(name: str, files: ExitStack) -> tuple[BinaryIO, int | None]:
 def _peek(file: BinaryIO) -> bytes:
     data: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
     return data
-
-
-TOGETHER_NS: Final = 10 * 1_000_000_000
-"""A run whose first stamp is at most this long before the last log time counts as simultaneous."""
-CLOCK_SET_NS: Final = 24 * 3600 * 1_000_000_000
-"""A keyframe stamped longer than this before its run's latest log time means that the robot's clock
-was set back."""
-
-
-class LogTimes:
-    """The log times of messages, in the order in which they are appended; int nanoseconds.
-
-    Each takes logarithmic time, whatever the number of runs.
-    """
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._starts: dict[RunId, int] = {}
-        """The number of the first message of each run, or of the first since its clock was set."""
-        self._numbers: list[int] = []
-        self._peaks: list[int] = []
-        """The log times that are higher than those of all later messages, so in falling order;
-        ``_numbers`` are the numbers of their messages."""
-        self.last_ns: int | None = None
-
-    def add(self, logged_ns: int) -> int:
-        """Add a message with the log time ``logged_ns``, which is returned."""
-        while self._peaks and self._peaks[-1] <= logged_ns:
-            self._peaks.pop()
-            self._numbers.pop()
-        self._peaks.append(logged_ns)
-        self._numbers.append(self._count)
-        self._count += 1
-        self.last_ns = logged_ns
-        return logged_ns
-
-    def add_stamped(self, run_id: RunId, stamp_ns: int) -> int:
-        """Add a keyframe of a run by its stamp; return its log time."""
-        start = self._starts.get(run_id)
-        if start is None:
-            together = self.last_ns is not None and 0 <= self.last_ns - stamp_ns <= TOGETHER_NS
-            latest_ns = self.last_ns if together else None
-        else:
-            latest_ns = self._peaks[bisect_left(self._numbers, start)]
-            if latest_ns - stamp_ns > CLOCK_SET_NS:
-                start = latest_ns = None
-        if start is None:
-            self._starts[run_id] = self._count
-        return self.add(stamp_ns if latest_ns is None else max(stamp_ns, latest_ns))

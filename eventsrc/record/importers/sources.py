@@ -1,19 +1,21 @@
-"""Sources of messages to import: what they give, which topics are taken; MCAP files, other logs."""
+"""Messages to import and what gives them: their topics and log times, MCAP files, other logs."""
 
 import re
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fnmatch import translate
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol
+from typing import BinaryIO, Final
 
 from pydantic_core import from_json
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.envelope.cdr_grids import GRID_SCHEMA
+from eventsrc.envelope.model import RunId
 from eventsrc.envelope.system_events import Excerpt
 from eventsrc.log import LogReader, MessageFormat, VerbatimEvent
-from eventsrc.log.foreign_mcap import ForeignDamage, foreign_messages
+from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.format import IMPORTED
 
 
@@ -49,23 +51,28 @@ class ImportedMessage:
     is_grid: bool = False
 
 
-class Source(Protocol):
-    """A file, stream or log to import from."""
+class Source:
+    """A file, stream or log to import from. An importer defines `messages`, which sets `at`."""
 
-    name: str
-    unit: str
+    unit = "message"
     """The unit that `at` counts: ``line``, ``message`` or ``offset``."""
-    at: int | None
-    """Number of the message that `messages` yielded last."""
-    size_bytes: int | None
-    skipped: int
-    """Number of messages not yielded because their format is not read."""
+
+    def __init__(self, name: str, size_bytes: int | None = None) -> None:
+        self.name = name
+        self.size_bytes = size_bytes
+        self.at: int | None = None
+        """Number of the message that `messages` yielded last."""
+        self.skipped = 0
+        """Number of messages not yielded because their format is not read."""
+        self._read = 0
 
     def messages(self) -> Iterator[ImportedMessage]:
         """The messages in order."""
+        raise NotImplementedError
 
     def bytes_read(self) -> int:
         """Bytes read so far, of ``size_bytes``."""
+        return self._read
 
 
 NOT_CHOSEN: Final = "not chosen"
@@ -122,21 +129,67 @@ def looks_like_envelope(payload: bytes) -> bool:
     return all(any(name in each for name in _CLASS_FIELDS) for each in value)
 
 
-MCAP_MAGIC = b"\x89MCAP0\r\n"
+TOGETHER_NS: Final = 10 * 1_000_000_000
+"""A run whose first stamp is at most this long before the last log time counts as simultaneous."""
+CLOCK_SET_NS: Final = 24 * 3600 * 1_000_000_000
+"""A keyframe stamped longer than this before its run's latest log time means that the robot's clock
+was set back."""
 
 
-class McapFile:
+class LogTimes:
+    """The log times of messages, in the order in which they are appended; int nanoseconds.
+
+    A viewer plays a log by its log times. So an imported envelope has its stamp as its log time,
+    and a drive of eight minutes plays eight minutes; the time of the import is in the segment's
+    metadata. Log times imitate times of receipt. They do not go back for a keyframe that was sent
+    late, or where the clocks of two robots differ a little. They go back where an older drive
+    follows, and where a robot's clock was set back. Each takes logarithmic time, whatever the
+    number of runs.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._starts: dict[RunId, int] = {}
+        """The number of the first message of each run, or of the first since its clock was set."""
+        self._numbers: list[int] = []
+        self._peaks: list[int] = []
+        """The log times that are higher than those of all later messages, so in falling order;
+        ``_numbers`` are the numbers of their messages."""
+        self.last_ns: int | None = None
+
+    def add(self, logged_ns: int) -> int:
+        """Add a message with the log time ``logged_ns``, which is returned."""
+        while self._peaks and self._peaks[-1] <= logged_ns:
+            self._peaks.pop()
+            self._numbers.pop()
+        self._peaks.append(logged_ns)
+        self._numbers.append(self._count)
+        self._count += 1
+        self.last_ns = logged_ns
+        return logged_ns
+
+    def add_stamped(self, run_id: RunId, stamp_ns: int) -> int:
+        """Add a keyframe of a run by its stamp; return its log time."""
+        start = self._starts.get(run_id)
+        if start is None:
+            together = self.last_ns is not None and 0 <= self.last_ns - stamp_ns <= TOGETHER_NS
+            latest_ns = self.last_ns if together else None
+        else:
+            latest_ns = self._peaks[bisect_left(self._numbers, start)]
+            if latest_ns - stamp_ns > CLOCK_SET_NS:
+                start = latest_ns = None
+        if start is None:
+            self._starts[run_id] = self._count
+        return self.add(stamp_ns if latest_ns is None else max(stamp_ns, latest_ns))
+
+
+class McapFile(Source):
     """An MCAP file that is no bag of ROS 2. Messages that are neither ``json`` nor occupancy grids
     in ``cdr`` (images, other messages) are passed over."""
 
     def __init__(self, name: str, file: BinaryIO, size_bytes: int | None) -> None:
-        self.name = name
-        self.unit = "message"
-        self.at: int | None = None
-        self.size_bytes = size_bytes
-        self.skipped = 0
+        super().__init__(name, size_bytes)
         self._file = file
-        self._read = 0
 
     def bytes_read(self) -> int:
         """Bytes of the file read."""
@@ -145,69 +198,47 @@ class McapFile:
     def messages(self) -> Iterator[ImportedMessage]:
         """The messages in file order."""
         try:
-            for number, message in enumerate(foreign_messages(self._file), start=1):
-                self.at = number
-                excerpt = message.payload if isinstance(message.payload, Excerpt) else None
-                payload = (
-                    message.payload if isinstance(message.payload, bytes) else message.payload.start
-                )
-                self._read += len(payload) if excerpt is None else excerpt.size
-                is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
-                is_read = is_grid or message.encoding == "json"
-                if excerpt is not None and (is_read or message.verbatim is not None):
-                    yield ImportedMessage(
-                        payload,
-                        message.key,
-                        message.logged_ns,
-                        is_foreign=message.encoding == "json" and message.version is None,
-                        refused=excerpt.reason(),
-                        excerpt=excerpt,
-                    )
-                elif message.verbatim is not None:
-                    yield ImportedMessage(
-                        payload,
-                        message.key,
-                        message.logged_ns,
-                        message.published_ns,
-                        form=message.verbatim,
-                    )
-                elif is_read:
-                    yield ImportedMessage(
-                        payload,
-                        message.key,
-                        message.logged_ns,
-                        message.published_ns,
-                        message.version,
-                        is_foreign=message.version is None,
-                        is_grid=is_grid,
-                    )
-                else:
-                    what = f"{message.encoding} {message.schema}".strip()
-                    yield ImportedMessage(b"", message.key, message.logged_ns, unread=what)
+            for self.at, message in enumerate(foreign_messages(self._file), start=1):  # noqa: B020
+                yield self._imported(message)
         except ForeignDamage as error:
             raise MapfoldError(
                 f"{self.name}: {error}; the messages before it are in the log"
             ) from None
 
+    def _imported(self, message: ForeignMessage) -> ImportedMessage:
+        excerpt = message.payload if isinstance(message.payload, Excerpt) else None
+        payload = message.payload.start if isinstance(message.payload, Excerpt) else message.payload
+        self._read += len(payload) if excerpt is None else excerpt.size
+        is_json = message.encoding == "json"
+        is_grid = message.encoding == "cdr" and message.schema == GRID_SCHEMA
+        if not (is_json or is_grid or message.verbatim is not None):
+            what = f"{message.encoding} {message.schema}".strip()
+            return ImportedMessage(b"", message.key, message.logged_ns, unread=what)
+        return ImportedMessage(
+            payload,
+            message.key,
+            message.logged_ns,
+            message.published_ns,
+            message.version,
+            message.verbatim,
+            is_foreign=message.version is None and (is_json or excerpt is None),
+            refused=None if excerpt is None else excerpt.reason(),
+            excerpt=excerpt,
+            is_grid=is_grid,
+        )
 
-class OtherLog:
-    """Another mapfold log, from its first event to its last durable one."""
+
+class OtherLog(Source):
+    """Another mapfold log, from its first event to its last durable one, system events included."""
+
+    unit = "offset"
 
     def __init__(self, path: Path) -> None:
-        self.name = str(path)
-        self.unit = "offset"
-        self.at: int | None = None
+        super().__init__(str(path))
         self._reader = LogReader(path)
-        self.size_bytes: int | None = None
-        self.skipped = 0
-        self._read = 0
-
-    def bytes_read(self) -> int:
-        """Bytes of payloads read so far."""
-        return self._read
 
     def messages(self) -> Iterator[ImportedMessage]:
-        """The log's events, system events included."""
+        """The log's events."""
         with self._reader as reader:
             begun = {
                 entry.base
@@ -218,12 +249,6 @@ class OtherLog:
                 self.at = event.offset
                 self._read += len(event.payload)
                 form = event.format if isinstance(event, VerbatimEvent) else None
-                times = event.logged_ns, event.stamp_ns
-                yield ImportedMessage(
-                    event.payload,
-                    event.key,
-                    *times,
-                    event.version,
-                    form,
-                    begins=event.offset in begun,
-                )
+                about = event.logged_ns, event.stamp_ns, event.version, form
+                begins = event.offset in begun
+                yield ImportedMessage(event.payload, event.key, *about, begins=begins)

@@ -60,7 +60,7 @@ class Recorded(_Model):
     repeated: bool = False
 
 
-class Refused(_Model):
+class Declined(_Model):
     """The command is not recorded; ``newer`` is the offset of a command that its sender did not
     know, if that is why."""
 
@@ -97,7 +97,7 @@ def send_command(
         try:
             if good:
                 return Recorded.model_validate_json(payload)
-            refused = Refused.model_validate_json(payload)
+            refused = Declined.model_validate_json(payload)
         except ValidationError:
             continue  # Zenoh's own error, such as a timeout
         if refused.newer is not None:
@@ -133,8 +133,8 @@ class EditRequest:
 
 
 def refuse_query(query: Query, error: str, newer: Offset | None = None) -> None:
-    """Reply with a `Refused`."""
-    query.reply_error(Refused(error=error, newer=newer).encode())
+    """Reply with a `Declined`."""
+    query.reply_error(Declined(error=error, newer=newer).encode())
 
 
 def fault_of(query: Query) -> str | None:

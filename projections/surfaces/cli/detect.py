@@ -23,7 +23,7 @@ from eventsrc.adapters.detector.poses import NoPoses, Poses, poses_of_file
 from eventsrc.adapters.detector.service import (
     CROPS_KEY,
     CropSender,
-    Detection,
+    DetectionRun,
     FileOutput,
     Output,
     ZenohOutput,
@@ -358,7 +358,7 @@ def detect(
             stop,
             patient=images is not None,
         )
-        detection = Detection(keyframes, output, live, stop)
+        detection = DetectionRun(keyframes, output, live, stop)
         if address is not None:
             stack.enter_context(metrics_of(address, detection))
         where = str(out) if out is not None else key

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from eventsrc.adapters.detector.picture_sources import LivePictures
 from eventsrc.adapters.detector.poses import NEAR_S
-from eventsrc.adapters.detector.service import Detection, Report
+from eventsrc.adapters.detector.service import DetectionRun, Report
 from eventsrc.base.advised import advised
 from eventsrc.base.text import counted, visible
 
@@ -41,7 +41,7 @@ Then, for a folder of pictures named by their times, with poses in a file:
 
 
 @contextlib.contextmanager
-def metrics_of(address: tuple[str, int], detection: Detection) -> Iterator[None]:
+def metrics_of(address: tuple[str, int], detection: DetectionRun) -> Iterator[None]:
     from eventsrc.record.metrics import MetricValue, serving_values  # not imported unless needed
 
     def values() -> "list[MetricValue]":
@@ -65,7 +65,7 @@ def metrics_of(address: tuple[str, int], detection: Detection) -> Iterator[None]
 
 @contextlib.contextmanager
 def show_status() -> Iterator[Callable[[Report], None]]:
-    """The ``watch`` function of `Detection.run`: on a terminal it shows a status line."""
+    """The ``watch`` function of `DetectionRun.run`: on a terminal it shows a status line."""
     if not people.is_terminal:
         yield lambda _report: None
         return

@@ -14,7 +14,7 @@ from eventsrc.adapters.sim.pictures import (
     publish_pictures,
     write_pictures,
 )
-from eventsrc.adapters.sim.run import publish_run, write_run
+from eventsrc.adapters.sim.simulation import publish_run, write_run
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
 from eventsrc.record.transport.config import check_key
