@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from eventsrc.adapters.sim.drive import DriveGrid, nearest_by_route
 from eventsrc.adapters.sim.floorplan import Point, Rect, Segment, Walls
-from eventsrc.adapters.sim.grid import DriveGrid
-from eventsrc.adapters.sim.tour import nearest_by_route
 from eventsrc.base.errors import MapfoldError
 
 OUTLINE = Rect(0.0, 0.0, 6.0, 4.0)

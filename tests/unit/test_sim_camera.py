@@ -19,6 +19,7 @@ from eventsrc.adapters.sim.detector import (
     WIDTH_PX,
     visible_objects,
 )
+from eventsrc.adapters.sim.drive import TruePose, drive
 from eventsrc.adapters.sim.house import House
 from eventsrc.adapters.sim.pictures import (
     Camera,
@@ -27,7 +28,7 @@ from eventsrc.adapters.sim.pictures import (
     thing_colours,
     write_pictures,
 )
-from eventsrc.adapters.sim.tour import TruePose, drive, plan_tour
+from eventsrc.adapters.sim.simulation import plan_tour
 from eventsrc.base.errors import MisuseError
 from tests.support.thorough import mostly_slow
 

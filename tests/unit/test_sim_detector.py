@@ -12,9 +12,9 @@ from eventsrc.adapters.sim.detector import (
     VisibleObject,
     visible_objects,
 )
+from eventsrc.adapters.sim.drive import TruePose
 from eventsrc.adapters.sim.floorplan import FloorPlan, Rect, Segment
 from eventsrc.adapters.sim.house import MODELS, House, Thing, build_house
-from eventsrc.adapters.sim.tour import TruePose
 
 FAR_WALL = Segment(-50.0, -50.0, -50.0, 50.0)
 

@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from eventsrc.adapters.sim import detector, simulate_run, tour
+from eventsrc.adapters.sim import detector, drive, simulate_run
 from tests.support.logs import simulated
 from tests.support.thorough import stride
 
@@ -39,7 +39,7 @@ def test_last_bits_of_a_sine_change_no_byte(
 ) -> None:
     here = list(simulated(seed, run).payloads)
     elsewhere = _another_library(seed)
-    modules: tuple[ModuleType, ...] = (tour, detector)
+    modules: tuple[ModuleType, ...] = (drive, detector)
     for module in modules:
         monkeypatch.setattr(module, "math", elsewhere)
     assert list(simulate_run(seed, run).payloads) == here
@@ -47,7 +47,7 @@ def test_last_bits_of_a_sine_change_no_byte(
 
 @pytest.mark.slow
 def test_without_slack_at_the_thresholds_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tour, "_SLACK", 0.0)
+    monkeypatch.setattr(drive, "_SLACK", 0.0)
     here = list(simulate_run(2, "a").payloads)
-    monkeypatch.setattr(tour, "math", _another_library(0))
+    monkeypatch.setattr(drive, "math", _another_library(0))
     assert list(simulate_run(2, "a").payloads) != here

@@ -5,16 +5,16 @@ import math
 
 import pytest
 
-from eventsrc.adapters.sim.floorplan import Segment, wrap
-from eventsrc.adapters.sim.house import House, build_house
-from eventsrc.adapters.sim.tour import (
+from eventsrc.adapters.sim.drive import (
     KEYFRAME_M,
     KEYFRAME_RAD,
     TruePose,
     drive,
     keyframes,
-    plan_tour,
 )
+from eventsrc.adapters.sim.floorplan import Segment, wrap
+from eventsrc.adapters.sim.house import House, build_house
+from eventsrc.adapters.sim.simulation import plan_tour
 from tests.support.thorough import mostly_slow
 
 pytestmark = pytest.mark.seconds

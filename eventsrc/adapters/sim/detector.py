@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .drive import TruePose
 from .floorplan import wrap
 from .house import MODELS, House, Thing
 from .random_streams import Vector, bernoulli, direction, normal, normals, stream, uniform, unit
-from .tour import TruePose
 
 WIDTH_PX, HEIGHT_PX = 640, 400
 HFOV_RAD = math.radians(69.4)

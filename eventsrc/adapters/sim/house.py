@@ -19,8 +19,8 @@ import numpy as np
 from eventsrc.base.errors import MapfoldError
 from eventsrc.envelope.occupancy_map import OCCUPIED, OccupancyMap
 
+from .drive import DriveGrid
 from .floorplan import Door, FloorPlan, Point, Rect, Room, Walls, build_floor_plan
-from .grid import DriveGrid
 from .random_streams import stream, uniform
 
 

@@ -17,7 +17,6 @@ import itertools
 import math
 import struct
 import threading
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,18 +27,27 @@ from numpy.typing import NDArray
 
 from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.base.advised import advised
-from eventsrc.base.errors import MisuseError, TransportError
+from eventsrc.base.errors import MisuseError
 from eventsrc.base.output_files import write_files, written_whole
 from eventsrc.base.progress import reported
 from eventsrc.envelope.model import RunId
 from eventsrc.record.transport.session import Session
 
 from .detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, Box
+from .drive import TruePose, drive, keyframes
 from .floorplan import Rect
 from .house import House, build_house
 from .random_streams import stream
-from .simulation import DEFAULT_SEED, encode, noisy_pose, start_of
-from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
+from .simulation import (
+    DEFAULT_SEED,
+    EXPLORER,
+    encode,
+    noisy_pose,
+    paced,
+    plan_tour,
+    start_of,
+    subscribed,
+)
 
 Colour = tuple[int, int, int]
 """Red, green and blue."""
@@ -329,18 +337,11 @@ def publish_pictures(
     """Publish pictures and poses, ``speed`` times as fast as the robot drove (0: unpaced), until
     ``stop`` is set; return the number of pictures. Raises TransportError if there is no subscriber
     within ``wait_s`` seconds."""
-    images, poses = session.publisher(image_key), session.publisher(pose_key)
-    if not images.wait_for_subscriber(wait_s):
-        raise TransportError(
-            f"no one subscribed to {image_key!r} within {wait_s:g} s; start"
-            f" `{advised('detect', '--zenoh-image', image_key)}` first or wait longer with --wait"
-        )
+    poses = session.publisher(pose_key)
+    command = advised("detect", "--zenoh-image", image_key)
+    images = subscribed(session, image_key, wait_s, command)
     sent = 0
-    started = time.monotonic()
-    for picture in pictures:
-        due = started + picture.time_s / speed if speed > 0 else started
-        if stop.wait(max(0.0, due - time.monotonic())):
-            break
+    for picture in paced(((each, each.time_s) for each in pictures), speed, stop):
         poses.put(encode({"stamp": picture.stamp_s, **picture.pose}))
         images.put(compressed_image(picture.stamp_s, picture.jpeg))
         sent += 1

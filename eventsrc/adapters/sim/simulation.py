@@ -1,5 +1,9 @@
 """Simulate a run through a house, and publish it over Zenoh or write it to a file.
 
+Run ``a`` explores; it looks around at every viewpoint of every room and of the hall, and at the end
+in the wide opening between living and dining room. Any other run looks around at its first stop,
+anywhere in the house, and visits all rooms in its own order, looking around in about half of them.
+
 The poses in the envelopes are those of a localisation, a centimetre or two off the true ones. The
 truth, the room of each keyframe and the instance of each detection, is written to a file of its
 own, never into an envelope or a log.
@@ -12,7 +16,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,20 +25,27 @@ from eventsrc.base.errors import MisuseError, TransportError
 from eventsrc.base.output_files import write_files
 from eventsrc.base.progress import reported
 from eventsrc.envelope.model import KeyframeId, RunId, default_det_id
-from eventsrc.record.transport.session import Session
+from eventsrc.record.transport.session import Publisher, Session
 
 from .detector import detect, visible_objects
-from .floorplan import wrap
+from .drive import Stop, TruePose, drive, keyframes, nearest_by_route
+from .floorplan import HALL, OPENING_M, Point, Room, wrap
 from .house import House, build_house
-from .random_streams import normal, stream
-from .tour import EXPLORER, TruePose, drive, keyframes, plan_tour
+from .random_streams import bernoulli, normal, stream, uniform
 
 DEFAULT_SEED = 7
+EXPLORER = "a"
 FIRST_START_S = 1_777_885_200.0
 """The start of run a, 2026-05-04 09:00 UTC. Each further run starts a day later."""
 _DAY_S = 86_400.0
 _POSITION_NOISE_M = 0.012
 _YAW_NOISE_RAD = 0.008
+_TWO_VIEWS_FROM_M = 5.0
+_SEARCH_M = 1.2
+_MOVE_M = 0.6
+
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +82,61 @@ def simulate_run(seed: int = DEFAULT_SEED, run: str = EXPLORER) -> SimulatedRun:
     return SimulatedRun(
         run_id, house, tuple(envelope for envelope, _ in made), tuple(t for _, t in made), poses
     )
+
+
+def plan_tour(house: House, run: str) -> tuple[Stop, ...]:
+    """The stops of ``run``; it starts at the first."""
+    return _explore(house) if run == EXPLORER else _revisit(house, run)
+
+
+def _explore(house: House) -> tuple[Stop, ...]:
+    views = [spot for room in house.plan.rooms for spot in _viewpoints(house, room)]
+    hall = _viewpoints(house, house.plan.room(HALL))
+    here = hall[0]
+    stops = [Stop(here, look_around=True)]
+    left = [view for view in views if view != here]
+    while left:  # next the nearest unseen viewpoint, by the length of the route
+        here = nearest_by_route(house.grid, here, left)
+        left.remove(here)
+        stops.append(Stop(here, look_around=True))
+    return (*stops, Stop(_opening(house), look_around=True))
+
+
+def _revisit(house: House, run: str) -> tuple[Stop, ...]:
+    rng = stream("tour", house.seed, run)
+    rooms = [house.plan.rooms[index] for index in rng.permutation(len(house.plan.rooms)).tolist()]
+    stops = [
+        Stop(_moved_spot(house, room, spot, rng), bernoulli(rng, 0.5))
+        for room in rooms
+        for spot in _viewpoints(house, room)
+    ]
+    return (Stop(stops[0].spot, look_around=True), *stops[1:])
+
+
+def _viewpoints(house: House, room: Room) -> list[Point]:
+    """One spot with clearance near the middle; two in a long room."""
+    rect = room.rect
+    x, y = rect.centre
+    wanted = [(x, y)]
+    if max(rect.width, rect.height) >= _TWO_VIEWS_FROM_M:
+        quarter = rect.width / 4
+        wanted = [(rect.x0 + quarter, y), (rect.x1 - quarter, y)]
+    return [house.grid.clearest(spot, rect, _SEARCH_M) for spot in wanted]
+
+
+def _moved_spot(house: House, room: Room, spot: Point, rng: np.random.Generator) -> Point:
+    """A random free spot up to ``_MOVE_M`` from ``spot`` in x and y; ``spot`` if none is found."""
+    for _ in range(50):
+        x = round(spot[0] + uniform(rng, -_MOVE_M, _MOVE_M), 2)
+        y = round(spot[1] + uniform(rng, -_MOVE_M, _MOVE_M), 2)
+        if room.rect.contains(x, y) and house.grid.free(x, y):
+            return x, y
+    return spot
+
+
+def _opening(house: House) -> Point:
+    door = next(door for door in house.plan.doors if door.width_m == OPENING_M)
+    return house.grid.clearest(door.centre, house.plan.outline, 0.5)
 
 
 def start_of(run: str) -> float:
@@ -132,25 +198,41 @@ def publish_run(
     Waits up to ``wait_s`` seconds for a subscriber, because messages without one are lost; raises
     TransportError if there is none. Returns the number of keyframes sent before ``stop`` was set.
     """
-    publisher = session.publisher(key)
-    if not publisher.wait_for_subscriber(wait_s):
-        raise TransportError(
-            f"no one subscribed to {key!r} within {wait_s:g} s; start `{advised('record')}` first "
-            "or wait longer with --wait"
-        )
+    publisher = subscribed(session, key, wait_s, advised("record"))
+    watched = reported(run.payloads, "publishing", len(run.envelopes), "keyframes")
+    timed = zip(watched, run.true_poses, strict=True)
     sent = 0
-    started = time.monotonic()
-    count = len(run.envelopes)
-    watched = reported(run.payloads, "publishing", count, "keyframes")
-    for payload, pose in zip(watched, run.true_poses, strict=True):
-        due = started + pose.time_s / speed if speed > 0 else started
-        if stop.wait(max(0.0, due - time.monotonic())):
-            break
+    for payload in paced(((each, pose.time_s) for each, pose in timed), speed, stop):
         publisher.put(payload)
         sent += 1
     session.confirm()
     publisher.close()
     return sent
+
+
+def subscribed(session: Session, key: str, wait_s: float, command: str) -> Publisher:
+    """A publisher under ``key`` that has a subscriber; ``command`` is advised to start one. Raises
+    TransportError if it has none within ``wait_s`` seconds."""
+    publisher = session.publisher(key)
+    if not publisher.wait_for_subscriber(wait_s):
+        raise TransportError(
+            f"no one subscribed to {key!r} within {wait_s:g} s; start `{command}` first "
+            "or wait longer with --wait"
+        )
+    return publisher
+
+
+def paced(
+    timed: Iterable[tuple[Item, float]], speed: float, stop: threading.Event
+) -> Iterator[Item]:
+    """Yield each item when its time, in seconds since the begin, has come: ``speed`` times as fast,
+    at once if that is 0; ends when ``stop`` is set."""
+    started = time.monotonic()
+    for item, time_s in timed:
+        due = started + time_s / speed if speed > 0 else started
+        if stop.wait(max(0.0, due - time.monotonic())):
+            return
+        yield item
 
 
 def write_run(run: SimulatedRun, out: Path) -> Path:

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError, TransportError
 from eventsrc.envelope.commands import (
@@ -33,6 +33,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.robot.acks import WireMessage
 from eventsrc.record.transport.session import Query, Session
 
 EDIT_PREFIX: Final = "mapfold/edit"
@@ -44,15 +45,7 @@ def edit_key(log_id: str) -> str:
     return f"{EDIT_PREFIX}/{log_id}"
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    def encode(self) -> bytes:
-        """The bytes that go over the wire."""
-        return self.model_dump_json().encode()
-
-
-class Recorded(_Model):
+class Recorded(WireMessage):
     """The command is durable at ``offset``; ``repeated`` if it was recorded before."""
 
     command_id: str
@@ -60,7 +53,7 @@ class Recorded(_Model):
     repeated: bool = False
 
 
-class Declined(_Model):
+class Declined(WireMessage):
     """The command is not recorded; ``newer`` is the offset of a command that its sender did not
     know, if that is why."""
 
@@ -96,8 +89,8 @@ def send_command(
     for good, payload in replies:
         try:
             if good:
-                return Recorded.model_validate_json(payload)
-            refused = Declined.model_validate_json(payload)
+                return Recorded.decode(payload)
+            refused = Declined.decode(payload)
         except ValidationError:
             continue  # Zenoh's own error, such as a timeout
         if refused.newer is not None:
@@ -115,12 +108,19 @@ CheckCommand = Callable[[Command], None]
 
 
 class EditRequest:
-    """A command that came over Zenoh and waits for its reply."""
+    """A command that came over Zenoh and waits for its reply. ``fault`` is why its payload is not
+    read; None if its size is allowed."""
 
     def __init__(self, query: Query) -> None:
         self._query = query
-        self.payload = query.payload
-        known_at = query.parameters.get(KNOWN_AT, "")
+        self.fault: str | None = None
+        if query.size > MAX_COMMAND_BYTES or query.selector_size > MAX_SELECTOR:
+            self.fault = (
+                f"a command of {query.size:,} bytes behind a selector of {query.selector_size:,}; "
+                f"at most {MAX_COMMAND_BYTES:,} and {MAX_SELECTOR:,} are taken"
+            )
+        self.payload = query.payload if self.fault is None else b""
+        known_at = query.parameters.get(KNOWN_AT, "") if self.fault is None else ""
         self.known_at = Offset(int(known_at)) if known_at.isdecimal() else None
 
     def reply(self, recorded: Recorded) -> None:
@@ -129,22 +129,7 @@ class EditRequest:
 
     def refuse(self, error: str, newer: Offset | None = None) -> None:
         """Reply that the command is not recorded, and why."""
-        refuse_query(self._query, error, newer)
-
-
-def refuse_query(query: Query, error: str, newer: Offset | None = None) -> None:
-    """Reply with a `Declined`."""
-    query.reply_error(Declined(error=error, newer=newer).encode())
-
-
-def fault_of(query: Query) -> str | None:
-    """Why the payload of a query is not read; None if its size is allowed."""
-    if query.size > MAX_COMMAND_BYTES or query.selector_size > MAX_SELECTOR:
-        return (
-            f"a command of {query.size:,} bytes behind a selector of {query.selector_size:,}; "
-            f"at most {MAX_COMMAND_BYTES:,} and {MAX_SELECTOR:,} are taken"
-        )
-    return None
+        self._query.reply_error(Declined(error=error, newer=newer).encode())
 
 
 class KnownCommand(NamedTuple):

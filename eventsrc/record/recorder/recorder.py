@@ -21,7 +21,7 @@ from eventsrc.record.transport.session import (
 )
 
 from .bridged import Bridge
-from .edits import EditRequest, Edits, edit_key, fault_of, refuse_query
+from .edits import EditRequest, Edits, edit_key
 from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
@@ -168,11 +168,11 @@ class Recorder:
         self._queue.put(CropMessage(message.key, message.payload, message.number))
 
     def _receive_edit(self, query: Query) -> None:
-        fault = fault_of(query)
-        if fault is not None:
-            refuse_query(query, fault)
-        elif not self._queue.put_edit(EditRequest(query)):
-            refuse_query(query, "the recorder is busy or ending; try again in a moment")
+        request = EditRequest(query)
+        if request.fault is not None:
+            request.refuse(request.fault)
+        elif not self._queue.put_edit(request):
+            request.refuse("the recorder is busy or ending; try again in a moment")
 
     def _send_reply(self, key: str, payload: bytes) -> None:
         try:

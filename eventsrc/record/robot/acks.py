@@ -17,7 +17,7 @@
 """
 
 import hashlib
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 from urllib.parse import quote
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field
@@ -44,24 +44,28 @@ def ack_key(run_id: RunId) -> str:
     return ACK_PREFIX + quote(run_id, safe="")
 
 
-class Ack(BaseModel):
-    """Every payload of ``sha256`` came under ``key`` and is synced in ``log_id``."""
+class WireMessage(BaseModel):
+    """A message that goes over the wire as JSON."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
-
-    run_id: RunId
-    key: str
-    log_id: str
-    sha256: Annotated[tuple[str, ...], Field(min_length=1), FailFast()]
 
     def encode(self) -> bytes:
         """The bytes that go over the wire."""
         return self.model_dump_json().encode()
 
     @classmethod
-    def decode(cls, payload: bytes) -> "Ack":
+    def decode(cls, payload: bytes) -> Self:
         """From bytes; raises ValidationError for anything else."""
         return cls.model_validate_json(payload)
+
+
+class Ack(WireMessage):
+    """Every payload of ``sha256`` came under ``key`` and is synced in ``log_id``."""
+
+    run_id: RunId
+    key: str
+    log_id: str
+    sha256: Annotated[tuple[str, ...], Field(min_length=1), FailFast()]
 
 
 def refusal_key(key: str) -> str:
@@ -76,10 +80,8 @@ def refusal_key(key: str) -> str:
     return _REFUSAL_PREFIX + quote(key, safe="")
 
 
-class Refusal(BaseModel):
+class Refusal(WireMessage):
     """One payload, ``size`` bytes long, and why it was refused."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     sha256: str
     size: int
@@ -91,22 +93,11 @@ class Refusal(BaseModel):
         return cls(sha256=payload_sha256(payload), size=len(payload), reason=reason)
 
 
-class Refusals(BaseModel):
+class Refusals(WireMessage):
     """The bytes and the reason of every payload in ``refused`` are synced in ``log_id``."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
     log_id: str
     refused: Annotated[tuple[Refusal, ...], Field(min_length=1)]
-
-    def encode(self) -> bytes:
-        """The bytes that go over the wire."""
-        return self.model_dump_json().encode()
-
-    @classmethod
-    def decode(cls, payload: bytes) -> "Refusals":
-        """From bytes; raises ValidationError for anything else."""
-        return cls.model_validate_json(payload)
 
 
 def sent_key(key: str) -> str:
@@ -114,19 +105,10 @@ def sent_key(key: str) -> str:
     return key + SENT_SUFFIX
 
 
-class Sent(BaseModel):
+class Sent(WireMessage):
     """Keyframe ``last`` of ``run_id`` was sent."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
+    model_config = ConfigDict(strict=True)
 
     run_id: RunId
     last: Annotated[int, Field(ge=-(2**63), lt=2**63)]
-
-    def encode(self) -> bytes:
-        """The bytes that go over the wire."""
-        return self.model_dump_json().encode()
-
-    @classmethod
-    def decode(cls, payload: bytes) -> "Sent":
-        """From bytes; raises ValidationError for anything else."""
-        return cls.model_validate_json(payload)
