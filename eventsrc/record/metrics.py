@@ -6,13 +6,12 @@ extra work. Each connection has a thread and a file descriptor. So a silent one 
 ``SILENT_S``, and beyond ``MAX_CONNECTIONS`` the oldest is closed.
 """
 
-import contextlib
 import shutil
 import socket
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from socketserver import ThreadingMixIn
@@ -61,7 +60,7 @@ class _Server(ThreadingMixIn, WSGIServer):
             if len(self._open) > MAX_CONNECTIONS:
                 oldest = next(iter(self._open))
                 del self._open[oldest]
-                with contextlib.suppress(OSError):
+                with suppress(OSError):
                     oldest.shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
 
@@ -79,7 +78,7 @@ class _Server6(_Server):
     address_family = socket.AF_INET6
 
 
-@contextlib.contextmanager
+@contextmanager
 def _serving_wsgi(host: str, port: int, application: Callable[..., Any]) -> Iterator[int]:
     """Serve in a thread within a ``with`` block; yields the port. Raises OSError."""
     kind = _Server6 if ":" in host else _Server
@@ -127,23 +126,25 @@ _GAUGES: Final = (
 )
 
 
-class _RecorderCollector(Collector):
-    def __init__(self, report: "Callable[[], RecorderReport]", log: Path) -> None:
-        self._report = report
-        self._log = log
+class _Collector(Collector):
+    def __init__(self, collect: Callable[[], Iterator[Metric]]) -> None:
+        self._collect = collect
 
     def collect(self) -> Iterator[Metric]:
-        report = self._report()
-        for name, text in _COUNTERS:
-            yield CounterMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
-        for name, text in _GAUGES:
-            yield GaugeMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
-        if report.streams:
-            yield from _ros_metrics(report)
-        failing = report.sealing_error is not None
-        yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 if sealing fails.", failing)
-        free = shutil.disk_usage(self._log).free
-        yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Free space for the log.", free)
+        return self._collect()
+
+
+def _recorder_metrics(report: "RecorderReport", log: Path) -> Iterator[Metric]:
+    for name, text in _COUNTERS:
+        yield CounterMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
+    for name, text in _GAUGES:
+        yield GaugeMetricFamily(f"mapfold_recorder_{name}", text, getattr(report, name))
+    if report.streams:
+        yield from _ros_metrics(report)
+    failing = report.sealing_error is not None
+    yield GaugeMetricFamily("mapfold_recorder_sealing_failing", "1 if sealing fails.", failing)
+    free = shutil.disk_usage(log).free
+    yield GaugeMetricFamily("mapfold_recorder_disk_free_bytes", "Free space for the log.", free)
 
 
 def _ros_metrics(report: "RecorderReport") -> Iterator[Metric]:
@@ -162,16 +163,14 @@ def _ros_metrics(report: "RecorderReport") -> Iterator[Metric]:
         yield family
 
 
-@contextmanager
 def serving_metrics(
     address: tuple[str, int], report: "Callable[[], RecorderReport]", log: Path
-) -> Iterator[int]:
+) -> AbstractContextManager[int]:
     """Serve ``/metrics`` within a ``with`` block; yields the port, also for port 0.
 
     Raises TransportError when the address cannot be listened on.
     """
-    with _serving(address, _RecorderCollector(report, log)) as port:
-        yield port
+    return _serving(address, lambda: _recorder_metrics(report(), log))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,16 +184,12 @@ class MetricValue:
     labels: tuple[tuple[str, str], ...] = ()
 
 
-class _ValuesCollector(Collector):
-    def __init__(self, values: Callable[[], Iterable[MetricValue]]) -> None:
-        self._values = values
-
-    def collect(self) -> Iterator[Metric]:
-        for value in self._values():
-            family = CounterMetricFamily if value.counter else GaugeMetricFamily
-            metric = family(value.name, value.text, labels=[name for name, _ in value.labels])
-            metric.add_metric([text for _, text in value.labels], value.value)
-            yield metric
+def _metrics_of(values: Iterable[MetricValue]) -> Iterator[Metric]:
+    for value in values:
+        family = CounterMetricFamily if value.counter else GaugeMetricFamily
+        metric = family(value.name, value.text, labels=[name for name, _ in value.labels])
+        metric.add_metric([text for _, text in value.labels], value.value)
+        yield metric
 
 
 class Instruments:
@@ -205,7 +200,7 @@ class Instruments:
         # Without this every label has a line more, with the time when it was first used.
         disable_created_metrics()  # type: ignore[no-untyped-call]
         self._registry = CollectorRegistry()
-        self._registry.register(_ValuesCollector(values))
+        self._registry.register(_Collector(lambda: _metrics_of(values())))
 
     def counter(self, name: str, text: str, labels: Sequence[str]) -> Callable[..., None]:
         """A counter; returns the function that counts one up, called with the labels' values."""
@@ -228,22 +223,17 @@ METRICS_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 """The content type of `Instruments.text`."""
 
 
-@contextmanager
 def serving_values(
     address: tuple[str, int], values: Callable[[], Iterable[MetricValue]]
-) -> Iterator[int]:
-    """Serve ``/metrics`` with the values that ``values`` returns at each scrape; yields the port.
-
-    Raises TransportError when the address cannot be listened on.
-    """
-    with _serving(address, _ValuesCollector(values)) as port:
-        yield port
+) -> AbstractContextManager[int]:
+    """`serving_metrics` with the values that ``values`` returns at each scrape."""
+    return _serving(address, lambda: _metrics_of(values()))
 
 
 @contextmanager
-def _serving(address: tuple[str, int], collector: Collector) -> Iterator[int]:
+def _serving(address: tuple[str, int], collect: Callable[[], Iterator[Metric]]) -> Iterator[int]:
     registry = CollectorRegistry()
-    registry.register(collector)
+    registry.register(_Collector(collect))
     host, port = address
     with ExitStack() as stack:
         try:

@@ -7,8 +7,9 @@ from message definitions, so names in a bag's definitions are checked before the
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
@@ -166,16 +167,17 @@ class BadBag(ValueError):
     """A bag's database cannot be read, or not to its end; the message is the reason."""
 
 
-class BagTopic(NamedTuple):
-    """A topic of a bag, how many messages it has, and the text that defines their type: ``ros2msg``
-    or ``ros2idl``; empty if the bag has none."""
+@dataclass
+class BagTopic:
+    """A topic of a bag: the text that defines the type of its messages (``ros2msg`` or ``ros2idl``;
+    empty if the bag has none), the number of its messages, and some of the first."""
 
-    topic: str
+    name: str
     type_name: str
-    encoding: str
-    message_count: int
     definition: str
     definition_encoding: str
+    count: int = 0
+    samples: list[bytes] = field(default_factory=list)
 
 
 _MESSAGES: Final = """
@@ -229,17 +231,18 @@ class SqliteBag:
 
     def topics(self) -> list[BagTopic]:
         """The topics by name."""
-        return sorted(
+        return [
             BagTopic(
                 each.topic,
                 each.msgtype,
-                getattr(each.ext, "serialization_format", ""),
-                each.msgcount,
                 each.msgdef.data if each.msgdef.format != self._none else "",
                 "ros2idl" if each.msgdef.format == self._idl else "ros2msg",
+                each.msgcount,
             )
-            for each in self._reader.connections
-        )
+            for each in sorted(
+                self._reader.connections, key=lambda each: (each.topic, each.msgtype)
+            )
+        ]
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes | Excerpt]]:
         """Yield topic, type, time of receipt and bytes of each message, in order of receipt. Raises

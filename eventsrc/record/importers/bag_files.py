@@ -10,9 +10,9 @@ import re
 import tempfile
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, Protocol
+from typing import BinaryIO, Final, NamedTuple
 
 import zstandard
 
@@ -20,7 +20,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import visible
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
-from eventsrc.ros.library import BadBag, SqliteBag
+from eventsrc.ros.library import BadBag, BagTopic, SqliteBag
 
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 SQLITE_MAGIC: Final = b"SQLite format 3\0"
@@ -61,26 +61,6 @@ class BagMessage(NamedTuple):
         return self._replace(payload=plain)
 
 
-@dataclass
-class Topic:
-    """A topic of a bag: the number of its messages, the text that defines their type (``ros2msg``
-    or ``ros2idl``; empty if the bag has none), and some of its first messages."""
-
-    name: str
-    type_name: str
-    encoding: str
-    definition: str
-    definition_encoding: str
-    count: int = 0
-    samples: list[bytes] = field(default_factory=list)
-
-    def add_sample(self, message: BagMessage) -> None:
-        """Keep a message, unless it is too large. Raises ZstdError."""
-        plain = message.decompressed()
-        if isinstance(plain.payload, bytes) and plain.refused is None:
-            self.samples.append(plain.payload)
-
-
 Sampled = Callable[[str, int], bool]
 """Returns whether to keep a message of this type with this number on its topic as a sample."""
 
@@ -90,7 +70,7 @@ class BagContents:
     """Topics and time span of a bag. ``first_ns`` and ``last_ns`` are when its first and last
     messages were received; None without any."""
 
-    topics: dict[str, Topic] = field(default_factory=dict)
+    topics: dict[str, BagTopic] = field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int | None = None
     damage: str | None = None
@@ -100,10 +80,6 @@ class BagContents:
     def count(self) -> int:
         """Number of messages on all topics."""
         return sum(topic.count for topic in self.topics.values())
-
-    def topic(self, new: Topic) -> Topic:
-        """The topic with the name of ``new``, which is added if there is none."""
-        return self.topics.setdefault(new.name, new)
 
     def span(self, received_ns: int) -> None:
         """Extend the time span by a message's time of receipt."""
@@ -197,24 +173,11 @@ class Bag:
 _DAMAGE: Final = (BadBag, ForeignDamage, zstandard.ZstdError)
 
 
-class _Part(Protocol):
-    """One file of a bag."""
-
-    path: Path
-    advice: str
-    """The end of messages about damage: how more of the file may be saved."""
-
-    def scan(self, contents: BagContents, sampled: Sampled) -> None: ...
-
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]: ...
-
-    def share_read(self) -> float: ...
-
-
 class _McapPart:
     """An MCAP file, compressed or not, read and checked by `eventsrc.log.foreign_mcap`."""
 
     advice = ""
+    """The end of messages about damage: how more of the file may be saved."""
 
     def __init__(self, path: Path, *, compressed: bool) -> None:
         self.path = path
@@ -231,10 +194,10 @@ class _McapPart:
             if topic is None:
                 form = message.form
                 text = form.schema_text.decode(errors="replace")
-                about = message.key, form.schema, form.encoding, text, form.schema_encoding
-                topic = contents.topic(Topic(*about))
+                topic = BagTopic(message.key, form.schema, text, form.schema_encoding)
+                contents.topics[message.key] = topic
             if sampled(topic.type_name, topic.count):
-                topic.add_sample(_bag_message(message))
+                _add_sample(topic, _bag_message(message))
             topic.count += 1
             contents.span(message.logged_ns)
 
@@ -271,14 +234,13 @@ class _SqlitePart:
     def scan(self, contents: BagContents, sampled: Sampled) -> None:
         bag = self._opened()
         for each in bag.topics():
-            about = each.topic, each.type_name, each.encoding, each.definition
-            topic = contents.topic(Topic(*about, each.definition_encoding))
-            before, topic.count = topic.count, topic.count + each.message_count
+            topic = contents.topics.setdefault(each.name, replace(each, count=0))
+            before, topic.count = topic.count, topic.count + each.count
             if not sampled(topic.type_name, before):
                 continue
-            for number, message in enumerate(bag.messages([each.topic]), before):
+            for number, message in enumerate(bag.messages([each.name]), before):
                 if sampled(topic.type_name, number):
-                    topic.add_sample(BagMessage(*message))
+                    _add_sample(topic, BagMessage(*message))
                 elif not sampled(topic.type_name, 1):
                     break  # only the first is wanted
         for received_ns in bag.span():
@@ -286,9 +248,7 @@ class _SqlitePart:
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         bag = self._opened()
-        self._count = max(
-            sum(each.message_count for each in bag.topics() if each.topic in topics), 1
-        )
+        self._count = max(sum(each.count for each in bag.topics() if each.name in topics), 1)
         for self._read, message in enumerate(bag.messages(topics), 1):
             yield BagMessage(*message)
 
@@ -334,7 +294,14 @@ def _refuse_unwritten(path: Path) -> None:
             )
 
 
-def _open_part(path: Path, files: ExitStack) -> _Part:
+def _add_sample(topic: BagTopic, message: BagMessage) -> None:
+    """Keep a message, unless it is too large. Raises ZstdError."""
+    plain = message.decompressed()
+    if isinstance(plain.payload, bytes) and plain.refused is None:
+        topic.samples.append(plain.payload)
+
+
+def _open_part(path: Path, files: ExitStack) -> _McapPart | _SqlitePart:
     with path.open("rb") as file:
         start = file.read(len(SQLITE_MAGIC))
         compressed = start.startswith(ZSTD_MAGIC)

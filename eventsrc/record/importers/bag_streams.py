@@ -13,12 +13,12 @@ from typing import Any, Final, TypeVar
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.ros import messages as ros
-from eventsrc.ros.library import MessageTypes, Undecodable
+from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.transforms import TransformBuffer
 
-from .bag_files import BagContents, Topic
+from .bag_files import BagContents
 
 TF_POSE: Final = "tf"
 """The value of ``--pose`` for transforms instead of a topic of poses."""
@@ -76,7 +76,7 @@ class Choice:
 
 
 def sampled(type_name: str, number: int) -> bool:
-    """Whether `choose` needs the message of a type with this number on its topic. Of transforms it
+    """Whether `Chooser` needs the message of a type with this number on its topic. Of transforms it
     needs later ones too: a localiser publishes the map frame only once it is localised."""
     if type_name == ros.TF:
         few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
@@ -84,13 +84,9 @@ def sampled(type_name: str, number: int) -> bool:
     return number == 0 and type_name in (ros.DETECTIONS, ros.CAMERA_INFO, *_POSE_TYPES)
 
 
-def choose(name: str, contents: BagContents, types: MessageTypes, options: BagOptions) -> Choice:
-    """Choose the topics of a bag and their uses. Raises MisuseError for an option that names a
-    missing topic, or one of another type."""
-    return _Chooser(name, contents, types, options).choose()
+class Chooser:
+    """Chooses the topics of a bag and their uses."""
 
-
-class _Chooser:
     def __init__(
         self, name: str, contents: BagContents, types: MessageTypes, options: BagOptions
     ) -> None:
@@ -106,7 +102,8 @@ class _Chooser:
         }
 
     def choose(self) -> Choice:
-        """Streams, grids, uses and notes."""
+        """Streams, grids, uses and notes. Raises MisuseError for an option that names a missing
+        topic, or one of another type."""
         detections = self._detections()
         for topic in detections:
             self._add_stream(topic, several=len(detections) > 1)
@@ -120,7 +117,7 @@ class _Chooser:
         return given or self._of_type(ros.DETECTIONS)
 
     def _add_stream(self, topic: str, *, several: bool) -> None:
-        made, options, max_gap_ns = self._made, self._options, self._options.max_gap_ns
+        made, options = self._made, self._options
         run_id = options.run_id or self._run_id()
         if several:
             run_id = f"{run_id}:{topic.strip('/').removesuffix('/detections')}"
@@ -139,23 +136,16 @@ class _Chooser:
         covariance = self._covariance(topic, map_frame) if by_transforms else None
         embeddings = self._embeddings(topic)
         camera = self._camera(topic, camera_frame)
-        stream = Stream(
-            topic,
-            run_id,
-            tf,
-            tf_static,
-            None if by_transforms else pose,
-            covariance,
-            embeddings,
-            camera,
-            map_frame,
-            base_frame,
-            options.labels,
-            options.embedding_model,
-            options.heights,
-            max_gap_ns=max_gap_ns,
+        topics = tf, tf_static, None if by_transforms else pose, covariance, embeddings, camera
+        made.streams.append(
+            Stream(
+                *(topic, run_id, *topics, map_frame, base_frame),
+                labels=options.labels,
+                embedding_model=options.embedding_model,
+                heights=options.heights,
+                max_gap_ns=options.max_gap_ns,
+            )
         )
-        made.streams.append(stream)
         made.use(topic, f"keyframes of run {run_id}")
         if by_transforms:
             made.use(tf, f"poses of {base_frame} in {map_frame}")
@@ -188,12 +178,9 @@ class _Chooser:
             )
 
     def _choose_grids(self, detections: Sequence[str]) -> None:
-        given = self._options.grid
         there = self._of_type(ros.GRID)
-        if given is not None:
-            if given != NONE:
-                self._check("--grid", given, ros.GRID)
-                self._made.grids.append(given)
+        if (given := self._given("--grid", ros.GRID)) is not None:
+            self._made.grids += [given] if given != NONE else []
         else:
             maps = [topic for topic in there if _last(topic) == _MAP]
             if not maps and there:
@@ -207,12 +194,18 @@ class _Chooser:
         for topic in self._made.grids:
             self._made.use(topic, "map")
 
+    def _given(self, option: str, *type_names: str) -> str | None:
+        """The topic that an option names, `NONE` included; None if it is not given."""
+        given: str | None = getattr(self._options, option.removeprefix("--"))
+        if given not in (None, NONE):
+            self._check(option, given, *type_names)
+        return given
+
     def _pose(self, topic: str, *, has_transforms: bool) -> str | None:
-        given = self._options.pose
-        if given is not None:
-            if given not in (TF_POSE, NONE):
-                self._check("--pose", given, *_POSE_TYPES)
-            return None if given == NONE else given
+        if self._options.pose == TF_POSE:
+            return TF_POSE
+        if (given := self._given("--pose", *_POSE_TYPES)) is not None:
+            return _unless_none(given)
         if has_transforms:
             return TF_POSE
         poses = [each for each in self._of_type(ros.POSE) if _last(each) != "initialpose"]
@@ -223,11 +216,8 @@ class _Chooser:
         return TF_POSE if self._transforms(static=False) else None
 
     def _covariance(self, topic: str, map_frame: str) -> str | None:
-        given = self._options.covariance
-        if given is not None:
-            if given != NONE:
-                self._check("--covariance", given, *_POSE_TYPES)
-            return None if given == NONE else given
+        if (given := self._given("--covariance", *_POSE_TYPES)) is not None:
+            return _unless_none(given)
         for kind in _POSE_TYPES:
             there = [
                 each
@@ -240,20 +230,14 @@ class _Chooser:
         return None
 
     def _embeddings(self, topic: str) -> str | None:
-        given = self._options.embeddings
-        if given is not None:
-            if given != NONE:
-                self._check("--embeddings", given, ros.TEXT, ros.FLOATS)
-            return None if given == NONE else given
+        if (given := self._given("--embeddings", ros.TEXT, ros.FLOATS)) is not None:
+            return _unless_none(given)
         there = [each for each in self._of_type(ros.TEXT, ros.FLOATS) if "embedding" in _last(each)]
         return self._nearest(topic, there, "embeddings", "--embeddings")
 
     def _camera(self, topic: str, frame: str) -> str | None:
-        given = self._options.camera
-        if given is not None:
-            if given != NONE:
-                self._check("--camera", given, ros.CAMERA_INFO)
-            return None if given == NONE else given
+        if (given := self._given("--camera", ros.CAMERA_INFO)) is not None:
+            return _unless_none(given)
         there = self._of_type(ros.CAMERA_INFO)
         same = [each for each in there if frame and self._frames.get(each) == frame]
         return self._nearest(topic, same or there, "cameras", "--camera")
@@ -282,7 +266,7 @@ class _Chooser:
                     tree.add_static(link.parent, link.child, link.pose)
         return tree
 
-    def _frame_of(self, topic: Topic) -> str | None:
+    def _frame_of(self, topic: BagTopic) -> str | None:
         """The frame of a topic's first message."""
         frames = self._samples(topic.name, lambda message: ros.frame_name(message.header.frame_id))
         return next(iter(frames), None)
@@ -352,6 +336,10 @@ class _Chooser:
         except (OverflowError, ValueError, OSError):
             return f"{name}-{first_ns}"
         return f"{name}-{began:%Y%m%dT%H%M%S}"
+
+
+def _unless_none(given: str) -> str | None:
+    return None if given == NONE else given
 
 
 def _last(name: str) -> str:

@@ -16,7 +16,7 @@ from eventsrc.ros.messages import DETECTIONS, FLOATS, TEXT, BadMessage
 from eventsrc.ros.stream import Counts
 
 from .bag_files import Bag, BagContents, bag_name
-from .bag_streams import BagOptions, Choice, choose, sampled
+from .bag_streams import BagOptions, Choice, Chooser, sampled
 from .sources import ImportedMessage, Source
 
 
@@ -71,7 +71,8 @@ class RosBag(Source):
         """Envelopes and maps, in the order in which detections and grids were received."""
         contents = self._bag.scan(sampled)
         notes = self._define(contents)
-        choice = choose(bag_name(self._path), contents, self._types, self._options)
+        name = bag_name(self._path)
+        choice = Chooser(name, contents, self._types, self._options).choose()
         report = self.report = _report(self.name, contents, choice)
         report.notes = [*notes, *report.notes]
         assembler: Assembler[ImportedMessage] = Assembler(choice.streams)
