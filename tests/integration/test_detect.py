@@ -15,7 +15,7 @@ import pytest
 from eventsrc.adapters.detector.keyframes import CROP_SIDE, GateLimits, KeyframeGate, Keyframes
 from eventsrc.adapters.detector.onnx_model import OnnxModel
 from eventsrc.adapters.detector.picture_sources import LivePictures
-from eventsrc.adapters.detector.poses import NoPoses
+from eventsrc.adapters.detector.poses import PoseTrack
 from eventsrc.adapters.detector.service import DetectionRun, FileOutput
 from eventsrc.adapters.detector.vision import decode, encode_jpeg, shrunk
 from eventsrc.adapters.detector.vision_models import (
@@ -180,7 +180,7 @@ def test_a_camera_has_no_last_picture(
     finder = Finder(OnnxModel(stage.detector), None, FinderOptions())
     encoder = Encoder(OnnxModel(stage.encoder), read_preparation(stage.encoder))
     gate = KeyframeGate(GateLimits())
-    keyframes = Keyframes(finder, encoder, gate, NoPoses(), RunId("r"), note=lambda _line: None)
+    keyframes = Keyframes(finder, encoder, gate, PoseTrack(), RunId("r"), note=lambda _line: None)
     detection = DetectionRun(keyframes, FileOutput(tmp_path / "out"), live, stop)
     running = threading.Thread(target=detection.run, args=(live, lambda _report: looked.set()))
     running.start()

@@ -304,6 +304,7 @@ class _Query:
     def __init__(self, command: Command) -> None:
         self.key = "mapfold/edit/x"
         self.payload = encode_command(command)
+        self.size, self.selector_size = len(self.payload), len(self.key)
         self.parameters: dict[str, str] = {}
         self.replies: list[tuple[bool, dict[str, object]]] = []
 

@@ -280,7 +280,7 @@ class LivePictures:
             try:
                 yield picture_of(message.payload, name, received_s)
             except MessageError as error:
-                yield Picture(name, received_s, _Failing(str(error)))
+                yield Picture(name, received_s, _decoder(PictureError(str(error))))
         self.queue.close()
 
     def _now_s(self) -> float:
@@ -299,16 +299,6 @@ class LivePictures:
 
     def _refuse_picture(self, _key: str, _number: SequenceNumber | None) -> None:
         self.queue.too_large += 1
-
-
-class _Failing:
-    """The ``pixels`` function of a picture that cannot be read; raises PictureError."""
-
-    def __init__(self, reason: str) -> None:
-        self._reason = reason
-
-    def __call__(self) -> Pixels:
-        raise PictureError(self._reason)
 
 
 _CHANNELS: Final[Mapping[str, int]] = {"bgr8": 3, "rgb8": 3, "8UC3": 3, "mono8": 1, "8UC1": 1}

@@ -17,7 +17,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.cdr import CdrFault, CdrFields, is_cdr
@@ -46,23 +46,8 @@ class Pose(NamedTuple):
     yaw: float
 
 
-class Poses(Protocol):
-    """The robot's poses by time."""
-
-    def at(self, stamp_s: float) -> Pose | None:
-        """The pose at a stamp; None if none is known near it."""
-
-
-class NoPoses:
-    """No poses."""
-
-    def at(self, stamp_s: float) -> Pose | None:  # noqa: ARG002  as `Poses` has it
-        """None."""
-        return None
-
-
 class PoseTrack:
-    """Poses in order of their stamps."""
+    """The robot's poses in order of their stamps."""
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
@@ -196,6 +181,9 @@ class LivePoses:
         self._track.add(stamp_s, pose)
         if len(self._track) > 2 * _KEPT:
             self._track.forget_before(_KEPT)
+
+
+Poses = PoseTrack | LivePoses
 
 
 class MessageError(ValueError):

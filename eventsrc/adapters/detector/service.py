@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from urllib.parse import quote
 
 from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, TransportError
@@ -40,20 +40,6 @@ class Delivered:
     """Crops not sent because there was no subscriber."""
 
 
-class Output(Protocol):
-    """A destination of keyframes."""
-
-    @property
-    def delivered(self) -> Delivered:
-        """The counts so far."""
-
-    def send(self, keyframe: Keyframe) -> None:
-        """Write or send one keyframe."""
-
-    def close(self, wait_s: float) -> None:
-        """Close the output, after waiting at most ``wait_s`` seconds for acknowledgements."""
-
-
 class FileOutput:
     """Envelopes as JSON lines in a new file, which gets its name when it is closed, or when a write
     fails: then it has the whole lines before. Raises MisuseError if the file exists already or
@@ -79,7 +65,7 @@ class FileOutput:
             raise MapfoldError(f"{error}; {self._path} has the {count} before") from None
         self.delivered.published += 1
 
-    def close(self, wait_s: float) -> None:  # noqa: ARG002  as `Output` has it
+    def close(self, wait_s: float) -> None:  # noqa: ARG002  as `ZenohOutput` has it
         """Close the file."""
         self._stack.close()
 
@@ -143,6 +129,9 @@ class ZenohOutput:
             if self._stop.is_set() and not stopped:
                 break
         self._publisher.close()
+
+
+Output = FileOutput | ZenohOutput
 
 
 class CropSender:

@@ -78,8 +78,8 @@ def _decoder_messages() -> Iterator[list[str]]:
     stderr is a file in memory within the block; other output there is passed on afterwards.
     """
     messages: list[str] = []
-    with _stderr, _scratch() as scratch:
-        real = os.dup(2)
+    with _stderr:
+        scratch, real = _scratch(), os.dup(2)
         os.dup2(scratch, 2)
         try:
             yield messages
@@ -100,15 +100,10 @@ def _decoder_messages() -> Iterator[list[str]]:
             os.close(real)
 
 
-_scratch_file: list[int] = []
-
-
-@contextmanager
-def _scratch() -> Iterator[int]:
-    if not _scratch_file:
-        with tempfile.TemporaryFile() as file:
-            _scratch_file.append(os.dup(file.fileno()))
-    yield _scratch_file[0]
+@functools.cache
+def _scratch() -> int:
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
 
 
 def colour_order(pixels: NDArray[np.uint8], order: Literal["rgb", "mono"]) -> Pixels:

@@ -182,9 +182,9 @@ def _checked(names: object, place: str) -> tuple[str, ...]:
 
 
 BATCH: Final = 32
+"""Crops in one batch, for a model that takes any number."""
 _MAX_PIXELS: Final = 64_000_000
 """Of the crops of a batch: they take 12 bytes each."""
-"""Crops in one batch, for a model that takes any number."""
 _Side = Annotated[int, Field(ge=1, le=2048)]
 _Channel = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Spread = Annotated[float, Field(ge=1e-3, le=1000.0)]

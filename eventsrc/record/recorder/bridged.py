@@ -175,8 +175,8 @@ class Bridge:
     @property
     def unread(self) -> tuple[tuple[str, int, str], ...]:
         """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
-        counts = [*self.refused.items()]
-        return tuple((topic, count, self.reasons.get(topic, "")) for topic, count in counts)
+        reasons, counts = self.reasons, [*self.refused.items()]
+        return tuple((topic, count, reasons.get(topic, "")) for topic, count in counts)
 
     @property
     def streams(self) -> tuple[tuple[str, Counts], ...]:

@@ -14,7 +14,7 @@ The sending thread:
 * Nothing is sent while there is no subscriber; the spool grows. When a subscriber appears, sending
   starts again at the oldest envelope that is not acknowledged.
 * At most ``window`` envelopes are in transit, so that a long spool does not flood the recorder's
-  queue. An ack makes room for more.
+  queue.
 * When no ack comes for the resend time, the oldest envelope is sent again, alone, as a probe;
   unanswered probes back off exponentially. When a probe is answered and the ack does not cover the
   rest, everything from the oldest on is sent again.
@@ -22,8 +22,7 @@ The sending thread:
   younger ones are acknowledged, it was lost, and everything from it on is sent again; otherwise
   lost envelopes would fill the window for good. The same holds when the last subscriber has left
   and another has come, however soon.
-* Progress (`Sent`) is published at most twice a second and at the end, so that a recorder also
-  finds when the last keyframes of a run are missing.
+* Progress (`Sent`) is published at most twice a second and at the end.
 * Acks and refusals arrive on Zenoh's thread, which only queues them. They are applied whether or
   not there is a subscriber: a recorder sends its last acks just after it has unsubscribed.
 """
@@ -35,7 +34,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from pydantic import ValidationError
@@ -98,12 +96,9 @@ class EnvelopePublisher:
         check_key(key, "key")
         check_options(options)
         self._spool = Spool(spool, max_spool_bytes)
-        self._sender = Sender(
-            options, key, self._spool, window=window, resend_after_s=resend_after_s
-        )
-        self._thread = threading.Thread(
-            target=self._sender.run, name="envelope-sender", daemon=True
-        )
+        self._sender = Sender(options, key, self._spool, window, resend_after_s)
+        run = self._sender.run
+        self._thread = threading.Thread(target=run, name="envelope-sender", daemon=True)
         self._thread.start()
         self._waiting: int | None = None
 
@@ -171,9 +166,7 @@ class EnvelopePublisher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -192,9 +185,8 @@ class Sender:
         options: ZenohOptions,
         key: str,
         spool: Spool,
-        *,
-        window: int = WINDOW,
-        resend_after_s: float = RESEND_AFTER_S,
+        window: int,
+        resend_after_s: float,
     ) -> None:
         self._options = options
         self._key = key
@@ -255,7 +247,8 @@ class Sender:
             self._failure = failure
             self.stop()
         except (TransportError, MisuseError):  # no router, or the configuration file is gone
-            self._pause(_RECONNECT_S)
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopping, _RECONNECT_S)
 
     def _run_session(self, session: Session) -> None:
         publisher, progress = session.publisher(self._key), session.publisher(sent_key(self._key))
@@ -274,10 +267,8 @@ class Sender:
     def _send_while_subscribed(
         self, session: Session, publisher: Publisher, progress: Publisher, subscribed: set[str]
     ) -> None:
-        """Send and apply acks while there is a subscriber, until it has left.
-
-        ``subscribed`` are the runs whose acks the session has subscribed to.
-        """
+        """Send and apply acks until the subscriber has left; ``subscribed`` are the runs whose acks
+        the session has subscribed to."""
         cursor, oldest = 0, self._spool.oldest()
         departures = publisher.departures
         timer = ResendTimer(self._resend_after_s)
@@ -309,7 +300,7 @@ class Sender:
     def _subscribe_to_acks(
         self, session: Session, batch: list[Spooled], subscribed: set[str]
     ) -> None:
-        """Subscribe to the acks of every run in ``batch``; call it before ``batch`` is sent."""
+        """Subscribe to the acks of every run in ``batch``, which is not sent yet."""
         new = {spooled.run_id for spooled in batch} - subscribed
         for run_id in sorted(new):
             session.subscribe(ack_key(run_id), lambda message: self._queue(message, Ack))
@@ -350,17 +341,15 @@ class Sender:
         """Apply the queued acks and refusals to the spool; True when envelopes left it."""
         freed = 0
         while self._answers:
-            freed += self._apply(self._answers.popleft())
+            answer = self._answers.popleft()
+            if isinstance(answer, Refusals):
+                freed += self._spool.refuse(answer, up_to=self._sent)
+            elif answer.key == self._key:  # else of the same bytes of another robot
+                freed += self._spool.acknowledge(answer)
         if freed:
             with self._changed:
                 self._changed.notify_all()
         return freed > 0
-
-    def _apply(self, answer: Ack | Refusals) -> int:
-        if isinstance(answer, Ack):
-            # An ack of the same bytes under another key is for another robot's envelope.
-            return self._spool.acknowledge(answer) if answer.key == self._key else 0
-        return self._spool.refuse(answer, up_to=self._sent)
 
     def _wait(self, timeout_s: float) -> None:
         """Wait for `wake`, an answer, `stop` or the timeout."""
@@ -368,18 +357,11 @@ class Sender:
             self._changed.wait_for(lambda: self._woken or self._stopping, timeout_s)
             self._woken = False
 
-    def _pause(self, timeout_s: float) -> None:
-        """Wait for `stop` or the timeout."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._stopping, timeout_s)
-
 
 class ResendTimer:
-    """When to send again: a probe after silence, or everything once a recorder answers.
-
-    ``recorder_answers`` is True when a recorder has answered a probe, or acknowledged younger
-    envelopes than the oldest, since `restart`.
-    """
+    """When to send again: a probe after silence, or everything once a recorder answers:
+    ``recorder_answers`` is True when it has answered a probe, or acknowledged younger envelopes
+    than the oldest, since `restart`."""
 
     def __init__(self, resend_after_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._resend_after_s = resend_after_s

@@ -26,7 +26,7 @@ from .acks import Ack, Refusals, payload_sha256
 DEFAULT_SPOOL_BYTES: Final = 1024 * 1024 * 1024
 """Of payload: sixteen hours without a link, at two envelopes of 9 kB a second."""
 
-_SPOOL_SCHEMA: Final = """
+_SCHEMA: Final = """
 create table if not exists spooled (
     seq integer primary key autoincrement,
     run_id text not null,
@@ -35,8 +35,6 @@ create table if not exists spooled (
     sha256 text
 );
 create index if not exists spooled_sha256 on spooled (sha256);
-"""
-_QUARANTINE_SCHEMA: Final = """
 create table if not exists refused (
     seq integer primary key,
     run_id text not null,
@@ -69,79 +67,6 @@ class Refused(NamedTuple):
     reason: str
 
 
-class _Quarantine:
-    """The table ``refused``: ``count`` rows, ``size`` bytes of payload.
-
-    The caller holds the lock of `Spool` and opens the transactions.
-    """
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-        db.executescript(_QUARANTINE_SCHEMA)
-        row = db.execute("select count(*), coalesce(sum(length(payload)), 0) from refused")
-        self.count, self.size = map(int, row.fetchone())
-
-    def add(self, seq: int, log_id: str, reason: str, size: int) -> None:
-        """Copy the spooled envelope ``seq``, of ``size`` bytes."""
-        self._db.execute(
-            "insert into refused select seq, run_id, keyframe_id, payload, ?, ?, sha256 "
-            "from spooled where seq = ?",
-            (log_id, reason, seq),
-        )
-        self.count += 1
-        self.size += size
-
-    def rows(self, limit: int) -> list[Refused]:
-        """The oldest rows in order, at most ``limit``."""
-        rows = self._db.execute(
-            "select run_id, keyframe_id, log_id, reason from refused order by seq limit ?", (limit,)
-        )
-        return [Refused(*row) for row in rows]
-
-    def free(self, size: int) -> bool:
-        """Drop the oldest payloads until ``size`` bytes are free; False if there are too few."""
-        target = self.size - size
-        while self.size > target:
-            oldest = self._db.execute(
-                "select seq, length(payload) from refused where payload is not null "
-                "order by seq limit 1"
-            ).fetchone()
-            if oldest is None:
-                return False
-            self._db.execute("update refused set payload = null where seq = ?", (oldest[0],))
-            self.size -= int(oldest[1])
-        return True
-
-    def requeue(self) -> tuple[int, int]:
-        """Move everything that still has its bytes back to the spool; returns count and bytes."""
-        count = self._db.execute(
-            "insert into spooled (run_id, keyframe_id, payload, sha256) select run_id, "
-            "keyframe_id, payload, sha256 from refused where payload is not null order by seq"
-        ).rowcount
-        self._db.execute("delete from refused where payload is not null")
-        size, self.size = self.size, 0
-        self.count -= count
-        return count, size
-
-    def acknowledge(self, sha256: str) -> None:
-        """Delete the payload that ``sha256`` names."""
-        if self.count:
-            self._delete(
-                "delete from refused where sha256 = ? returning coalesce(length(payload), 0)",
-                (sha256,),
-            )
-
-    def clear(self) -> int:
-        """Delete everything; returns how many rows."""
-        return self._delete("delete from refused returning coalesce(length(payload), 0)", ())
-
-    def _delete(self, query: str, values: tuple[str, ...]) -> int:
-        sizes = [size for (size,) in self._db.execute(query, values)]
-        self.count -= len(sizes)
-        self.size -= sum(sizes)
-        return len(sizes)
-
-
 class Spool:
     """The envelopes in one spool file. Thread-safe; every method raises SpoolError when the file
     cannot be used."""
@@ -150,7 +75,9 @@ class Spool:
         self.path = path
         self.max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._count = self._bytes = 0
+        self._count = self._bytes = self._refused_bytes = 0
+        self.refused_count = 0
+        """How many envelopes are in quarantine."""
         with _spool_errors(self.path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(
@@ -179,10 +106,10 @@ class Spool:
         self._db.execute("pragma locking_mode = exclusive")
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = normal")
-        self._db.executescript(_SPOOL_SCHEMA)
-        self._quarantine = _Quarantine(self._db)
-        row = self._db.execute("select count(*), coalesce(sum(length(payload)), 0) from spooled")
-        self._count, self._bytes = row.fetchone()
+        self._db.executescript(_SCHEMA)
+        counted = "select count(*), coalesce(sum(length(payload)), 0) from "
+        self._count, self._bytes = self._db.execute(counted + "spooled").fetchone()
+        self.refused_count, self._refused_bytes = self._db.execute(counted + "refused").fetchone()
 
     def add(self, run_id: RunId, keyframe_id: KeyframeId, payload: bytes) -> None:
         """Keep one envelope until it is acknowledged. Raises SpoolFull if there is no room."""
@@ -204,8 +131,14 @@ class Spool:
         """Drop quarantined bytes as needed; False if ``size`` bytes do not fit even so."""
         if self._bytes + size > self.max_bytes:
             return False
-        too_much = self._bytes + self._quarantine.size + size - self.max_bytes
-        return too_much <= 0 or self._quarantine.free(too_much)
+        while self._bytes + self._refused_bytes + size > self.max_bytes:
+            oldest, freed = self._db.execute(
+                "select seq, length(payload) from refused where payload is not null "
+                "order by seq limit 1"
+            ).fetchone()
+            self._db.execute("update refused set payload = null where seq = ?", (oldest,))
+            self._refused_bytes -= int(freed)
+        return True
 
     def after(self, seq: int, limit: int) -> list[Spooled]:
         """The oldest waiting envelopes after ``seq`` in order, at most ``limit``."""
@@ -240,7 +173,8 @@ class Spool:
                 ).fetchall()
                 removed += len(rows)
                 self._bytes -= sum(size for (size,) in rows)
-                self._quarantine.acknowledge(sha256)
+                if self.refused_count:
+                    self._drop_refused("where sha256 = ?", (sha256,))
             self._count -= removed
         return removed
 
@@ -259,34 +193,50 @@ class Spool:
         return moved
 
     def _move_to_quarantine(self, seq: int, size: int, log_id: str, reason: str) -> None:
-        self._quarantine.add(seq, log_id, reason, size)
+        self._db.execute(
+            "insert into refused select seq, run_id, keyframe_id, payload, ?, ?, sha256 "
+            "from spooled where seq = ?",
+            (log_id, reason, seq),
+        )
         self._db.execute("delete from spooled where seq = ?", (seq,))
         self._count -= 1
         self._bytes -= size
-
-    @property
-    def refused_count(self) -> int:
-        """How many envelopes are in quarantine."""
-        return self._quarantine.count
+        self.refused_count += 1
+        self._refused_bytes += size
 
     def refused(self, limit: int) -> list[Refused]:
         """The oldest in quarantine, in order, at most ``limit``."""
         with _spool_errors(self.path), self._lock:
-            return self._quarantine.rows(limit)
+            rows = self._db.execute(
+                "select run_id, keyframe_id, log_id, reason from refused order by seq limit ?",
+                (limit,),
+            )
+            return [Refused(*row) for row in rows]
 
     def retry_refused(self) -> int:
         """Move everything in quarantine that still has its bytes behind the waiting envelopes;
         returns how many."""
         with _spool_errors(self.path), self._lock, self._transaction():
-            count, size = self._quarantine.requeue()
+            count = self._db.execute(
+                "insert into spooled (run_id, keyframe_id, payload, sha256) select run_id, "
+                "keyframe_id, payload, sha256 from refused where payload is not null order by seq"
+            ).rowcount
+            self._bytes += self._refused_bytes
             self._count += count
-            self._bytes += size
+            self._drop_refused("where payload is not null")
         return count
 
     def discard_refused(self) -> int:
         """Empty the quarantine; returns how many envelopes were in it."""
         with _spool_errors(self.path), self._lock:
-            return self._quarantine.clear()
+            return self._drop_refused()
+
+    def _drop_refused(self, where: str = "", values: tuple[str, ...] = ()) -> int:
+        query = f"delete from refused {where} returning coalesce(length(payload), 0)"  # noqa: S608
+        sizes = [size for (size,) in self._db.execute(query, values)]
+        self.refused_count -= len(sizes)
+        self._refused_bytes -= sum(sizes)
+        return len(sizes)
 
     def __len__(self) -> int:
         return self._count

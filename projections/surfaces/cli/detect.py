@@ -19,7 +19,7 @@ from eventsrc.adapters.detector.keyframes import (
 from eventsrc.adapters.detector.onnx_model import OnnxModel
 from eventsrc.adapters.detector.picture import Picture
 from eventsrc.adapters.detector.picture_sources import QUEUE, LivePictures, open_images
-from eventsrc.adapters.detector.poses import NoPoses, Poses, poses_of_file
+from eventsrc.adapters.detector.poses import Poses, PoseTrack, poses_of_file
 from eventsrc.adapters.detector.service import (
     CROPS_KEY,
     CropSender,
@@ -315,7 +315,7 @@ def detect(
     name = run_id_of(run_id)
     check_installed()
     wanted = device_of(device)
-    given_poses: Poses = NoPoses() if poses is None else poses_of_file(poses)
+    given_poses: Poses = PoseTrack() if poses is None else poses_of_file(poses)
     options = FinderOptions(head, confidence, overlap, max_detections, size)
     finder = Finder(
         OnnxModel(detector, wanted, threads),
