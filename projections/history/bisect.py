@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from eventsrc.envelope.model import Offset
-from projections.store.history import History
-from projections.store.history_rows import NEVER
+from projections.store.history import NEVER, History
 from projections.store.records import Cause, ObjectHistory, PlaceHistory
 
 from .condition_functions import Direction, Names, Value
@@ -120,14 +119,13 @@ class HistoryFacts:
         ordinal = self._history.object_ordinals.get(object_id)
         if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return None
-        return id_of_place(self._history, self._history.objects[ordinal].place(self.end))
+        return id_of_place(self._history, self._history.object_at(ordinal, self.end).place)
 
     def sightings(self, object_id: str) -> int:
         ordinal = self._history.object_ordinals.get(object_id)
         if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return 0
-        values = self._history.objects[ordinal].values(self.end)
-        return 0 if values is None else values.obs_count
+        return self._history.object_at(ordinal, self.end).obs_count
 
     def size(self, place_id: str) -> int:
         ordinal = self._history.place_ordinals.get(place_id)

@@ -26,7 +26,7 @@ from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
 from projections.fold.pose_corrections import PoseCorrection
 from projections.map.phrases import command_document, command_name, command_title
 from projections.store.history import History
-from projections.store.records import Cause, PlaceHistory, Refusal
+from projections.store.records import Cause, PlaceHistory, RefusedMerge
 
 from .explanation import Entry
 from .merges import refusal_reason
@@ -198,7 +198,7 @@ def same_place_commands(
     ]
 
 
-def _refusal_entry(history: History, refusal: Refusal, place: PlaceOrdinal | None) -> Entry:
+def _refusal_entry(history: History, refusal: RefusedMerge, place: PlaceOrdinal | None) -> Entry:
     if place is None:
         what = f"merge of {place_name(history, refusal.a)} and {place_name(history, refusal.b)}"
     else:

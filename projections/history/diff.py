@@ -18,7 +18,6 @@ from projections.map.phrases import command_document
 from projections.map.records import Estimate, KeyframeRecord, Relocation
 from projections.map.view import MapView
 from projections.store.records import Cause
-from projections.store.stored_view import StoredView
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,23 +277,6 @@ def difference_of(
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
         commands=tuple(commands),
-    )
-
-
-def _keyframe_changes(first: MapView, second: MapView) -> Changes[tuple[str, int], KeyframeRow]:
-    moved = first.moved_keyframes(second) if isinstance(first, StoredView) else None
-    if moved is None:
-        tables = [_by(keyframe_key, _keyframe_rows(v, v.keyframes)) for v in (first, second)]
-        return changes(*tables)
-    both = min(len(first.keyframes), len(second.keyframes))
-    before, after = (
-        _keyframe_rows(view, (view.keyframes[number] for number in moved))
-        for view in (first, second)
-    )
-    return Changes(
-        added=tuple(_keyframe_rows(second, second.keyframes[both:])),
-        removed=tuple(_keyframe_rows(first, first.keyframes[both:])),
-        changed=tuple(zip(before, after, strict=True)),
     )
 
 

@@ -1,34 +1,23 @@
-"""Explain a place or an object: its history, event by event."""
+"""Explain a place by its history, event by event; and why two keyframes are in one place.
+
+Each keyframe joined one place when it was placed; a chain of absorptions leads from there to its
+place at any later event. Two are in one place from the event after which both chains lead to the
+same place, and the merges on the two chains up to that event are the reason.
+"""
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
-from projections.fold.deltas import ObjectSeen, ObservationOrdinal, PlaceOrdinal, Pose
-from projections.fold.exact import Q40, mean_m
-from projections.map.records import ObservationRecord
-from projections.store.history import History
-from projections.store.records import (
-    Cause,
-    Merge,
-    ObjectHistory,
-    ObjectMerge,
-    PlaceHistory,
-    count_before,
-)
+from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal, Pose
+from projections.fold.exact import mean_m
+from projections.store.history import NEVER, History
+from projections.store.records import Cause, Merge, PlaceHistory, count_before
 
-from .evidence import (
-    evidence_document,
-    evidence_entries,
-    evidence_facts,
-    evidence_text,
-    standing_text,
-    votes_text,
-)
 from .merges import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title
 
@@ -135,7 +124,7 @@ def _growth(history: History, record: PlaceHistory) -> Iterator[Entry]:
     merged = {merge.cause.offset for merge in record.merges}
     before = 0
     for change in record.changes:
-        passed = _passed_milestone(before, change.keyframe_count)
+        passed = passed_milestone(before, change.keyframe_count)
         before = change.keyframe_count
         if passed and change.offset not in merged and change.offset != record.formed.offset:
             cause = history.cause_at(change.offset)
@@ -203,7 +192,9 @@ def _standing_place_summary(history: History, record: PlaceHistory, end: Offset)
 
 def _objects_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
     classes = Counter(
-        o.class_name(end) for o in history.objects if o.stands(end) and o.place(end) == place
+        each.class_name
+        for each, record in zip(history.objects_at(end), history.objects, strict=False)
+        if each.place == place and record.stands(end)
     )
     if not classes:
         return "no objects"
@@ -226,133 +217,115 @@ def _neighbours_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
     return "next to " + ", ".join(f"{place_title(history, p, end)} ({n}×)" for n, p in found)
 
 
-def explain_object(
-    history: History,
-    observation: Callable[[ObservationOrdinal], ObservationRecord],
-    record: ObjectHistory,
-    end: Offset,
+def explain_same_place(
+    history: History, first: KeyframeOrdinal, second: KeyframeOrdinal, end: Offset
 ) -> Explanation:
-    """Explain an object by the events below ``end``."""
-    seen = [observation(each.observation) for each in sightings_of(history, record, end)]
-    votes = Counter(each.class_name for each in seen)
-    entries = sorted(
-        (e for e in _object_entries(history, observation, record) if e.cause.offset < end),
-        key=lambda entry: entry.cause.offset,
-    )
+    """Why keyframes ``first`` and ``second`` are in one place, or not, after ``end`` events."""
+    since = together_since(history, first, second)
+    together = since is not None and since < end
+    until = Offset(since + 1) if since is not None and together else end
+    entries = [
+        _placed_entry(history, k)
+        for k in dict.fromkeys((first, second))
+        if history.placed_offsets[k] < end
+    ]
+    entries += [
+        _merged_entry(history, merge) for merge in _merges_of(history, (first, second), until)
+    ]
     return Explanation(
-        kind="object",
-        subject=record.object_id,
-        summary=_object_summary(history, record, votes, end),
-        entries=tuple(entries),
+        kind="same",
+        subject=f"{keyframe_name(history, first)} and {keyframe_name(history, second)}",
+        summary=_same_place_summary(history, first, second, since if together else None, end),
+        entries=tuple(sorted(entries, key=lambda entry: entry.cause.offset)),
         facts={
-            "class_name": record.class_name(end),
-            "place_id": id_of_place(history, record.place(end)),
-            "det_ids": [each.det_id for each in seen],
-            **evidence_facts(record, votes, end),
+            "same": together,
+            "since": since if together else None,
+            "places": [id_of_place(history, history.place_at(k, end)) for k in (first, second)],
         },
     )
 
 
-def sightings_of(history: History, record: ObjectHistory, end: Offset) -> list[ObjectSeen]:
-    """The sightings of an object and of those that it absorbed in the events below ``end``."""
-    found = record.sightings[: count_before(record.sightings, end)]
-    for merge in record.merges[: count_before(record.merges, end)]:
-        found += sightings_of(history, history.objects[merge.absorbed], end)
-    return sorted(found, key=lambda seen: seen.observation)
+def together_since(
+    history: History, first: KeyframeOrdinal, second: KeyframeOrdinal
+) -> Offset | None:
+    """The offset of the event that first brought two keyframes into one place; None for never."""
+    joined = Offset(max(history.placed_offsets[first], history.placed_offsets[second]))
+    if joined == NEVER:
+        return None
+    chain = _merges_of(history, (first, second), NEVER)
+    for offset in sorted({joined, *(m.cause.offset for m in chain if m.cause.offset > joined)}):
+        after = Offset(offset + 1)
+        if history.place_at(first, after) == history.place_at(second, after):
+            return offset
+    return None
 
 
-def _object_summary(
-    history: History, record: ObjectHistory, votes: Counter[str], end: Offset
-) -> str:
-    last = record.values(end)
-    if last is None:
-        return "not seen yet"
-    merge = record.absorbed_by
-    if merge is not None and merge.offset < end:
-        survivor = history.objects[merge.survivor].object_id
-        return f"fused into {survivor} at offset {merge.offset:,} ({merge.cause.when})"
-    x, y = mean_m(last.sum_x_um, last.obs_count), mean_m(last.sum_y_um, last.obs_count)
-    sightings = sightings_of(history, record, end)
-    least = min(seen.similarity_q40 for seen in sightings) / Q40
-    similar = f" (similarity at least {least:.2f})" if last.obs_count > 1 else ""
-    return (
-        f"{record.class_name(end)}{_votes(record, votes)}, "
-        f"seen {counted(last.obs_count, 'time')}{similar}, "
-        f"on average from ({x:.2f}, {y:.2f}); in {place_title(history, record.place(end), end)}"
-        f"{standing_text(history, record, end)}"
+def _merges_of(
+    history: History, keyframes: tuple[KeyframeOrdinal, KeyframeOrdinal], end: Offset
+) -> list[Merge]:
+    """Merges below ``end`` that moved either keyframe from one place to another, in order."""
+    merges: dict[int, Merge] = {}
+    for keyframe in keyframes:
+        if history.placed_offsets[keyframe] >= end:
+            continue
+        place = history.placed_in[keyframe]
+        while (merge := history.places[place].absorbed_by) is not None and merge.cause.offset < end:
+            merges[merge.number] = merge
+            place = merge.survivor
+    return [merges[number] for number in sorted(merges)]
+
+
+def _placed_entry(history: History, keyframe: KeyframeOrdinal) -> Entry:
+    place = place_name(history, history.placed_in[keyframe])
+    offset = Offset(history.placed_offsets[keyframe])
+    own = history.keyframe_offsets[keyframe]
+    wait = counted(offset - own, "event")
+    late = "" if offset == own else f", {wait} after it came: it was noise before"
+    name = keyframe_name(history, keyframe)
+    return Entry(
+        history.cause_at(offset),
+        "placed",
+        f"{name} at {position_text(history.keyframes[keyframe].pose)} joined {place}{late}",
+        {"keyframe": name, "place_id": place},
     )
 
 
-def _votes(record: ObjectHistory, votes: Counter[str]) -> str:
-    return votes_text(votes) if record.estimates else ""
+def _merged_entry(history: History, merge: Merge) -> Entry:
+    survivor = place_name(history, merge.survivor)
+    absorbed = ", ".join(place_name(history, place) for place in merge.absorbed)
+    return Entry(
+        merge.cause,
+        "merged",
+        f"{survivor} absorbed {absorbed}; {merge_reason(history, merge)}",
+        {"merge": merge.number},
+    )
 
 
-def _object_entries(
+def _same_place_summary(
     history: History,
-    observation: Callable[[ObservationOrdinal], ObservationRecord],
-    record: ObjectHistory,
-) -> Iterator[Entry]:
-    pose = history.keyframes[history.keyframe_count(Offset(record.found.offset + 1)) - 1].pose
-    first = observation(record.sightings[0].observation).det_id
-    yield Entry(
-        record.cause,
-        "found",
-        f"new object: {first}, seen from {position_text(pose)}, "
-        f"matched no {'object' if record.estimates else record.found.class_name} nearby",
-        {"det_id": first},
-    )
-    yield from _sightings(history, record)
-    yield from _moves(history, record)
-    for merge in record.merges:
-        absorbed = history.objects[merge.absorbed].object_id
-        text = f"{absorbed} was fused into it {_why_fused(merge)}"
-        yield Entry(merge.cause, "fused", text, {"object_id": absorbed, **_evidence_of(merge)})
-    if (ended := record.absorbed_by) is not None:
-        survivor = history.objects[ended.survivor].object_id
-        text = f"fused into {survivor} {_why_fused(ended)}"
-        yield Entry(ended.cause, "ended", text, {"object_id": survivor, **_evidence_of(ended)})
-    for offset, what, text, facts in evidence_entries(record):
-        yield Entry(history.cause_at(offset), what, text, facts)
-
-
-def _why_fused(merge: ObjectMerge) -> str:
-    evidence = merge.values.evidence
-    return "by a command" if evidence is None else f"as one thing: {evidence_text(evidence)}"
-
-
-def _evidence_of(merge: ObjectMerge) -> dict[str, Any]:
-    evidence = merge.values.evidence
-    return {} if evidence is None else {"evidence": evidence_document(evidence)}
-
-
-def _sightings(history: History, record: ObjectHistory) -> Iterator[Entry]:
-    before = 1
-    for seen in record.sightings:
-        if _passed_milestone(before, seen.obs_count):
-            text = f"seen {counted(seen.obs_count, 'time')}"
-            yield Entry(history.cause_at(seen.offset), "seen", text, {"obs_count": seen.obs_count})
-        before = seen.obs_count
-
-
-def _moves(history: History, record: ObjectHistory) -> Iterator[Entry]:
-    before: PlaceOrdinal | None = None
-    for moved in record.moves:
-        cause = history.cause_at(moved.offset)
-        facts = {"from": id_of_place(history, before), "to": id_of_place(history, moved.place)}
-        yield Entry(cause, "located", _move_text(history, before, moved.place, moved.offset), facts)
-        before = moved.place
-
-
-def _move_text(
-    history: History, before: PlaceOrdinal | None, after: PlaceOrdinal | None, offset: Offset
+    first: KeyframeOrdinal,
+    second: KeyframeOrdinal,
+    since: Offset | None,
+    end: Offset,
 ) -> str:
-    to = place_name(history, after)
-    if before is None:
-        return f"located in {to}"
-    merge = history.places[before].absorbed_by
-    if merge is not None and merge.cause.offset == offset:
-        return f"located in {to}, which absorbed {place_name(history, before)}"
-    return f"located in {to} instead of {place_name(history, before)}: most sightings are there"
+    if since is not None:
+        cause = history.cause_at(since)
+        now = place_title(history, history.place_at(first, end), end)
+        return f"in one place since offset {since:,} ({cause.title}); it is {now} now"
+    return "not in one place: " + "; ".join(
+        _place_of_keyframe(history, k, end) for k in (first, second)
+    )
+
+
+def _place_of_keyframe(history: History, keyframe: KeyframeOrdinal, end: Offset) -> str:
+    name = keyframe_name(history, keyframe)
+    if history.keyframe_offsets[keyframe] >= end:
+        return f"{name} has not come yet"
+    if history.keyframes[keyframe].pose is None:
+        return f"{name} has no pose"
+    place = history.place_at(keyframe, end)
+    where = "noise" if place is None else f"in {place_title(history, place, end)}"
+    return f"{name} is {where}"
 
 
 def position_text(pose: Pose | None) -> str:
@@ -360,7 +333,7 @@ def position_text(pose: Pose | None) -> str:
     return "no pose" if pose is None else f"({pose.x_um / 1e6:.2f}, {pose.y_um / 1e6:.2f})"
 
 
-def _passed_milestone(before: int, after: int) -> bool:
+def passed_milestone(before: int, after: int) -> bool:
     """Whether a count passed one of 10, 20, 50, 100, 200, 500 …: growth that gets an entry."""
     return _milestones_up_to(after) > _milestones_up_to(before)
 

@@ -23,14 +23,14 @@ from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_recorder import HistoryRecorder
 from projections.store.history_recorder import Progress as Progress
-from projections.store.records import Merge, ObjectMerge, Refusal
+from projections.store.records import Merge, ObjectMerge, RefusedMerge
 from projections.store.stored_view import StoredView
 from projections.store.timeline_cache import TimelineCache
 
 from .bisect import CountIndex, HistoryFacts, Search, Searcher
 from .command_entries import EntryMaker, object_commands, place_commands, same_place_commands
 from .conditions import Expression
-from .explanation import Explanation, explain_object, explain_place, with_entries
+from .explanation import Explanation, explain_place, explain_same_place, with_entries
 from .names import (
     NoSuchThing,
     find_keyframe,
@@ -39,9 +39,9 @@ from .names import (
     id_of_place,
     keyframe_ordinal,
 )
-from .same_place import explain_same_place
+from .object_explanation import explain_object
 
-_Caused = TypeVar("_Caused", Merge, Refusal, ObjectMerge)
+_Caused = TypeVar("_Caused", Merge, RefusedMerge, ObjectMerge)
 
 
 def checked_end(reader: LogReader, end: Offset | None) -> Offset:
@@ -144,7 +144,7 @@ class KnownHistory:
         last = self._checked(end)
         return _before(self.covering(last).merges, last)
 
-    def refusals(self, end: Offset | None = None) -> list[Refusal]:
+    def refusals(self, end: Offset | None = None) -> list[RefusedMerge]:
         """Every merge that a command refused in the first ``end`` events, in order."""
         last = self._checked(end)
         return _before(self.covering(last).refusals, last)

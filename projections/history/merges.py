@@ -23,14 +23,21 @@ from typing import Any
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import RecordedCommand
-from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceLink, PlaceOrdinal
+from projections.fold.deltas import (
+    KeyframeOrdinal,
+    MergeEvidence,
+    ObjectOrdinal,
+    PlaceLink,
+    PlaceOrdinal,
+)
+from projections.fold.exact import UM_PER_M
 from projections.map.phrases import command_document, command_on, command_title
 from projections.store.history import History
-from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal
+from projections.store.records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
-from .evidence import evidence_document
 from .names import keyframe_name, log_name, place_name
 
+_NATS = 1000
 MOST_SEEN = 4
 """The most objects that a text names; of more, the first are named and the others counted."""
 
@@ -168,8 +175,8 @@ def _drive_text(history: History, merge: Merge, most_seen: int | None) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     cells = counted(drive.cells, "cell")
     at = merge.cause.offset
-    both = [history.objects[each] for each in seen_from_both(history, merge)]
-    seen = [f"{each.class_name(at)} {each.object_id}" for each in both]
+    both = [history.object_at(each, at) for each in seen_from_both(history, merge)]
+    seen = [f"{each.class_name} {each.object_id}" for each in both]
     if most_seen is not None and len(seen) > most_seen:
         seen = [*seen[: most_seen - 1], f"{len(seen) - most_seen + 1} more"]
     return (
@@ -218,17 +225,17 @@ def _document(recorded: RecordedCommand | None) -> dict[str, Any] | None:
     return None if recorded is None else command_document(recorded)
 
 
-def refusal_reason(history: History, refusal: Refusal) -> str:
+def refusal_reason(history: History, refusal: RefusedMerge) -> str:
     """The core points that would have joined two places, and the command that keeps them apart."""
     return f"{_link_text(history, refusal.link)}; kept apart by {refuser(history, refusal)}"
 
 
-def refuser(history: History, refusal: Refusal) -> str:
+def refuser(history: History, refusal: RefusedMerge) -> str:
     """The command that refused a merge: kind, id, author and reason."""
     return _title(_command(history, refusal.apart, joins=False))
 
 
-def refusal_document(history: History, refusal: Refusal) -> dict[str, Any]:
+def refusal_document(history: History, refusal: RefusedMerge) -> dict[str, Any]:
     """One refused merge as JSON; ``run_id`` and ``keyframe_id`` name the bridging keyframe."""
     return {
         **refusal.cause.document(),
@@ -325,15 +332,38 @@ def _joined_document(history: History, link: PlaceLink) -> dict[str, Any]:
     return {**link_document(history, link), "command": command}
 
 
+def evidence_text(evidence: MergeEvidence | None) -> str:
+    """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; looks and
+    positions are log-likelihood ratios in nats. None stands for a merge by a command."""
+    if evidence is None:
+        return "a command"
+    return (
+        f"{evidence.distance_um / UM_PER_M:.2f} m apart, looks {evidence.look / _NATS:+.1f}, "
+        f"positions {evidence.geometry / _NATS:+.1f}, "
+        f"in one picture {evidence.pictures_with_both:,} of {counted(evidence.pictures, 'time')}"
+    )
+
+
+def evidence_document(evidence: MergeEvidence) -> dict[str, Any]:
+    """The evidence of a merge of objects as JSON; log-likelihood ratios in nats."""
+    return {
+        "distance_m": evidence.distance_um / UM_PER_M,
+        "look": evidence.look / _NATS,
+        "geometry": evidence.geometry / _NATS,
+        "pictures_with_both": evidence.pictures_with_both,
+        "pictures": evidence.pictures,
+    }
+
+
 def object_merge_document(history: History, merge: ObjectMerge) -> dict[str, Any]:
     """One merge of objects as JSON."""
-    survivor, absorbed = (history.objects[n] for n in (merge.survivor, merge.absorbed))
+    survivor = history.object_at(merge.survivor, Offset(merge.offset + 1))
     evidence = merge.values.evidence
     return {
         **merge.cause.document(),
-        "class_name": survivor.class_name(Offset(merge.offset + 1)),
+        "class_name": survivor.class_name,
         "survivor": survivor.object_id,
-        "absorbed": absorbed.object_id,
+        "absorbed": history.objects[merge.absorbed].object_id,
         **({} if evidence is None else {"evidence": evidence_document(evidence)}),
     }
 

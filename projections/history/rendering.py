@@ -10,13 +10,12 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.map.phrases import command_title
 from projections.map.records import Estimate
 from projections.store.history import History
-from projections.store.records import EdgeChange, Merge, ObjectMerge, Refusal
+from projections.store.records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
-from .evidence import evidence_text
 from .explanation import Explanation
-from .merges import merge_reason, refuser
+from .merges import evidence_text, merge_reason, refuser
 from .names import keyframe_name, place_name, place_title
 
 
@@ -231,7 +230,7 @@ def merges_text(history: History, merges: Sequence[Merge], end: Offset) -> str:
     return table(header, rows, right=("#", "offset", "objects", "edges"))
 
 
-def refusals_text(history: History, refusals: Sequence[Refusal]) -> str:
+def refusals_text(history: History, refusals: Sequence[RefusedMerge]) -> str:
     """The table of refused merges, or that there are none."""
     if not refusals:
         return "no merge was refused\n"
@@ -264,7 +263,7 @@ def object_merges_text(history: History, merges: Sequence[ObjectMerge]) -> str:
             merge.cause.name,
             history.objects[merge.survivor].object_id,
             history.objects[merge.absorbed].object_id,
-            history.objects[merge.survivor].class_name(Offset(merge.offset + 1)),
+            history.object_at(merge.survivor, Offset(merge.offset + 1)).class_name,
             *([evidence_text(merge.values.evidence)] if by_evidence else []),
         )
         for merge in merges
@@ -283,8 +282,8 @@ def merge_text(history: History, merge: Merge) -> str:
     ]
     for place, size in zip(merge.absorbed, merge.absorbed_sizes, strict=True):
         lines.append(f"absorbed  {_place(history, merge, place, size)}")
-    objects = [history.objects[number] for number in merge.objects]
-    named = [f"object    {o.object_id} ({o.class_name(Offset(after))})" for o in objects]
+    objects = [history.object_at(number, Offset(after)) for number in merge.objects]
+    named = [f"object    {o.object_id} ({o.class_name})" for o in objects]
     lines += shortened(named, MOST_THINGS, "--json lists all")
     lines += shortened(
         [_edge_text(history, e) for e in merge.edges], MOST_THINGS, "--json lists all"

@@ -14,7 +14,7 @@ from projections.fold.errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
 from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.map.phrases import command_document, command_name
-from projections.store.history_rows import NEVER
+from projections.store.history import NEVER
 
 from .known import Progress
 from .names import NoSuchThing

@@ -1,5 +1,10 @@
 """The changes of a history as columns: tables of numbers and texts, rows in order of events.
 
+There is a table for each kind of delta, with columns for its fields, which are read from the
+struct itself. A field that is a struct or a tuple has a column for each part; a struct that may be
+None has a flag of its own name before them. The ordinal of a new thing is the number of its row,
+and an embedding is kept as its checksum.
+
 A `Stripe` has the rows of a span of events. Rows are only ever added, so the map after any number
 of events is made from the first rows of each table, and a log that has grown adds a stripe.
 
@@ -9,109 +14,177 @@ Kinds of columns: ``int``, ``number?`` (an integer of 0 or more, -1 for none), `
 in the array ``NAME/ends``, where each ends.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Final, Literal, TypeAlias
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
+from typing import Any, Final, Literal, TypeAlias, cast
 
+import msgspec
 import numpy as np
+from msgspec import inspect
 from numpy.typing import NDArray
 
+from eventsrc.base.crc import crc32
 from eventsrc.envelope.model import Offset
+from projections.fold import deltas
 
 Kind = Literal["int", "number?", "float", "flag", "code", "text"]
 Array: TypeAlias = NDArray[Any]
 Table: TypeAlias = dict[str, Kind]
+Row: TypeAlias = tuple[Any, ...]
 
 NONE: Final = -1
 """The value of ``number?`` and ``code`` for None."""
 
-_VALUES: Final[Table] = {
-    "obs_count": "int",
-    "sum_x_um": "int",
-    "sum_y_um": "int",
-    "first_seen": "float",
-    "last_seen": "float",
+DELTAS: Final[Mapping[str, type[msgspec.Struct]]] = {
+    "run": deltas.RunSeen,
+    "keyframe": deltas.KeyframeAdded,
+    "observation": deltas.ObservationAdded,
+    "skipped": deltas.EventSkipped,
+    "map": deltas.MapGiven,
+    "formed": deltas.PlaceFormed,
+    "placed": deltas.KeyframePlaced,
+    "changed": deltas.PlaceChanged,
+    "named": deltas.PlaceNamed,
+    "refused": deltas.MergeRefused,
+    "linked": deltas.PlacesLinked,
+    "found": deltas.ObjectFound,
+    "seen": deltas.ObjectSeen,
+    "fused": deltas.ObjectsMerged,
+    "estimated": deltas.ObjectEstimated,
+    "classified": deltas.ObjectClassified,
+    "missing": deltas.ObjectMissing,
+    "relocated": deltas.ObjectRelocated,
+    "moved": deltas.ObjectMoved,
 }
-_OBJECT: Final[Table] = {"offset": "int", "object": "int"}
+_ORDINALS: Final = {
+    "keyframe": "keyframe",
+    "observation": "observation",
+    "formed": "place",
+    "found": "object",
+}
+"""The field that is the number of the row."""
+_LEFT_OUT: Final = {
+    "observation": ("run_id", "keyframe_id"),  # those of its keyframe
+    "map": ("map",),  # it is read from the log
+}
+_UNIQUE: Final = ("det_id", "place_id", "object_id")
+_SCALARS: Final[Mapping[type, Kind]] = {
+    inspect.IntType: "int",
+    inspect.FloatType: "float",
+    inspect.BoolType: "flag",
+    inspect.StrType: "code",
+    inspect.LiteralType: "code",
+}
 
+
+class _Field:
+    """A field of a delta as columns. ``model`` is the struct that it is, if it is one."""
+
+    def __init__(self, field: inspect.Field) -> None:
+        self.name = field.name
+        types = field.type.types if isinstance(field.type, inspect.UnionType) else (field.type,)
+        self.optional = len(types) > 1
+        (type_,) = (each for each in types if not isinstance(each, inspect.NoneType))
+        self.model: Callable[..., Any] | None = None
+        if isinstance(type_, inspect.StructType):
+            self.model = type_.cls
+            self.columns = _table_of(map(_Field, type_.fields))
+            self._nothing = (0,) * (1 + len(self.columns))
+            if self.optional:
+                self.columns = {self.name: "flag", **self.columns}
+        elif isinstance(type_, inspect.TupleType):
+            kinds = enumerate(_SCALARS[type(each)] for each in type_.item_types)
+            self.columns = {f"{self.name}{number}": kind for number, kind in kinds}
+        elif isinstance(type_, inspect.CustomType):
+            self.columns = {"crc": "number?"}
+        else:
+            kind = _SCALARS[type(type_)]
+            if self.optional and kind == "int":
+                kind = "number?"
+            elif not self.optional and self.name in _UNIQUE:
+                kind = "text"
+            self.columns = {self.name: kind}
+        self.is_scalar = list(self.columns) == [self.name]
+
+    def parts(self, value: Any) -> Row:
+        """The columns of a value that is not a scalar."""
+        if self.model is not None:
+            if value is None:
+                return self._nothing
+            parts = msgspec.structs.astuple(value)
+            return (1, *parts) if self.optional else parts
+        if isinstance(value, tuple):
+            return value
+        return (None if value is None else crc32(value.data),)
+
+    def made(self, columns: list[list[Any]]) -> Iterable[Any]:
+        """The values made of columns."""
+        if self.model is None:
+            return columns[0] if self.is_scalar else zip(*columns, strict=True)
+        if not self.optional:
+            return map(self.model, *columns)
+        there, *parts = columns
+        made = map(self.model, *parts)
+        return (each if is_there else None for each, is_there in zip(made, there, strict=True))
+
+
+def _table_of(fields: Iterable[_Field]) -> Table:
+    return {name: kind for field in fields for name, kind in field.columns.items()}
+
+
+def _fields_of(table: str, delta: type[msgspec.Struct]) -> list[_Field]:
+    """The fields that are kept, scalars first."""
+    left_out = (_ORDINALS.get(table), *_LEFT_OUT.get(table, ()))
+    whole = cast("inspect.StructType", inspect.type_info(delta))
+    fields = [_Field(field) for field in whole.fields if field.name not in left_out]
+    return sorted(fields, key=lambda field: not field.is_scalar)
+
+
+_FIELDS: Final = {table: _fields_of(table, delta) for table, delta in DELTAS.items()}
 TABLES: Final[dict[str, Table]] = {
-    "run": {"offset": "int", "run": "int", "run_id": "code", "started_at": "float"},
-    "keyframe": {
-        "offset": "int",
-        "run": "int",
-        "run_id": "code",
-        "keyframe_id": "int",
-        "timestamp": "float",
-        "posed": "flag",
-        "x_um": "int",
-        "y_um": "int",
-        "yaw_rad": "float",
-        "floor": "code",
-    },
-    "observation": {
-        "offset": "int",
-        "keyframe": "int",
-        "det_id": "text",
-        "class_name": "code",
-        "confidence": "float",
-        "x0": "float",
-        "y0": "float",
-        "x1": "float",
-        "y1": "float",
-        "model": "code",
-        "crc": "number?",
-        "foreign": "flag",
-    },
-    "skipped": {
-        "offset": "int",
-        "kind": "code",
-        "run_id": "code",
-        "keyframe_id": "int",
-        "det_id": "code",
-        "first_offset": "number?",
-    },
-    "map": {"offset": "int"},
-    "formed": {"offset": "int", "place_id": "text", "founder": "int"},
-    "placed": {"offset": "int", "keyframe": "int", "place": "int"},
-    "changed": {
-        "offset": "int",
-        "place": "int",
-        "keyframe_count": "int",
-        "sum_x_um": "int",
-        "sum_y_um": "int",
-    },
-    "named": {"offset": "int", "place": "int", "name": "code", "command": "number?"},
+    **{table: _table_of(fields) for table, fields in _FIELDS.items()},
     "merge": {"offset": "int", "document": "text"},
-    "refusal": {"offset": "int", "document": "text"},
-    "linked": {"offset": "int", "a": "int", "b": "int", "shared_transitions": "int"},
-    "found": {
-        "offset": "int",
-        "object_id": "text",
-        "class_name": "code",
-        "observation": "int",
-    },
-    "seen": {**_OBJECT, "observation": "int", "similarity_q40": "int", **_VALUES},
-    "object_merge": {"offset": "int", "document": "text"},
-    "estimated": {
-        **_OBJECT,
-        "x_um": "int",
-        "y_um": "int",
-        "var_xx_um2": "int",
-        "var_xy_um2": "int",
-        "var_yy_um2": "int",
-        "spots": "int",
-    },
-    "classified": {**_OBJECT, "class_name": "code"},
-    "missing": {**_OBJECT, "run": "int", "misses": "int", "missing": "flag"},
-    "relocated": {
-        **_OBJECT,
-        "observation": "int",
-        "from_x_um": "int",
-        "from_y_um": "int",
-        "to_x_um": "int",
-        "to_y_um": "int",
-    },
-    "moved": {**_OBJECT, "place": "number?"},
 }
+"""The columns of each table by name. Merges of places, with all that they moved, are documents."""
+
+
+def _row_maker(fields: Sequence[_Field]) -> Callable[[Any], Row]:
+    """The function that makes the row of a delta with these fields."""
+    names = [field.name for field in fields if field.is_scalar]
+    compound = [field for field in fields if not field.is_scalar]
+    if len(names) == 1:
+        return lambda delta: (getattr(delta, names[0]),)
+    scalars = attrgetter(*names)
+    if not compound:
+        return scalars
+
+    def row(delta: Any) -> Row:
+        found: Row = scalars(delta)
+        for field in compound:
+            found += field.parts(getattr(delta, field.name))
+        return found
+
+    return row
+
+
+ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
+    delta: (table, _row_maker(_FIELDS[table])) for table, delta in DELTAS.items()
+}
+"""The table of each kind of delta, and the function that makes its row."""
+
+
+def deltas_of(table: str, columns: Iterable[list[Any]], numbers: Iterable[int]) -> list[Any]:
+    """The deltas of rows with these columns and numbers."""
+    rest = iter(columns)
+    values = {
+        field.name: field.made([next(rest) for _ in field.columns]) for field in _FIELDS[table]
+    }
+    if table in _ORDINALS:
+        values[_ORDINALS[table]] = numbers
+    delta = DELTAS[table]
+    return list(map(delta, *(values[name] for name in delta.__struct_fields__)))
+
+
 STRINGS: Final = "strings"
 """The array of a stripe's repeated texts."""
 
@@ -149,17 +222,27 @@ class Stripe:
             self._strings = texts_in(self.arrays, STRINGS, 0, None) if found else []
         return self._strings
 
-    def text(self, table: str, column: str, row: int) -> str | None:
-        """The text of a row."""
-        return self.texts(table, column, row, row + 1)[0]
-
-    def texts(self, table: str, column: str, first: int, last: int) -> list[str | None]:
-        """The texts of the rows from ``first`` to before ``last``."""
+    def texts(self, table: str, column: str, rows: slice | Array) -> list[str | None]:
+        """The texts of some rows."""
         name = f"{table}.{column}"
-        if TABLES[table][column] == "text":
-            return list(texts_in(self.arrays, name, first, last))
-        strings = [*self.strings, None]  # so that NONE, -1, is None
-        return [strings[code] for code in self.arrays[name][first:last].tolist()]
+        if TABLES[table][column] != "text":
+            strings = [*self.strings, None]  # so that NONE, -1, is None
+            return [strings[code] for code in self.arrays[name][rows].tolist()]
+        if isinstance(rows, slice):
+            return list(texts_in(self.arrays, name, rows.start, rows.stop))
+        return [texts_in(self.arrays, name, row, row + 1)[0] for row in rows.tolist()]
+
+    def lists(self, table: str, rows: slice | Array) -> Iterator[list[Any]]:
+        """Each column of some rows."""
+        for column, kind in TABLES[table].items():
+            if kind in ("text", "code"):
+                yield self.texts(table, column, rows)
+                continue
+            array = self.arrays[f"{table}.{column}"][rows]
+            values: list[Any] = (array.astype(np.bool_) if kind == "flag" else array).tolist()
+            if kind == "number?":
+                values = [None if value == NONE else value for value in values]
+            yield values
 
 
 def texts_in(arrays: Mapping[str, Array], name: str, first: int, last: int | None) -> list[str]:

@@ -7,12 +7,12 @@ costs nothing per member.
 An ``end`` is a number of events: the answer is about the map after the events 0 … end − 1.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import starmap
-from typing import Final, cast
+from typing import Any, Final, cast
 
+import msgspec
 import numpy as np
 
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
@@ -22,49 +22,46 @@ from projections.fold.deltas import (
     EventSkipped,
     KeyframeAdded,
     KeyframeOrdinal,
-    KeyframePlaced,
     MapGiven,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectMoved,
     ObjectOrdinal,
-    ObjectRelocated,
-    ObjectSeen,
-    PlaceChanged,
-    PlaceFormed,
-    PlaceNamed,
     PlaceOrdinal,
     PlacesLinked,
     RunSeen,
 )
 from projections.fold.settings import Settings
+from projections.map.records import ObjectRecord
 
-from .history_rows import (
-    NO_PLACE,
-    as_ints,
-    documents,
-    items_of,
-    keyframes_of,
-    placed_columns,
-    posed,
+from .columns import Array
+from .lazy_rows import Chunks, Items, OrdinalsByName
+from .neighbours import Neighbours, posed
+from .object_states import ObjectStates
+from .records import (
+    Cause,
+    Merge,
+    ObjectHistory,
+    ObjectMerge,
+    PlaceHistory,
+    RefusedMerge,
+    last_before,
 )
-from .lazy_rows import Chunks, OrdinalsByName
-from .neighbours import Neighbours
-from .records import Cause, Merge, ObjectHistory, ObjectMerge, PlaceHistory, Refusal, last_before
 from .tables import Groups, Tables
+
+NEVER: Final = Offset(2**63 - 1)
+"""The offset of an event that has not happened."""
+NO_PLACE: Final = PlaceOrdinal(-1)
+"""The value of `History.placed_in` for a keyframe in no place."""
+_MOST_STATES: Final = 64
 
 MapAt = Callable[[Offset], OccupancyMap]
 """Reads the occupancy map that the event at an offset is."""
 
 _OBJECT_LISTS: Final = {
-    "sightings": ("seen", ObjectSeen),
-    "moves": ("moved", ObjectMoved),
-    "estimates": ("estimated", ObjectEstimated),
-    "classes": ("classified", ObjectClassified),
-    "misses": ("missing", ObjectMissing),
-    "relocations": ("relocated", ObjectRelocated),
+    "sightings": "seen",
+    "moves": "moved",
+    "estimates": "estimated",
+    "classes": "classified",
+    "misses": "missing",
+    "relocations": "relocated",
 }
 
 
@@ -118,12 +115,12 @@ class History:
         self.next_offset = tables.end
         self.tables = tables
         self.map_at = map_at
+        self._states: dict[ObjectOrdinal, tuple[list[int], list[ObjectRecord]]] = {}
 
     @cached_property
     def keyframes(self) -> Sequence[KeyframeAdded]:
         """The keyframes by ordinal."""
-        tables = self.tables
-        return Chunks(tables.count("keyframe"), partial(keyframes_of, tables))
+        return Chunks(self.tables.count("keyframe"), partial(self.tables.deltas, "keyframe"))
 
     @cached_property
     def keyframe_offsets(self) -> Sequence[int]:
@@ -145,13 +142,11 @@ class History:
         """What happened to each place."""
         tables = self.tables
         places = []
-        rows = tables.rows("formed", 0, tables.count("formed"))
-        causes = self.causes_at([row[0] for row in rows])
-        for number, (row, cause) in enumerate(zip(rows, causes, strict=True)):
-            place = PlaceHistory(PlaceFormed(row[0], PlaceOrdinal(number), *row[1:]), cause)
-            place.joined = items_of(tables, "placed", "place", KeyframePlaced, number)
-            place.changes = items_of(tables, "changed", "place", PlaceChanged, number)
-            place.names = items_of(tables, "named", "place", PlaceNamed, number)
+        for formed, cause in self._with_causes("formed"):
+            place = PlaceHistory(formed, cause)
+            place.joined = _items_of(tables, "placed", "place", formed.place)
+            place.changes = _items_of(tables, "changed", "place", formed.place)
+            place.names = _items_of(tables, "named", "place", formed.place)
             places.append(place)
         for merge in self.merges:
             places[merge.survivor].merges.append(merge)
@@ -162,14 +157,11 @@ class History:
     @cached_property
     def objects(self) -> Sequence[ObjectHistory]:
         """What happened to each object."""
-        tables = self.tables
         objects = []
-        rows = tables.rows("found", 0, tables.count("found"))
-        causes = self.causes_at([row[0] for row in rows])
-        for number, (row, cause) in enumerate(zip(rows, causes, strict=True)):
-            record = ObjectHistory(ObjectFound(row[0], ObjectOrdinal(number), *row[1:]), cause)
-            for name, (table, delta) in _OBJECT_LISTS.items():
-                setattr(record, name, items_of(tables, table, "object", delta, number))
+        for found, cause in self._with_causes("found"):
+            record = ObjectHistory(found, cause)
+            for name, table in _OBJECT_LISTS.items():
+                setattr(record, name, _items_of(self.tables, table, "object", found.object))
             objects.append(record)
         for merge in self.object_merges:
             objects[merge.survivor].merges.append(merge)
@@ -179,9 +171,8 @@ class History:
     @cached_property
     def runs(self) -> Sequence[Sequence[RunSeen]]:
         """Each run as it was seen."""
-        tables = self.tables
         runs: list[list[RunSeen]] = []
-        for seen in starmap(RunSeen, tables.rows("run", 0, tables.count("run"))):
+        for seen in self.tables.deltas("run"):
             if seen.run == len(runs):
                 runs.append([])
             runs[seen.run].append(seen)
@@ -190,11 +181,7 @@ class History:
     @cached_property
     def skipped(self) -> Sequence[EventSkipped]:
         """What was left out."""
-        tables = self.tables
-        return Chunks(
-            tables.count("skipped"),
-            lambda a, b: list(starmap(EventSkipped, tables.rows("skipped", a, b))),
-        )
+        return Chunks(self.tables.count("skipped"), partial(self.tables.deltas, "skipped"))
 
     @cached_property
     def maps(self) -> Sequence[MapGiven]:
@@ -205,9 +192,8 @@ class History:
     @cached_property
     def edges(self) -> Mapping[tuple[PlaceOrdinal, PlaceOrdinal], Sequence[PlacesLinked]]:
         """By pair of places their shared transitions in order."""
-        tables = self.tables
         edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
-        for linked in starmap(PlacesLinked, tables.rows("linked", 0, tables.count("linked"))):
+        for linked in self.tables.deltas("linked"):
             edges.setdefault((linked.a, linked.b), []).append(linked)
         return edges
 
@@ -233,17 +219,22 @@ class History:
     @cached_property
     def merges(self) -> Sequence[Merge]:
         """The merges of places."""
-        return documents(self.tables, "merge", Merge)
+        texts = self.tables.texts("merge", "document", 0, self.tables.count("merge"))
+        decode = msgspec.json.Decoder(Merge).decode
+        return [decode(text or "") for text in texts]
 
     @cached_property
-    def refusals(self) -> Sequence[Refusal]:
+    def refusals(self) -> Sequence[RefusedMerge]:
         """The merges that commands refused."""
-        return documents(self.tables, "refusal", Refusal)
+        return [
+            RefusedMerge(cause, each.a, each.b, each.bridge, each.link, each.apart)
+            for each, cause in self._with_causes("refused")
+        ]
 
     @cached_property
     def object_merges(self) -> Sequence[ObjectMerge]:
         """The merges of objects."""
-        return documents(self.tables, "object_merge", ObjectMerge)
+        return [ObjectMerge(cause, fused) for fused, cause in self._with_causes("fused")]
 
     @cached_property
     def place_ordinals(self) -> Mapping[str, PlaceOrdinal]:
@@ -268,7 +259,7 @@ class History:
 
     def posed_offsets(self) -> Sequence[int]:
         """The events that added keyframes with a pose, in order."""
-        posed = self.tables.column("keyframe", "posed").astype(np.bool_)
+        posed = self.tables.column("keyframe", "pose").astype(np.bool_)
         return as_ints(self.tables.integers("keyframe", "offset")[posed])
 
     def offsets_by_run(self) -> Mapping[str, Sequence[int]]:
@@ -277,6 +268,11 @@ class History:
         by_run = Groups(self.tables.column("keyframe", "run"), offsets)
         found = {seen[0].run_id: by_run[number] for number, seen in enumerate(self.runs)}
         return {run_id: as_ints(of) for run_id, of in found.items() if len(of)}
+
+    def _with_causes(self, table: str) -> Iterator[tuple[Any, Cause]]:
+        """The deltas of a table, each with its event."""
+        found = self.tables.deltas(table)
+        return zip(found, self.causes_at([each.offset for each in found]), strict=True)
 
     def cause_at(self, offset: Offset) -> Cause:
         """The event at ``offset`` as a cause."""
@@ -331,8 +327,56 @@ class History:
             found = merge.survivor
         return found
 
+    def object_at(self, found: ObjectOrdinal, end: Offset) -> ObjectRecord:
+        """What an object is after the events below ``end``, without its observations; not seen
+        before it is found."""
+        if found not in self._states:
+            states = ObjectStates.of_one(self.tables, found)
+            while len(self._states) >= _MOST_STATES:
+                del self._states[next(iter(self._states))]
+            self._states[found] = states.ends.tolist(), states.records(ObjectRecord)
+        ends, records = self._states[found]
+        row = bisect_right(ends, end) - 1
+        first = records[0]
+        return records[row] if row >= 0 else ObjectRecord(found, first.object_id, first.class_name)
+
+    def objects_at(self, end: Offset) -> list[ObjectRecord]:
+        """`object_at` of all objects found by the events below ``end``, absorbed ones too."""
+        return ObjectStates.all_at(self.tables, end).records(ObjectRecord)
+
     def transitions(self, a: PlaceOrdinal, b: PlaceOrdinal, end: Offset) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))
         linked = last_before(self.edges.get(pair, ()), end)
         return 0 if linked is None else linked.shared_transitions
+
+
+def as_ints(array: Array) -> memoryview:
+    """A sequence of Python integers."""
+    found: Any = array
+    return memoryview(found)
+
+
+def placed_columns(tables: Tables, end: Offset | None = None) -> tuple[Array, Array]:
+    """For each keyframe the event below ``end`` that placed it, and the place that it joined."""
+    keyframes = tables.count("keyframe") if end is None else tables.before("keyframe", end)
+    count = None if end is None else tables.before("placed", end)
+    offsets = np.full(keyframes, NEVER, np.int64)
+    places = np.full(keyframes, NO_PLACE, np.int64)
+    placed = tables.column("placed", "keyframe", count)
+    offsets[placed] = tables.column("placed", "offset", count)
+    places[placed] = tables.column("placed", "place", count)
+    return offsets, places
+
+
+def _items_of(tables: Tables, table: str, column: str, value: int) -> list[Any]:
+    """The rows of a table whose ``column`` has this value, as deltas in order."""
+    rows = tables.group(table, column)[value]
+    if not len(rows):
+        return []
+    found: Items[Any] = Items(
+        rows,
+        partial(tables.deltas_at, table),
+        lambda of: tables.integers(table, "offset")[of],
+    )
+    return cast("list[Any]", found)

@@ -10,9 +10,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
 
 from .columns import NONE, Array
-from .history import History
-from .history_rows import documents, placed_columns
-from .records import Merge, ObjectMerge
+from .history import History, placed_columns
 from .tables import Groups, Rows, last_rows
 
 
@@ -22,10 +20,12 @@ class Moment:
     def __init__(self, history: History, end: Offset) -> None:
         self.tables, self.end = history.tables, end
         self._counts: dict[str, int] = {}
-        self.merges = documents(self.tables, "merge", Merge, self.count("merge"))
-        self.object_merges = documents(
-            self.tables, "object_merge", ObjectMerge, self.count("object_merge")
+        self.merges = history.merges[: self.count("merge")] if self.count("merge") else ()
+        both = (self.column("fused", each).tolist() for each in ("survivor", "absorbed"))
+        self.object_merges: list[tuple[ObjectOrdinal, ObjectOrdinal]] = list(
+            zip(*both, strict=True)
         )
+        """(survivor, absorbed) of each merge of Objects, in order."""
 
     def count(self, table: str) -> int:
         if table not in self._counts:
@@ -35,8 +35,8 @@ class Moment:
     def column(self, table: str, column: str) -> Array:
         return self.tables.column(table, column, self.count(table))
 
-    def rows(self, table: str) -> list[tuple[Any, ...]]:
-        return self.tables.rows(table, 0, self.count(table))
+    def deltas(self, table: str) -> list[Any]:
+        return self.tables.deltas(table, 0, self.count(table))
 
     def last(self, table: str, column: str, size: int) -> Rows:
         """For each value 0 … ``size`` − 1 of a column, the last row that has it; -1 for none."""
@@ -44,10 +44,10 @@ class Moment:
             return np.full(size, NONE, np.int64)
         return last_rows(self.column(table, column), size)
 
-    def last_values(self, table: str, column: str, size: int) -> list[tuple[Any, ...] | None]:
-        """As `last`, with the values of all columns of the row; None for none."""
+    def last_deltas(self, table: str, column: str, size: int) -> list[Any]:
+        """As `last`, with the deltas that are the rows; None for none."""
         last = self.last(table, column, size)
-        rows = iter(self.tables.rows_at(table, last[last >= 0]))
+        rows = iter(self.tables.deltas_at(table, last[last >= 0]))
         return [next(rows) if row >= 0 else None for row in last.tolist()]
 
     @cached_property
@@ -75,17 +75,17 @@ class Moment:
 
     @cached_property
     def absorbed_objects(self) -> set[ObjectOrdinal]:
-        return {merge.absorbed for merge in self.object_merges}
+        return {absorbed for _, absorbed in self.object_merges}
 
     @cached_property
     def survivors_of_objects(self) -> set[ObjectOrdinal]:
-        return {merge.survivor for merge in self.object_merges}
+        return {survivor for survivor, _ in self.object_merges}
 
     @cached_property
     def object_of_seen(self) -> Array:
         """By row of ``seen`` the object that its observation is part of."""
-        pairs = [(m.survivor, m.absorbed) for m in self.object_merges]
-        return _survivors(self.count("found"), pairs)[self.column("seen", "object")]
+        found = _survivors(self.count("found"), self.object_merges)
+        return found[self.column("seen", "object")]
 
     @property
     def is_fused(self) -> Array:

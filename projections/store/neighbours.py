@@ -17,6 +17,9 @@ from projections.fold.exact import distance_um, metres_to_um
 from projections.fold.floors import shift_um
 from projections.fold.settings import Settings
 
+from .columns import NONE
+from .tables import Tables
+
 
 class Posed(NamedTuple):
     """The keyframes that have a pose, in order, as columns: their ordinals, the events that added
@@ -26,6 +29,21 @@ class Posed(NamedTuple):
     offsets: NDArray[np.int64]
     positions: NDArray[np.int64]
     floors: NDArray[np.int64]
+
+
+def posed(tables: Tables) -> Posed:
+    """The keyframes that have a pose."""
+    numbers = np.flatnonzero(tables.column("keyframe", "pose"))
+    x, y = (tables.integers("keyframe", each)[numbers] for each in ("x_um", "y_um"))
+    codes, strings = tables.codes("keyframe", "floor")
+    names: dict[str | None, int] = {}
+    unique, first, inverse = np.unique(codes[numbers], return_index=True, return_inverse=True)
+    number_of = np.zeros(len(unique), np.int64)
+    for place in np.argsort(first).tolist():
+        name = None if unique[place] == NONE else strings[unique[place]]
+        number_of[place] = names.setdefault(name, len(names))
+    offsets = tables.integers("keyframe", "offset")[numbers]
+    return Posed(numbers, offsets, np.stack([x, y], axis=1), number_of[inverse])
 
 
 class Neighbours:

@@ -146,7 +146,7 @@ class Merge:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class RefusedMerge:
     """A merge of places ``a`` and ``b`` that a command refused; ``a`` was founded first.
 
     ``link`` are the core points that would have joined them. ``apart`` are the keyframes that the
@@ -237,36 +237,11 @@ class ObjectHistory:
     def object_id(self) -> str:
         return self.found.object_id
 
-    def place(self, end: Offset) -> PlaceOrdinal | None:
-        """The place it is located in after the events below ``end``."""
-        moved = last_before(self.moves, end)
-        return None if moved is None else moved.place
-
     def stands(self, end: Offset) -> bool:
         """Whether it is found and not absorbed after the events below ``end``."""
         return self.found.offset < end and (
             self.absorbed_by is None or self.absorbed_by.offset >= end
         )
-
-    def values(self, end: Offset) -> ObjectSeen | ObjectsMerged | None:
-        """The object's count, sums and times after the events below ``end``."""
-        seen, merged = last_before(self.sightings, end), last_before(self.merges, end)
-        if seen is None or merged is None or seen.obs_count > merged.values.obs_count:
-            return seen
-        return merged.values
-
-    def class_name(self, end: Offset) -> str:
-        """The object's class after the events below ``end``."""
-        classified = last_before(self.classes, end)
-        return self.found.class_name if classified is None else classified.class_name
-
-    def looked_for(self, end: Offset) -> ObjectMissing | None:
-        """The count of keyframes that should show it and do not, after the events below ``end``;
-        None if it was relocated since."""
-        looked, moved = last_before(self.misses, end), last_before(self.relocations, end)
-        if looked is None or (moved is not None and moved.offset > looked.offset):
-            return None
-        return looked
 
 
 class _HasOffset(Protocol):

@@ -1,32 +1,46 @@
 """The map at any offset, made from the columns of a history without folding.
 
-Counts, places and objects are computed from whole columns. Keyframes and observations are made one
-by one on first access, and all of them before the view is changed.
+Counts, places and objects are computed from whole columns. Keyframes and observations, the members
+of a place and the observations of an Object, most of the data, are made on first access, and all
+before the view is changed.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import pairwise, repeat
-from typing import Any, Final, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset
-from projections.fold.deltas import Delta, PlaceOrdinal, Pose, SkipKind
+from projections.fold.deltas import (
+    Delta,
+    KeyframeAdded,
+    KeyframeOrdinal,
+    ObjectRelocated,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    SkipKind,
+)
 from projections.fold.survivors import PlaceSurvivors
-from projections.map.records import KeyframeRecord, ObservationRecord
+from projections.map.records import (
+    KeyframeRecord,
+    ObjectRecord,
+    ObservationRecord,
+    PlaceRecord,
+    Relocation,
+    RunRecord,
+)
 from projections.map.view import MapView
 
-from .columns import NONE
+from .columns import NONE, TABLES
 from .history import History
 from .lazy_rows import Chunks
 from .moment import Moment
+from .object_states import ObjectStates
 from .recorded_vectors import RecordedVectors
-from .stored_records import adjacency_of, floors_of, objects_of, places_of, runs_of, skipped_of
 from .timeline_cache import TimelineCache
-
-_LAZY: Final = ("keyframes", "observations")
 
 
 class StoredView(MapView):
@@ -51,41 +65,34 @@ class StoredView(MapView):
         self._is_changed = False
         self._cache, self._recorded = cache, recorded
         self._moment = moment = Moment(history, end)
-        self.all_places = places_of(moment)
+        self.all_places = _places(moment)
         for merge in moment.merges:
             self.survivors.merge(merge.survivor, merge.absorbed)
         gone = self.survivors.absorbed_by
         self.places = {p.ordinal: p for p in self.all_places if p.ordinal not in gone}
-        self.all_objects = objects_of(moment)
-        for each in moment.object_merges:
-            self.object_survivors.merge(each.survivor, (each.absorbed,))
-        absorbed = self.object_survivors.absorbed_by
-        self.objects = {o.ordinal: o for o in self.all_objects if o.ordinal not in absorbed}
+        self.all_objects = _objects(moment)
+        for survivor, absorbed in moment.object_merges:
+            self.object_survivors.merge(survivor, (absorbed,))
+        fused = self.object_survivors.absorbed_by
+        self.objects = {o.ordinal: o for o in self.all_objects if o.ordinal not in fused}
         for found in self.objects.values():
             self.contents.update(found)
-        self.runs = runs_of(moment)
-        self.adjacency = adjacency_of(moment)
-        for kind, count in skipped_of(moment).items():
+        self.runs = _runs(moment)
+        self.adjacency = _adjacency(moment)
+        for kind, count in _skipped(moment).items():
             self.skipped[cast("SkipKind", kind)] = count
-        self.floors = {name: number for number, name in enumerate(floors_of(moment))}
+        self.floors = {name: number for number, name in enumerate(_floors(moment))}
         for given in history.maps[: moment.count("map")] if moment.count("map") else ():
             self.maps[given.map.floor] = given
-        # Made on first access: they are most of a map.
-        del self.keyframes, self.observations
+        keyframes: Chunks[KeyframeRecord] = Chunks(
+            moment.count("keyframe"), partial(_keyframes, moment, self.survivors)
+        )
+        observations: Chunks[ObservationRecord] = Chunks(
+            moment.count("observation"), partial(_observations, moment)
+        )
+        self.keyframes = cast("list[KeyframeRecord]", keyframes)
+        self.observations = cast("list[ObservationRecord]", observations)
         self.advance(end)
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _LAZY or "_moment" not in self.__dict__:
-            raise AttributeError(name)
-        moment, count = self._moment, self._moment.count(name.removesuffix("s"))
-        make: Callable[[int, int], list[Any]]
-        if name == "keyframes":  # not a method: a view in a cycle would stay in memory
-            make = partial(_keyframes, moment, self.survivors)
-        else:
-            make = partial(_observations, moment)
-        found: Chunks[Any] = Chunks(count, make)
-        setattr(self, name, found)
-        return found
 
     def apply(self, delta: Delta) -> None:
         """Apply one delta."""
@@ -141,9 +148,9 @@ class StoredView(MapView):
             return super()._sums()
         moment = self._moment
         return (
-            int(np.count_nonzero(moment.column("keyframe", "posed"))),
+            int(np.count_nonzero(moment.column("keyframe", "pose"))),
             int(np.count_nonzero(moment.is_fused)),
-            int(np.count_nonzero(moment.column("observation", "foreign"))),
+            int(np.count_nonzero(moment.column("observation", "foreign_space"))),
         )
 
     def _make_all(self) -> None:
@@ -156,52 +163,171 @@ class StoredView(MapView):
 def _keyframes(
     moment: Moment, survivors: PlaceSurvivors, first: int, last: int
 ) -> list[KeyframeRecord]:
-    offsets, runs, run_ids, ids, timestamps, posed, x_um, y_um, yaws, floors = moment.tables.lists(
-        "keyframe", first, last
-    )
+    added: list[KeyframeAdded] = moment.tables.deltas("keyframe", first, last)
     _, joined = moment.placed
-    poses = map(Pose, x_um, y_um, yaws)
     starts = moment.observation_starts[first : last + 1].tolist()
-    return list(
-        map(
-            KeyframeRecord,
-            range(first, last),
-            offsets,
-            runs,
-            run_ids,
-            ids,
-            timestamps,
-            [pose if has_pose else None for pose, has_pose in zip(poses, posed, strict=True)],
-            repeat(survivors),
-            [list(range(*span)) or () for span in pairwise(starts)],
-            [None if place == NONE else place for place in joined[first:last].tolist()],
-            floors,
+    places = joined[first:last].tolist()
+    return [
+        KeyframeRecord(
+            k.keyframe,
+            k.offset,
+            k.run,
+            k.run_id,
+            k.keyframe_id,
+            k.timestamp,
+            k.pose,
+            survivors,
+            list(map(ObservationOrdinal, range(*span))) or (),
+            None if place == NONE else place,
+            k.floor,
         )
-    )
+        for k, span, place in zip(added, pairwise(starts), places, strict=True)
+    ]
 
 
 def _observations(moment: Moment, first: int, last: int) -> list[ObservationRecord]:
-    _, keyframes, det_ids, names, confidences, x0, y0, x1, y1, models, crcs, foreign = (
-        moment.tables.lists("observation", first, last)
-    )
+    columns = moment.tables.lists("observation", first, last)
+    found = dict(zip(TABLES["observation"], columns, strict=True))
     objects, similarities = (column[first:last].tolist() for column in moment.fused)
     return list(
         map(
             ObservationRecord,
             range(first, last),
-            keyframes,
-            det_ids,
-            names,
-            confidences,
-            zip(x0, y0, x1, y1, strict=True),
-            models,
+            found["keyframe"],
+            found["det_id"],
+            found["class_name"],
+            found["confidence"],
+            zip(*(found[f"bbox{number}"] for number in range(4)), strict=True),
+            found["embedding_model"],
             repeat(None),
-            crcs,
-            foreign,
-            [None if found == NONE else found for found in objects],
+            found["crc"],
+            found["foreign_space"],
+            [None if each == NONE else each for each in objects],
             [
-                None if found == NONE else q40
-                for found, q40 in zip(objects, similarities, strict=True)
+                None if each == NONE else q40
+                for each, q40 in zip(objects, similarities, strict=True)
             ],
         )
     )
+
+
+class StoredPlace(PlaceRecord):
+    """A place whose members are made on first access."""
+
+    __slots__ = ("_made", "_moment")
+
+    _moment: Moment
+    _made: list[KeyframeOrdinal] | None
+
+    def read_from(self, moment: Moment) -> None:
+        """Use ``moment`` as the source of the members."""
+        self._moment, self._made = moment, None
+
+    @property
+    def unordered_members(self) -> list[KeyframeOrdinal]:
+        if self._made is None:
+            self._made = self._moment.members[self.ordinal].tolist()
+        return self._made
+
+    @unordered_members.setter
+    def unordered_members(self, members: list[KeyframeOrdinal]) -> None:
+        self._made = members
+
+
+def _places(moment: Moment) -> list[PlaceRecord]:
+    formed = moment.deltas("formed")
+    changed = moment.last_deltas("changed", "place", len(formed))
+    named = moment.last_deltas("named", "place", len(formed))
+    places: list[PlaceRecord] = []
+    for new, change, name in zip(formed, changed, named, strict=True):
+        place = StoredPlace(new.place, new.place_id, new.founder, new.offset)
+        place.read_from(moment)
+        if change is not None:
+            place.keyframe_count = change.keyframe_count
+            place.sum_x_um, place.sum_y_um = change.sum_x_um, change.sum_y_um
+        if name is not None:
+            place.name, place.name_offset = name.name, name.command
+        places.append(place)
+    return places
+
+
+class StoredObject(ObjectRecord):
+    """An Object whose observations are made on first access."""
+
+    __slots__ = ("_made", "_moment")
+
+    _moment: Moment
+    _made: list[ObservationOrdinal] | None
+
+    def read_from(self, moment: Moment) -> None:
+        """Use ``moment`` as the source of the observations."""
+        self._moment, self._made = moment, None
+
+    @property
+    def observations(self) -> list[ObservationOrdinal]:
+        if self._made is None:
+            moment, absorbed = self._moment, self.ordinal in self._moment.absorbed_objects
+            made = [] if absorbed else moment.sightings[self.ordinal].tolist()
+            if self.ordinal in moment.survivors_of_objects:
+                made.sort()
+            self._made = made  # when it is sorted: another thread may read it
+        return self._made
+
+    @observations.setter
+    def observations(self, observations: list[ObservationOrdinal]) -> None:
+        self._made = observations
+
+
+def _objects(moment: Moment) -> list[ObjectRecord]:
+    objects = ObjectStates.all_at(moment.tables, moment.end).records(StoredObject)
+    for each in objects:
+        each.read_from(moment)
+    moved: list[ObjectRelocated] = moment.deltas("relocated")
+    for d in moved:
+        at = (d.from_x_um, d.from_y_um, d.to_x_um, d.to_y_um)
+        objects[d.object].relocations.append(Relocation(d.offset, d.observation, *at))
+    for survivor, absorbed in moment.object_merges:  # in order
+        relocations = objects[survivor].relocations + objects[absorbed].relocations
+        objects[survivor].relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
+        objects[absorbed].relocations = []
+    return cast("list[ObjectRecord]", objects)
+
+
+def _runs(moment: Moment) -> list[RunRecord]:
+    records: list[RunRecord] = []
+    for seen in moment.deltas("run"):
+        if seen.run == len(records):
+            records.append(RunRecord(seen.run, seen.run_id, seen.started_at))
+        records[seen.run].started_at = seen.started_at
+    counts = np.bincount(moment.column("keyframe", "run"), minlength=len(records))
+    for record, count in zip(records, counts.tolist(), strict=True):
+        record.keyframe_count = count
+    return records
+
+
+def _adjacency(moment: Moment) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
+    a, b = (moment.column("linked", each).astype(np.int64) for each in ("a", "b"))
+    pairs = a << 32 | b
+    _, first = np.unique(pairs, return_index=True)
+    _, last = np.unique(pairs[::-1], return_index=True)  # both in the order of the pairs
+    rows = (len(pairs) - 1 - last)[np.argsort(first)]
+    counts = moment.column("linked", "shared_transitions")[rows].tolist()
+    found = zip(a[rows].tolist(), b[rows].tolist(), counts, strict=True)
+    return {(PlaceOrdinal(a), PlaceOrdinal(b)): count for a, b, count in found if count}
+
+
+def _floors(moment: Moment) -> list[str]:
+    """The named floors in the order of their first keyframes."""
+    codes, strings = moment.tables.codes("keyframe", "floor", moment.count("keyframe"))
+    named = codes[codes >= 0]
+    _, first = np.unique(named, return_index=True)
+    return list(dict.fromkeys(strings[code] for code in named[np.sort(first)].tolist()))
+
+
+def _skipped(moment: Moment) -> dict[str, int]:
+    codes, strings = moment.tables.codes("skipped", "kind", moment.count("skipped"))
+    kinds, counts = np.unique(codes, return_counts=True)
+    found: dict[str, int] = {}
+    for code, count in zip(kinds.tolist(), counts.tolist(), strict=True):
+        found[strings[code]] = found.get(strings[code], 0) + count
+    return found

@@ -1,7 +1,7 @@
 """The tables of a history: stripes end to end, looked up by row.
 
 Numbers are read as whole columns, which are put together from the stripes when first used, texts by
-the span of rows. A stripe may lie in a file (`projections.store.part_file`), whose arrays raise
+the span of rows. A stripe may lie in a file (`projections.store.kept_files`), whose arrays raise
 `DamagedPart` when their checksum does not match; then the stripes are made again from the log and
 the look-up is repeated. The same log gives the same rows, so what was read before still holds.
 
@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
-from .columns import NONE, TABLES, Array, Stripe
+from .columns import NONE, TABLES, Array, Stripe, deltas_of
 
 Rows = NDArray[np.int64]
 _T = TypeVar("_T")
 _MANY: Final = 4_000
 _AT_ONCE: Final = 65_536
+_INDEX_BITS: Final = 32
 
 
 class DamagedPart(Exception):
@@ -78,7 +79,7 @@ class Tables:
             lambda: [
                 text
                 for stripe, a, b in self._spans(table, first, last)
-                for text in stripe.texts(table, column, a, b)
+                for text in stripe.texts(table, column, slice(a, b))
             ]
         )
 
@@ -98,21 +99,29 @@ class Tables:
             self._groups[key] = Groups(self.column(table, column))
         return self._groups[key]
 
-    def rows(self, table: str, first: int, last: int) -> list[tuple[Any, ...]]:
-        """The rows from ``first`` to before ``last``, each with all its columns in order."""
-        return list(zip(*self.lists(table, first, last), strict=True))
+    def as_of(self, table: str, column: str, things: Rows, ends: Rows) -> Rows:
+        """For each of ``things`` the last row about it, by ``column``, of the events below its end;
+        -1 for none."""
+        counts = np.searchsorted(self.column(table, "offset"), ends)
+        return self.group(table, column).last(things, counts)
+
+    def deltas(self, table: str, first: int = 0, last: int | None = None) -> list[Any]:
+        """The rows from ``first`` to before ``last`` as deltas; to the end for None."""
+        stop = self.count(table) if last is None else last
+        return deltas_of(table, self.lists(table, first, stop), range(first, stop))
+
+    def deltas_at(self, table: str, numbers: Array) -> list[Any]:
+        """These rows as deltas."""
+        columns = self._with_repair(lambda: self._lists_at(table, numbers))
+        return deltas_of(table, columns, numbers.tolist())
 
     def lists(self, table: str, first: int, last: int) -> list[list[Any]]:
-        """The same rows as a list for each column."""
+        """The rows from ``first`` to before ``last`` as a list for each column, in order."""
         found = self._with_repair(lambda: self._lists(table, first, last))
         self._unreleased += last - first
         if self._unreleased >= _MANY:  # so that reading all rows does not fill memory
             self._release()
         return found
-
-    def rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
-        """These rows, each with all its columns in order."""
-        return self._with_repair(lambda: self._rows_at(table, numbers))
 
     def _before(self, table: str, end: Offset) -> int:
         count = 0
@@ -147,26 +156,28 @@ class Tables:
     def _lists(self, table: str, first: int, last: int) -> list[list[Any]]:
         found: list[list[Any]] = [[] for _ in TABLES[table]]
         for stripe, a, b in self._spans(table, first, last):
-            for column, values in zip(found, _stripe_lists(stripe, table, a, b), strict=True):
+            for column, values in zip(found, stripe.lists(table, slice(a, b)), strict=True):
                 column += values
         return found
 
-    def _rows_at(self, table: str, numbers: Array) -> list[tuple[Any, ...]]:
-        """`rows_at`; of each stripe only the requested rows are read."""
+    def _lists_at(self, table: str, numbers: Array) -> list[list[Any]]:
+        """The columns of these rows; of each stripe only the requested rows are read."""
         stripes = self.stripes
         bounds = np.cumsum([0, *(stripe.rows.get(table, 0) for stripe in stripes)])
         within = np.searchsorted(bounds, numbers, "right") - 1
-        found: list[tuple[Any, ...]] = []
+        found: list[list[Any]] = [[] for _ in TABLES[table]]
         places: list[Array] = []
         for index in np.unique(within).tolist():
             here = np.flatnonzero(within == index)
-            found += _picked(stripes[index], table, numbers[here] - bounds[index])
+            rows = numbers[here] - bounds[index]
+            for column, values in zip(found, stripes[index].lists(table, rows), strict=True):
+                column += values
             places.append(here)
             self._release()
         if len(places) < 2:
             return found
         order = np.argsort(np.concatenate(places)).tolist()
-        return [found[place] for place in order]
+        return [[column[place] for place in order] for column in found]
 
     def _codes(self, table: str, column: str, count: int | None) -> tuple[Array, list[str]]:
         strings: list[str] = []
@@ -213,6 +224,7 @@ class Groups:
         self._order = order if items is None else items[order]
         counts = np.bincount(values) if len(values) else _NOTHING
         self._ends = np.concatenate([[0], np.cumsum(counts)])
+        self._keys: Rows | None = None
 
     def __getitem__(self, value: int) -> Array:
         """The items with this value, in order."""
@@ -220,37 +232,17 @@ class Groups:
             return self._order[:0]
         return self._order[self._ends[value] : self._ends[value + 1]]
 
-
-def _stripe_lists(stripe: Stripe, table: str, first: int, last: int) -> Iterator[list[Any]]:
-    for column, kind in TABLES[table].items():
-        if kind in ("text", "code"):
-            yield stripe.texts(table, column, first, last)
-        else:
-            yield _values(stripe.arrays[f"{table}.{column}"][first:last], kind)
-
-
-def _picked(stripe: Stripe, table: str, rows: Array) -> list[tuple[Any, ...]]:
-    """The rows of a stripe with these indices."""
-    columns: list[Any] = []
-    for column, kind in TABLES[table].items():
-        if kind == "text":
-            columns.append([stripe.text(table, column, row) for row in rows.tolist()])
-        elif kind == "code":
-            strings = [*stripe.strings, None]
-            codes = stripe.arrays[f"{table}.{column}"][rows].tolist()
-            columns.append([strings[code] for code in codes])
-        else:
-            columns.append(_values(stripe.arrays[f"{table}.{column}"][rows], kind))
-    return list(zip(*columns, strict=True))
-
-
-def _values(array: Array, kind: str) -> list[Any]:
-    if kind == "flag":
-        array = array.astype(np.bool_)
-    values: list[Any] = array.tolist()
-    if kind == "number?":
-        return [None if value == NONE else value for value in values]
-    return values
+    def last(self, values: Rows, limits: Rows) -> Rows:
+        """For each value its last item that is below a limit; -1 for none. Items must ascend."""
+        if not len(self._order):
+            return np.full(len(values), NONE, np.int64)
+        if self._keys is None:
+            of = np.repeat(np.arange(len(self._ends) - 1), np.diff(self._ends))
+            self._keys = of << _INDEX_BITS | self._order
+        place = np.searchsorted(self._keys, values << _INDEX_BITS | limits) - 1
+        found = self._keys[place]  # the last one where it is -1, which is of another value or none
+        is_one = (place >= 0) & (found >> _INDEX_BITS == values)
+        return np.where(is_one, found & (1 << _INDEX_BITS) - 1, NONE)
 
 
 def last_rows(values: Array, size: int) -> Rows:

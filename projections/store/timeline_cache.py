@@ -46,8 +46,7 @@ from projections.map.digest import VERSION
 from projections.map.own_events import with_vectors
 
 from .columns import Stripe, joined_short
-from .part_file import FORMAT, Part, Unwritable, write_part
-from .state_file import MalformedState, pack, unpack
+from .kept_files import FORMAT, MalformedState, Part, Unwritable, pack, unpack, write_part
 from .tables import DamagedPart
 
 FOLD_VERSION: Final = 5

@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.history.explanation import explain_object
+from projections.history.object_explanation import explain_object
 from projections.map.digest import map_digest
 from projections.map.export import state_document
 from projections.map.fold import fold_log

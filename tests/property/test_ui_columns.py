@@ -19,8 +19,8 @@ from projections.map.fold import fold_events, fold_log
 from projections.map.own_events import read_corrections
 from projections.map.view import MapView
 from projections.surfaces.ui.binary import packed_arrays
-from projections.surfaces.ui.columns import history_columns
 from projections.surfaces.ui.log_map import LogMap
+from projections.surfaces.ui.map_answers import history_columns
 from projections.surfaces.ui.opened import Opened
 from tests.support.logs import write_log
 from tests.support.thorough import rounds

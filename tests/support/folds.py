@@ -15,7 +15,7 @@ from projections.fold.deltas import Delta
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.view import MapView
-from projections.store.state_file import pack, unpack
+from projections.store.kept_files import pack, unpack
 
 from .envelopes import payload
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from msgspec.structs import astuple, replace
+from msgspec.structs import replace
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
@@ -32,18 +32,16 @@ from projections.map.export import state_document, state_text
 from projections.map.fold import fold_events
 from projections.map.own_events import new_map
 from projections.map.records import (
-    Estimate,
     KeyframeRecord,
     ObjectRecord,
     ObservationRecord,
     PlaceRecord,
-    Relocation,
     RunRecord,
 )
 from projections.map.view import MapView
 from projections.store.history import History
-from projections.store.records import ObjectHistory, count_before, last_before
-from tests.support.memory_history import MemoryHistory
+from projections.store.records import count_before, last_before
+from tests.support.memory_history import MemoryHistory, object_of
 
 
 class KnownInMemory(KnownHistory):
@@ -310,7 +308,7 @@ def _observations(history: History, latest: MapView, end: Offset) -> list[Observ
 
 def _objects(history: History, end: Offset) -> list[ObjectRecord]:
     count = bisect_left(history.objects, end, key=lambda o: o.found.offset)
-    records = [_object(each, end) for each in history.objects[:count]]
+    records = [object_of(each, end) for each in history.objects[:count]]
     for merge in history.object_merges:
         if merge.offset < end:
             survivor, absorbed = records[merge.survivor], records[merge.absorbed]
@@ -320,27 +318,6 @@ def _objects(history: History, end: Offset) -> list[ObjectRecord]:
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.relocations = []
     return records
-
-
-def _object(history: ObjectHistory, end: Offset) -> ObjectRecord:
-    found, seen = history.found, history.sightings[: count_before(history.sightings, end)]
-    record = ObjectRecord(found.object, found.object_id, history.class_name(end))
-    record.observations = [delta.observation for delta in seen]
-    if (last := history.values(end)) is not None:
-        record.obs_count = last.obs_count
-        record.sum_x_um, record.sum_y_um = last.sum_x_um, last.sum_y_um
-        record.first_seen, record.last_seen = last.first_seen, last.last_seen
-    record.place = history.place(end)
-    if (estimated := last_before(history.estimates, end)) is not None:
-        _, _, *values = astuple(estimated)
-        record.estimate = Estimate(*values)
-    if (looked := history.looked_for(end)) is not None:
-        record.misses = looked.misses
-        record.missing_in = looked.run if looked.missing else None
-    for moved in history.relocations[: count_before(history.relocations, end)]:
-        offset, _, *values = astuple(moved)
-        record.relocations.append(Relocation(offset, *values))
-    return record
 
 
 def _runs(history: History, keyframes: list[KeyframeRecord], end: Offset) -> list[RunRecord]:

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from msgspec.structs import astuple
 
 from eventsrc.envelope.model import FIRST_OFFSET, KeyframeId, Offset, RunId
 from projections.fold import packed
@@ -38,8 +39,8 @@ from projections.fold.deltas import (
     RunSeen,
 )
 from projections.fold.settings import Settings
-from projections.store.history import History
-from projections.store.history_rows import NEVER, NO_PLACE
+from projections.map.records import Estimate, ObjectRecord, Relocation
+from projections.store.history import NEVER, NO_PLACE, History
 from projections.store.neighbours import Neighbours, Posed
 from projections.store.records import (
     Cause,
@@ -48,8 +49,10 @@ from projections.store.records import (
     ObjectHistory,
     ObjectMerge,
     PlaceHistory,
-    Refusal,
+    RefusedMerge,
     cause_of,
+    count_before,
+    last_before,
 )
 
 
@@ -73,7 +76,7 @@ class MemoryHistory(History):
         self.places: list[PlaceHistory] = []
         self.objects: list[ObjectHistory] = []
         self.merges: list[Merge] = []
-        self.refusals: list[Refusal] = []
+        self.refusals: list[RefusedMerge] = []
         self.object_merges: list[ObjectMerge] = []
         self.runs: list[list[RunSeen]] = []
         self.skipped: list[EventSkipped] = []
@@ -129,6 +132,14 @@ class MemoryHistory(History):
         added = self.keyframes[number : number + 1]
         return cause_of(offset, [k for k in added if k.offset == offset])
 
+    def object_at(self, found: ObjectOrdinal, end: Offset) -> ObjectRecord:
+        """What an object is after the events below ``end``."""
+        return object_of(self.objects[found], end)
+
+    def objects_at(self, end: Offset) -> list[ObjectRecord]:
+        """`object_at` of all objects found by the events below ``end``."""
+        return [object_of(each, end) for each in self.objects if each.found.offset < end]
+
     def _run_seen(self, delta: RunSeen, _: Cause) -> None:
         if delta.run == len(self.runs):
             self.runs.append([])
@@ -163,7 +174,7 @@ class MemoryHistory(History):
         self.places[delta.place].names.append(delta)
 
     def _merge_refused(self, delta: MergeRefused, cause: Cause) -> None:
-        refused = Refusal(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
+        refused = RefusedMerge(cause, delta.a, delta.b, delta.bridge, delta.link, delta.apart)
         self.refusals.append(refused)
 
     def _objects_merged(self, delta: ObjectsMerged, cause: Cause) -> None:
@@ -257,3 +268,34 @@ def posed(keyframes: Sequence[KeyframeAdded]) -> Posed:
         np.array([(at.x_um, at.y_um) for _, at in found], np.int64).reshape(-1, 2),
         np.array([names.setdefault(k.floor, len(names)) for k, _ in found], np.int64),
     )
+
+
+def object_of(history: ObjectHistory, end: Offset) -> ObjectRecord:
+    """What an object is after the events below ``end``, by its deltas one by one."""
+    found, seen = history.found, history.sightings[: count_before(history.sightings, end)]
+    record = ObjectRecord(found.object, found.object_id, found.class_name)
+    if (classified := last_before(history.classes, end)) is not None:
+        record.class_name = classified.class_name
+    record.observations = [delta.observation for delta in seen]
+    last: ObjectSeen | ObjectsMerged | None = seen[-1] if seen else None
+    merged = last_before(history.merges, end)
+    if merged is not None and not (last and last.obs_count > merged.values.obs_count):
+        last = merged.values
+    if last is not None:
+        record.obs_count = last.obs_count
+        record.sum_x_um, record.sum_y_um = last.sum_x_um, last.sum_y_um
+        record.first_seen, record.last_seen = last.first_seen, last.last_seen
+    if (moved := last_before(history.moves, end)) is not None:
+        record.place = moved.place
+    if (estimated := last_before(history.estimates, end)) is not None:
+        _, _, *values = astuple(estimated)
+        record.estimate = Estimate(*values)
+    again = last_before(history.relocations, end)
+    looked = last_before(history.misses, end)
+    if looked is not None and not (again and again.offset > looked.offset):
+        record.misses = looked.misses
+        record.missing_in = looked.run if looked.missing else None
+    for each in history.relocations[: count_before(history.relocations, end)]:
+        offset, _, *values = astuple(each)
+        record.relocations.append(Relocation(offset, *values))
+    return record

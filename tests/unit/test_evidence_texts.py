@@ -9,8 +9,9 @@ from eventsrc.envelope.model import Offset
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.history.diff import difference_of
-from projections.history.explanation import Explanation, explain_object
+from projections.history.explanation import Explanation
 from projections.history.merges import object_merge_document
+from projections.history.object_explanation import explain_object
 from projections.history.rendering import difference_text, explanation_text, object_merges_text
 from projections.map.view import MapView
 from tests.support.memory_history import MemoryHistory

@@ -10,7 +10,7 @@ import pytest
 
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.store.state_file import MAGIC, MalformedState, pack, unpack
+from projections.store.kept_files import MAGIC, MalformedState, pack, unpack
 from projections.store.timeline_cache import MISFITS
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import Folded, state_bytes

@@ -26,7 +26,6 @@ from eventsrc.envelope.model import Offset
 from projections.surfaces.serve.answering import TooMuchError
 from projections.surfaces.serve.http import add_openapi, only, read_body
 
-from .answers import digest_answer, history_answer, walls_answer
 from .binary import encoded
 from .comparisons import (
     WHATIF_OPTIONS,
@@ -41,6 +40,7 @@ from .edits import Editor, corrections_answer, read_edit
 from .live import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
+from .map_answers import digest_answer, history_answer, walls_answer
 from .requests import assignments_of, refusal
 from .search import keyframe_answer, search_answer
 from .service import GoOn, UiService

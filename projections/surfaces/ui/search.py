@@ -44,8 +44,10 @@ def _places(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
 
 
 def _objects(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
-    for each in moment.known.history.objects:
-        class_name = each.class_name(moment.end)
+    history = moment.known.history
+    classes = {each.ordinal: each.class_name for each in history.objects_at(moment.end)}
+    for each in history.objects:
+        class_name = classes.get(each.found.object, each.found.class_name)
         yield {
             "kind": "object", "id": each.object_id, "number": each.found.object,
             "offset": each.found.offset, "stands": each.stands(moment.end), "text": class_name,

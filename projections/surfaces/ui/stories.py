@@ -15,7 +15,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal
 from projections.fold.errors import QuestionError
 from projections.history import NoSuchThing
-from projections.history.explanation import Entry, Explanation
+from projections.history.explanation import Entry, Explanation, explain_same_place
 from projections.history.merges import (
     chains_of,
     merge_document,
@@ -30,9 +30,8 @@ from projections.history.rendering import (
     object_merges_text,
     refusals_text,
 )
-from projections.history.same_place import explain_same_place
 from projections.store.history import History
-from projections.store.records import Merge, ObjectMerge, Refusal
+from projections.store.records import Merge, ObjectMerge, RefusedMerge
 
 from .log_map import LogMap
 from .moment import Moment
@@ -95,7 +94,9 @@ def _summary(history: History, merges: list[Merge]) -> str:
     )
 
 
-def _other_summary(history: History, refusals: list[Refusal], objects: list[ObjectMerge]) -> str:
+def _other_summary(
+    history: History, refusals: list[RefusedMerge], objects: list[ObjectMerge]
+) -> str:
     """The summary of an event that merged no places."""
     refused = [
         f"{place_name(history, each.a)} and {place_name(history, each.b)} did not merge: refused"

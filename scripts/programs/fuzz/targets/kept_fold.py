@@ -8,7 +8,7 @@ from contextlib import suppress
 
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.store.state_file import MAGIC, unpack
+from projections.store.kept_files import MAGIC, unpack
 from projections.store.timeline_cache import MISFITS
 from scripts.programs.attack.corruption import corrupt_bytes, corrupt_json
 from scripts.programs.fuzz.target import Target
