@@ -32,7 +32,7 @@ from prometheus_client.registry import Collector
 from eventsrc.base.errors import TransportError
 
 if TYPE_CHECKING:
-    from .recorder import RecorderReport
+    from .recorder.writer_thread import RecorderReport
 
 SILENT_S: Final = 5.0
 MAX_CONNECTIONS: Final = 16

@@ -11,7 +11,7 @@ completed it. So readers of the log need no ROS types, and get the same numbers 
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any, Final, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -153,10 +153,8 @@ class LoggedEvent(Protocol):
     def payload(self) -> bytes: ...
 
 
-class MessageOf(Protocol):
-    """Returns type and definition of an event that is a ROS message in CDR, None for others."""
-
-    def __call__(self, event: Any, /) -> tuple[str, str] | None: ...
+MessageOf = Callable[[Any], tuple[str, str] | None]
+"""Returns type and definition of an event that is a ROS message in CDR, None for others."""
 
 
 class DerivedFrom(NamedTuple):

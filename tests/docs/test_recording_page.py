@@ -12,8 +12,8 @@ from eventsrc.envelope.model import MAX_DEPTH_M, MAX_POSITION_M
 from eventsrc.envelope.occupancy_map import decode_map
 from eventsrc.envelope.readers import DetectionModel, EnvelopeCamera, EnvelopeModel
 from eventsrc.record.metrics import serving_metrics
-from eventsrc.record.recorder import DEFAULT_QUEUE_SIZE, RecorderReport
-from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES
+from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES, DEFAULT_QUEUE_SIZE
+from eventsrc.record.recorder.writer_thread import RecorderReport
 from eventsrc.record.robot.publisher import WINDOW
 from eventsrc.record.robot.spool import DEFAULT_SPOOL_BYTES
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT

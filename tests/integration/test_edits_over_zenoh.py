@@ -23,7 +23,6 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import RunId
 from eventsrc.envelope.system_events import COMMAND_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import Event, LogReader, LogWriter
-from eventsrc.record.recorder import Recorder
 from eventsrc.record.recorder.edits import (
     MAX_EDITS_WAITING,
     CommandRefused,
@@ -37,6 +36,7 @@ from eventsrc.record.recorder.edits import (
     send_command,
 )
 from eventsrc.record.recorder.queue import MessageQueue
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Received, Session
 from projections.fold.corrections import check_settings
 from tests.support.envelopes import envelope, payload

@@ -16,7 +16,7 @@ from eventsrc.envelope.system_events import EXCERPT_BYTES, REJECTED_KEY, Rejecte
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.record.append import append_payload
 from eventsrc.record.log_info import log_info
-from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.robot.acks import Refusal, Refusals, payload_sha256, refusal_key
 from eventsrc.record.transport.session import Received, Session
 from tests.support.envelopes import envelope, payload

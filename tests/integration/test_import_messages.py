@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from eventsrc.record.importers import ImportInterrupted, ImportReport, import_files
+from eventsrc.record.importers.run import ImportInterrupted, ImportReport, import_files
 from projections.surfaces.cli.signals import ctrl_c_between_steps
 from tests.support.commands import PROGRAM, TIMEOUT_S, Commands
 from tests.support.envelopes import envelope, payload

@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.base.errors import TransportError
 from eventsrc.record.metrics import MAX_CONNECTIONS, serving_metrics
-from eventsrc.record.recorder import RecorderReport
+from eventsrc.record.recorder.writer_thread import RecorderReport
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_zenoh import Program, scrape
 from tests.support.http_attacks import answer, ask, connect

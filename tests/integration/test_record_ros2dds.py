@@ -11,8 +11,8 @@ import pytest
 
 from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, ROS_KEY
 from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, verify_log
-from eventsrc.record.importers import import_files
 from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.bridged import topic_of
 from eventsrc.record.recorder.queue import BridgedMessage
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session

@@ -15,9 +15,9 @@ from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss, Reject
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.append import append_payload
 from eventsrc.record.gap_history import ledger_of, save_ledger
-from eventsrc.record.recorder import Recorder
 from eventsrc.record.recorder.checking import Batch, Checker
 from eventsrc.record.recorder.queue import MessageQueue
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.recorder.writer_thread import WriterThread
 from eventsrc.record.robot.acks import (
     MAX_PER_ACK,

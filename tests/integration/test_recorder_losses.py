@@ -12,8 +12,9 @@ from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS, Gap
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import FsyncPolicy, LogReader, LogWriter
 from eventsrc.record.gap_history import ledger_of
-from eventsrc.record.recorder import Recorder, RecorderReport
 from eventsrc.record.recorder.queue import SequenceGaps
+from eventsrc.record.recorder.recorder import Recorder
+from eventsrc.record.recorder.writer_thread import RecorderReport
 from eventsrc.record.robot.acks import MAX_SENT_BYTES, Sent, sent_key
 from eventsrc.record.transport.session import Session
 from tests.support.envelopes import envelope, keyframe_payloads, payload

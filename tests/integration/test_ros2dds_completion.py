@@ -10,11 +10,11 @@ from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
 from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, VerbatimEvent, verify_log
 from eventsrc.record.gap_history import ledger_of
-from eventsrc.record.importers import import_files
-from eventsrc.record.recorder import Recorder
+from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.bridged import Bridge, append_missing, message_of
 from eventsrc.record.recorder.checking import Checker
 from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording, derive, read_recording
 from projections.surfaces.cli.bridged import recording_of

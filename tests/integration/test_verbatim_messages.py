@@ -25,7 +25,7 @@ from eventsrc.log import (
 from eventsrc.log.format import list_segments
 from eventsrc.log.seek import resolve, resolve_start
 from eventsrc.record.gap_history import fold_ledger
-from eventsrc.record.importers import import_files
+from eventsrc.record.importers.run import import_files
 from eventsrc.record.log_info import log_info
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest

@@ -12,7 +12,7 @@ from eventsrc.base.errors import LogDamaged, LogError
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.format import ACTIVE, SEALED, SEALED_END, head_metadata, segment_path
-from eventsrc.record.importers import import_files
+from eventsrc.record.importers.run import import_files
 from tests.support.commands import Commands
 from tests.support.fixtures_log import KEY, envelope, read_log
 from tests.support.rewriting import plainly_read, rewrite

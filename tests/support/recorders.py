@@ -13,7 +13,8 @@ from pathlib import Path
 from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import ledger_of
-from eventsrc.record.recorder import Recorder, RecorderReport
+from eventsrc.record.recorder.recorder import Recorder
+from eventsrc.record.recorder.writer_thread import RecorderReport
 from eventsrc.record.robot.acks import Ack, payload_sha256
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session, ZenohOptions

@@ -9,8 +9,8 @@ from typing import Any
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 from eventsrc.record.gap_history import ledger_of
-from eventsrc.record.recorder import Recorder
 from eventsrc.record.recorder.bridged import Bridge, message_of, topic_of
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.derivation import derive

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from eventsrc.record.recorder import RecorderReport
+from eventsrc.record.recorder.writer_thread import RecorderReport
 from projections.surfaces.cli.recorder_text import RecorderStatus, summary
 
 NOTHING = RecorderReport(

@@ -31,7 +31,7 @@ from eventsrc.base.text import visible
 from eventsrc.base.user_files import FileFault, open_file
 from eventsrc.envelope.cdr import CdrFault, CdrFields, is_cdr
 from eventsrc.envelope.model import MAX_TIMESTAMP_S
-from eventsrc.record.transport.session import Received, SequenceNumber, Session, SizeLimit
+from eventsrc.record.transport.session import Received, Session, SizeLimit
 
 from .picture import (
     JPEG_START,
@@ -229,6 +229,10 @@ class NewestQueue:
             self._waiting.append((message, received_s))
             self._filled.notify()
 
+    def refuse(self) -> None:
+        """Count a picture that is too large."""
+        self.too_large += 1
+
     def close(self) -> None:
         """Drop the pictures in the queue."""
         with self._filled:
@@ -259,13 +263,21 @@ class LivePictures:
     ) -> None:
         self._stop, self._clock = stop, clock
         self.queue = NewestQueue(queue)
-        self.poses = LivePoses() if pose_key is not None else None
-        if self.poses is not None and pose_key is not None:
-            limit = SizeLimit(_MAX_POSE_BYTES, self._refuse_pose)
-            session.subscribe(pose_key, self._on_pose, limit)
+        self.poses: LivePoses | None = None
+        if pose_key is not None:
+            poses = self.poses = LivePoses()
+            too_large = f"a message of more than {_MAX_POSE_BYTES:,} bytes"
+            session.subscribe(
+                pose_key,
+                lambda message: poses.put(message.payload, self._now_s()),
+                SizeLimit(_MAX_POSE_BYTES, lambda: poses.refuse(too_large)),
+            )
         if image_key is not None:
-            limit = SizeLimit(MAX_PICTURE_BYTES, self._refuse_picture)
-            session.subscribe(image_key, self._on_picture, limit)
+            session.subscribe(
+                image_key,
+                lambda message: self.queue.put(message, self._now_s()),
+                SizeLimit(MAX_PICTURE_BYTES, self.queue.refuse),
+            )
         session.confirm()
 
     def __iter__(self) -> Iterator[Picture]:
@@ -285,20 +297,6 @@ class LivePictures:
 
     def _now_s(self) -> float:
         return self._clock() / 1e9
-
-    def _on_picture(self, message: Received) -> None:
-        self.queue.put(message, self._now_s())
-
-    def _on_pose(self, message: Received) -> None:
-        if self.poses is not None:
-            self.poses.put(message.payload, self._now_s())
-
-    def _refuse_pose(self, _key: str, _number: SequenceNumber | None) -> None:
-        if self.poses is not None:
-            self.poses.refuse(f"a message of more than {_MAX_POSE_BYTES:,} bytes")
-
-    def _refuse_picture(self, _key: str, _number: SequenceNumber | None) -> None:
-        self.queue.too_large += 1
 
 
 _CHANNELS: Final[Mapping[str, int]] = {"bgr8": 3, "rgb8": 3, "8UC3": 3, "mono8": 1, "8UC1": 1}

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from eventsrc.base.errors import MapfoldError
@@ -186,10 +186,9 @@ def _report(name: str, contents: BagContents, choice: Choice) -> BagReport:
 def _refused(
     payload: bytes | Excerpt, topic: str, received_ns: int, reason: str
 ) -> ImportedMessage:
-    message = ImportedMessage(b"", _key(topic), received_ns, refused=f"{topic}: {reason}")
-    if isinstance(payload, Excerpt):
-        return replace(message, excerpt=payload)
-    return replace(message, payload=payload)
+    kept, excerpt = (b"", payload) if isinstance(payload, Excerpt) else (payload, None)
+    refused = f"{topic}: {reason}"
+    return ImportedMessage(kept, _key(topic), received_ns, refused=refused, excerpt=excerpt)
 
 
 def _key(topic: str) -> str:

@@ -351,26 +351,18 @@ def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -
         return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
     if Path(name).name == METADATA:
         raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
+    file: BinaryIO
     try:
-        file, size = _open_file(name, files)
-        start = _peek(file)
+        if name == STDIN:
+            label, file, size = "standard input", sys.stdin.buffer, None
+        else:
+            path, label = Path(name), name
+            file, size = files.enter_context(path.open("rb")), path.stat().st_size
+        start: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
     except OSError as error:
         raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
-    label = "standard input" if name == STDIN else name
     if name != STDIN and is_file_of_a_bag(start):
         return RosBag(Path(name), files, bags)
     if start.startswith(MCAP_MAGIC):
         return McapFile(label, file, size)
     return JsonLines(label, file, size, start)
-
-
-def _open_file(name: str, files: ExitStack) -> tuple[BinaryIO, int | None]:
-    if name == STDIN:
-        return sys.stdin.buffer, None
-    path = Path(name)
-    return files.enter_context(path.open("rb")), path.stat().st_size
-
-
-def _peek(file: BinaryIO) -> bytes:
-    data: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
-    return data

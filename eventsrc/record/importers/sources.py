@@ -1,10 +1,9 @@
 """Messages to import and what gives them: their topics and log times, MCAP files, other logs."""
 
-import re
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from fnmatch import translate
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -88,21 +87,20 @@ class TopicChoice:
     ``*`` matches any characters, also ``/``."""
 
     patterns: tuple[str, ...] = ()
-    _expressions: list[re.Pattern[str]] = field(default_factory=list, compare=False)
 
     @classmethod
     def of(cls, patterns: Sequence[str]) -> "TopicChoice":
         """The choice by these patterns. Raises MisuseError for an empty one."""
         if not all(patterns):
             raise MisuseError("--topic is empty; give a topic, or a pattern such as 'tb/*'")
-        return cls(tuple(patterns), [re.compile(translate(pattern)) for pattern in patterns])
+        return cls(tuple(patterns))
 
     def __bool__(self) -> bool:
         return bool(self.patterns)
 
     def takes(self, topic: str) -> bool:
         """Whether messages of ``topic`` are imported."""
-        return not self._expressions or any(e.match(topic) for e in self._expressions)
+        return not self.patterns or any(fnmatchcase(topic, each) for each in self.patterns)
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ class Recorder:
             bridge=bridge,
         )
         # A larger announcement is ignored, as is one that cannot be read: it is no event.
-        sent_limit = SizeLimit(MAX_SENT_BYTES, lambda _key, _number: None)
+        sent_limit = SizeLimit(MAX_SENT_BYTES, lambda: None)
         self._subscriptions = [
             subscription
             for key in keys

@@ -132,11 +132,10 @@ class Received(msgspec.Struct, frozen=True, gc=False):
 
 
 class SizeLimit(NamedTuple):
-    """Messages over ``size_bytes`` are not received; ``refuse`` is called with the key of each and
-    its publisher's number, if it has one."""
+    """Messages over ``size_bytes`` are not received; ``refuse`` is called for each."""
 
     size_bytes: int
-    refuse: Callable[[str, SequenceNumber | None], None]
+    refuse: Callable[[], None]
 
 
 class Query:

@@ -93,7 +93,7 @@ class Session:
         def receive(sample: zenoh.Sample) -> None:
             payload = sample.payload  # each access makes a new object
             if limit is not None and len(payload) > limit.size_bytes:
-                limit.refuse(str(sample.key_expr), sequence_number(sample))
+                limit.refuse()
             else:
                 key = str(sample.key_expr)
                 handler(Received(key, payload.to_bytes(), sequence_number(sample)))

@@ -12,7 +12,8 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.label_files import read_label_file
 from eventsrc.base.text import counted, visible
-from eventsrc.record.importers import BagOptions, BagReport
+from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
 _PANEL: Final = "Bags of ROS 2"

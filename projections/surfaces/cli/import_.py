@@ -14,18 +14,17 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import fold_and_save_ledger
-from eventsrc.record.importers import (
+from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.map_yaml import read_map_yaml
+from eventsrc.record.importers.run import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
-    BagOptions,
     ImportInterrupted,
     ImportReport,
-    TopicChoice,
     check_sources,
     import_files,
 )
-from eventsrc.record.importers.map_yaml import read_map_yaml
-from eventsrc.record.importers.sources import NOT_CHOSEN, Source
+from eventsrc.record.importers.sources import NOT_CHOSEN, Source, TopicChoice
 from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines

@@ -17,7 +17,8 @@ from eventsrc.base.errors import LogError
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogWriter
-from eventsrc.record.recorder import Recorder, RecorderReport
+from eventsrc.record.recorder.recorder import Recorder
+from eventsrc.record.recorder.writer_thread import RecorderReport
 
 from .terminal import emit, finish, people, say
 

@@ -15,8 +15,9 @@ from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTE
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.record.gap_history import fold_and_save_ledger
-from eventsrc.record.recorder import DEFAULT_CROPS, DEFAULT_KEYS, DEFAULT_QUEUE_SIZE, Recorder
 from eventsrc.record.recorder.edits import EDIT_PREFIX, Edits, KnownCommands, edit_key
+from eventsrc.record.recorder.queue import DEFAULT_QUEUE_SIZE
+from eventsrc.record.recorder.recorder import DEFAULT_CROPS, DEFAULT_KEYS, Recorder
 from eventsrc.record.transport.config import parse_address
 from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes

@@ -12,8 +12,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from eventsrc.log import LogWriter
-from eventsrc.record.importers import BagOptions, import_files
+from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.ros_bags import RosBag
+from eventsrc.record.importers.run import import_files
 from tests.support.ros_bags import STORAGES, Drive, write_bag
 
 GOAL = 5_000

@@ -14,7 +14,7 @@ from pathlib import Path
 from eventsrc.log import LogWriter
 from eventsrc.log.durable_files import FsyncPolicy
 from eventsrc.record.log_info import log_info
-from eventsrc.record.recorder import Recorder
+from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from tests.support.commands import UnusedCpu, cpu_seconds, unused_cpu
 

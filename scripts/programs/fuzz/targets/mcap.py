@@ -9,7 +9,7 @@ from mcap.writer import CompressionType, Writer
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.log import NEVER, LogReader, LogWriter
-from eventsrc.record.importers import import_files
+from eventsrc.record.importers.run import import_files
 from scripts.programs.fuzz.mcap_mutation import mutate_mcap
 from scripts.programs.fuzz.scratch import scratch
 from scripts.programs.fuzz.target import Target, check_message
