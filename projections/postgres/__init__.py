@@ -1,8 +1,7 @@
 """Write the map of a log into the databases: once (`rebuild`) or as the log grows (`tail`)."""
 
-from .foreign_embedding import ForeignEmbedding
-from .rebuild import RebuildProgress, RebuildReport, rebuild
-from .tail import tail
+from .live_tail import tail
+from .rebuild import ForeignEmbedding, RebuildProgress, RebuildReport, rebuild
 from .tail_progress import TailProgress, TailReport
 
 __all__ = [

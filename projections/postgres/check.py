@@ -37,13 +37,13 @@ from .connection import (
     pin_session_settings,
 )
 from .cypher import PARENTS, refuse_without_age
-from .graph_render import Row, expected_rows
+from .graph_rows import Row, expected_rows
 from .inputs import LogInputs, SettingsOf
 from .labels import GRAPH, LABELS, MAP_TABLE, TABLE, VERTEX_LABELS
 from .live_fold import LiveFold, batches
-from .map_rows import MapRow, map_of, map_rows
+from .map_table import MapRow, map_of, map_rows
 from .origin import command_for, refuse_mismatch, rows_dropped
-from .sink import Checkpoint, SinkName
+from .sink import SINKS, Checkpoint, SinkName
 from .statements import statements
 from .vector_rows import VectorRow, new_rows
 
@@ -111,15 +111,6 @@ NAMED: Final = 100
 """The most differences that are named; all are counted."""
 STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
-_NO_ROWS_TEXT: Final[dict[SinkName, str]] = {"graph": "no graph has", "vectors": "no vectors have"}
-
-_TABLES: Final[dict[SinkName, list[sql.Identifier]]] = {
-    "graph": [
-        *(sql.Identifier(GRAPH, label) for label in LABELS),
-        sql.Identifier("mapfold", MAP_TABLE),
-    ],
-    "vectors": [sql.Identifier("public", TABLE)],
-}
 _VECTORS: Final = """
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
        embedding_model, embedding::real[],
@@ -129,7 +120,7 @@ FROM public.detection_embeddings ORDER BY det_pk
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class RowDifference:
     """A row that is missing, extra or different; ``id`` is its graphid or det_pk."""
 
     table: str
@@ -151,7 +142,7 @@ class CheckReport:
     next_offset: Offset
     rows: int
     differing: int
-    differences: tuple[Difference, ...]
+    differences: tuple[RowDifference, ...]
     foreign: tuple[ForeignTable, ...] = ()
     known_at: Offset | None = None
 
@@ -196,9 +187,10 @@ def _check_sink(
             reader.refresh()  # a tail may have moved the checkpoint since it was opened
             known = LogInputs.read(reader, settings)
             if checkpoint is None:
+                has = "have" if SINKS[sink].is_plural else "has"
                 raise ProjectionMissing(
-                    f"{describe_target(url)}: {_NO_ROWS_TEXT[sink]} been projected there;"
-                    f" run: {command_for('replay', log, known.latest)}"
+                    f"{describe_target(url)}: no {sink} {has} been projected there; run:"
+                    f" {command_for('replay', log, known.latest)}"
                 )
             if not locked:
                 raise rows_dropped(checkpoint, sink, describe_target(url), log, known.latest)
@@ -226,7 +218,7 @@ def _lock_tables(connection: Connection, sink: SinkName) -> bool:
     It must be the transaction's first statement: a snapshot from before a swap sees the new tables
     as empty.
     """
-    tables = sql.SQL(", ").join(_TABLES[sink])
+    tables = sql.SQL(", ").join(sql.Identifier(*table) for table in SINKS[sink].tables)
     try:
         connection.execute(sql.SQL("LOCK TABLE {} IN ACCESS SHARE MODE").format(tables))
     except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
@@ -241,7 +233,7 @@ class _Comparison:
     def __init__(self) -> None:
         self.rows = 0
         self.differing = 0
-        self.differences: list[Difference] = []
+        self.differences: list[RowDifference] = []
 
     def merge(self, table: str, expected: Iterator[Keyed], found: Iterator[Keyed]) -> None:
         want, have = next(expected, None), next(found, None)
@@ -265,7 +257,7 @@ class _Comparison:
         row = want or have
         if row is not None and len(self.differences) < NAMED:
             expected, found = (None if r is None else _shortened(r[1]) for r in (want, have))
-            self.differences.append(Difference(table, row[0], kind, expected, found))
+            self.differences.append(RowDifference(table, row[0], kind, expected, found))
 
 
 def _events(

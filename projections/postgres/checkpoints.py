@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 import psycopg
+from psycopg import sql
 
 from eventsrc.base.advised import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
@@ -14,15 +15,9 @@ from projections.fold.errors import CheckpointMoved, DatabaseError, ProjectionBu
 
 from .connection import Connection, describe_connection
 from .inputs import MapInputs
-from .labels import GRAPH, LABELS, TABLE
-from .sink import Checkpoint, SinkName
+from .sink import SINKS, Checkpoint, SinkName
 from .statements import statements
 
-_LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 1, "vectors": 2}
-_FIRST_TABLES: Final[dict[SinkName, str]] = {
-    "graph": f'{GRAPH}."{LABELS[0]}"',
-    "vectors": f"public.{TABLE}",
-}
 _COMMENT_PREFIX: Final = "mapfold"
 LOCK_GRACE_S: Final = 1.0
 """Wait for the writer's lock: a server takes a moment to notice that the last writer's connection
@@ -42,7 +37,7 @@ class DeadLetter:
 
 def lock_writer(connection: Connection, sink: SinkName) -> None:
     """Lock a sink for writing until the connection ends. Raises ProjectionBusy."""
-    number = {"number": _LOCK_NUMBERS[sink]}
+    number = {"number": SINKS[sink].writer_lock}
     deadline = time.monotonic() + LOCK_GRACE_S
     while True:
         row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
@@ -62,7 +57,7 @@ def lock_writer(connection: Connection, sink: SinkName) -> None:
 
 def writer(connection: Connection, sink: SinkName) -> str | None:
     """Name of the application that holds the sink's lock; None when it is free."""
-    number = {"number": _LOCK_NUMBERS[sink]}
+    number = {"number": SINKS[sink].writer_lock}
     row = connection.execute(statements("checkpoint")["lock_holder"], number).fetchone()
     return None if row is None else str(row[1])
 
@@ -110,9 +105,8 @@ def load(connection: Connection, sink: SinkName) -> Checkpoint | None:
 
 def rows_exist(connection: Connection, sink: SinkName) -> bool:
     """Whether the sink's graph or table still exists."""
-    row = connection.execute(
-        statements("checkpoint")["rows_exist"], {"table": _FIRST_TABLES[sink]}
-    ).fetchone()
+    first = sql.Identifier(*SINKS[sink].tables[0]).as_string(connection)
+    row = connection.execute(statements("checkpoint")["rows_exist"], {"table": first}).fetchone()
     return row is not None and bool(row[0])
 
 

@@ -25,8 +25,9 @@ from psycopg.rows import TupleRow
 from eventsrc.base.errors import MisuseError
 from projections.fold.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
-from .cluster import SUPERUSER, reset_advice
+from .data_folder import SUPERUSER, reset_advice
 from .embedded import EmbeddedServer, embedded_log
+from .sink import SinkName
 
 Connection = psycopg.Connection[TupleRow]
 
@@ -78,6 +79,15 @@ class Targets:
     def one_database(self) -> bool:
         """True when graph and vectors are in one database and so in one transaction."""
         return self.graph_url == self.vector_url
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """Each database once."""
+        return tuple(dict.fromkeys((self.graph_url, self.vector_url)))
+
+    def url_of(self, sink: SinkName) -> str:
+        """The database of a sink."""
+        return self.graph_url if sink == "graph" else self.vector_url
 
     def restart_embedded(self) -> None:
         """Start the embedded server again, if it is used and has died."""

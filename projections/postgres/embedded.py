@@ -26,7 +26,7 @@ from psycopg.conninfo import conninfo_to_dict
 from eventsrc.base.advised import advised
 from projections.fold.errors import EmbeddedServerError
 
-from .cluster import LOG_NAME, SUPERUSER, Cluster
+from .data_folder import LOG_NAME, SUPERUSER, Cluster
 from .server_user import server_user
 
 DEFAULT_HOME: Final = ".mapfold"

@@ -1,33 +1,47 @@
-"""The sink that writes the map as an Apache AGE graph."""
+"""The sink that writes the map as an Apache AGE graph, and its tables.
 
-from collections.abc import Callable, Mapping, Sequence
+AGE keeps a graph as a schema, so a graph is *ours* when the schema carries our mark as its comment.
+Anything else under these names belongs to another program: it is refused and never changed, except
+that an empty graph, as scripts that set up a database make it, is taken over (`_adopt_if_empty`).
+
+The swap renames the old graph; it is dropped later, when every transaction that may still have
+looked up its name has ended (see `replaced_tables`).
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Any, Final
+from itertools import count
+from typing import Final
 
 from psycopg import sql
 
-from projections.fold.errors import DatabaseError
+from eventsrc.base.advised import advised
+from projections.fold.errors import DatabaseError, ProjectionMismatch
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
-from . import graph_schema, map_table
+from . import map_table, replaced_tables
 from .connection import Connection, describe_connection, ensure_extension
-from .cypher import policies_apply
+from .cypher import PARENTS, add_policies, policies_apply
 from .grants import copy_privileges
-from .graph_rows import GraphRows, changed_rows, changing_rows, fixed_rows
+from .graph_rows import GraphRows, Row, changed_rows, changing_rows, fixed_rows
 from .labels import (
+    CHANGING_EDGES,
     COUNT_KEYS,
     EDGE_LABELS,
     GRAPH,
+    KEYS,
+    LABEL_IDS,
     LABELS,
     MAP_TABLE,
+    MATCHED,
     NEXT_GRAPH,
     OLD_GRAPH,
     VERTEX_LABELS,
     Label,
 )
-from .loader import InsertLoader, Load, Loader, LoaderName, loader_of, unnest_columns
-from .map_rows import MapRow, map_rows
+from .loader import Load, LoaderName, graph_statement, load_of_graph, unnest_columns
+from .map_table import MapRow, map_rows
 from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
 from .sink import PreparedWrite, SinkName
 from .statements import statements
@@ -38,30 +52,31 @@ afterwards, but the server has the time while the fold goes on."""
 LATE: Final = frozenset(LABELS) - EARLY
 SMALL_BATCH: Final = 200
 """Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
+_MARK: Final = "mapfold"
 
 
 class GraphSink:
-    """Implements `LiveSink` and `RebuildSink` for the graph ``semantic_map``."""
+    """Implements `Sink` for the graph ``semantic_map``."""
 
     name: Final[SinkName] = "graph"
 
     def __init__(self, loader: LoaderName = "copy") -> None:
-        self._loader: Loader = loader_of(loader)
+        self._loader: LoaderName = loader
 
     def ensure(self, connection: Connection) -> bool:
         """Create an empty graph if there is none, or one without labels. Raises ProjectionMismatch
         for that of an older version."""
         ensure_extension(connection, "age")
-        graph_schema.adopt_if_empty(connection, GRAPH)
-        if not graph_schema.exists(connection, GRAPH):
-            graph_schema.create(connection, GRAPH)
-        elif graph_schema.is_bare(connection, GRAPH):
-            graph_schema.add_labels(connection, GRAPH)
+        _adopt_if_empty(connection, GRAPH)
+        if not graph_exists(connection, GRAPH):
+            create_graph(connection, GRAPH)
+        elif _is_bare(connection, GRAPH):
+            _add_labels(connection, GRAPH)
         else:
-            graph_schema.refuse_older(connection, GRAPH)
+            _refuse_older(connection, GRAPH)
             map_table.refuse_missing(connection)
             return False
-        graph_schema.index(connection, GRAPH)
+        index_graph(connection, GRAPH)
         map_table.ensure(connection)
         map_table.replace(connection, [])
         return True
@@ -81,15 +96,15 @@ class GraphSink:
         connection: Connection,
     ) -> None:
         copies = not is_small and not policies_apply(connection)
-        loader = self._loader if copies else InsertLoader()
+        loader = self._loader if copies else "insert"
         for label, inserted in rows.inserted.items():
-            _new_rows(loader, GRAPH, label, inserted)(connection)
+            load_of_graph(loader, GRAPH, label, inserted)(connection)
         for label, upserted in rows.upserted.items():
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
             unnest_columns(kind, GRAPH, label, upserted)(connection)
         for label, replaced in rows.replaced.items():
-            _delete(connection, label, [row[1] for row in replaced], "delete_from")
-            _new_rows(InsertLoader(), GRAPH, label, replaced)(connection)
+            _delete(connection, label, [int(row[1]) for row in replaced], "delete_from")
+            load_of_graph("insert", GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
             _delete(connection, label, ids)
         if maps is not None:
@@ -104,12 +119,12 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         with connection.transaction():
-            graph_schema.adopt_if_empty(connection, GRAPH)
-            graph_schema.exists(connection, GRAPH)
+            _adopt_if_empty(connection, GRAPH)
+            graph_exists(connection, GRAPH)
         if try_drop_lock(connection, self.name):
             for graph in (OLD_GRAPH, NEXT_GRAPH):
                 with connection.transaction():
-                    graph_schema.drop(connection, graph)
+                    drop_graph(connection, graph)
 
     def shadow(self) -> "GraphShadow":
         """A shadow, not created yet."""
@@ -118,37 +133,36 @@ class GraphSink:
     def drop_replaced(self, connection: Connection) -> None:
         """Drop the replaced graph once its last reader has ended."""
         if wait_for_earlier_transactions(connection) and try_drop_lock(connection, self.name):
-            graph_schema.drop_in_background(connection, OLD_GRAPH)
+            _drop_in_background(connection, OLD_GRAPH)
 
 
 class GraphShadow:
     """Implements `Shadow`: the graph ``semantic_map_next``."""
 
-    def __init__(self, loader: Loader) -> None:
+    def __init__(self, loader: LoaderName) -> None:
         self._loader = loader
 
     def create(self, connection: Connection) -> None:
         """Create an empty graph and its early indexes."""
-        graph_schema.create(connection, NEXT_GRAPH)
-        graph_schema.index(connection, NEXT_GRAPH, EARLY)
+        create_graph(connection, NEXT_GRAPH)
+        index_graph(connection, NEXT_GRAPH, EARLY)
 
     def load(self, changes: BatchChanges, view: MapView) -> Load:
         """Returns a function that writes the fixed rows of new keyframes and observations."""
-        return self._load(fixed_rows(view, changes.keyframes, changes.observations))
+        return self._load(fixed_rows(view, changes))
 
     def finish(self, view: MapView) -> Callable[[Connection], Mapping[str, int]]:
         """Returns a function that writes the changing rows, builds the other indexes and compares
         numbers by label."""
-        load, counts = self._load(changing_rows(view)), view.counts()
+        load, maps, counts = self._load(changing_rows(view)), map_rows(view), view.counts()
         expected = {label: counts[COUNT_KEYS[label]] for label in LABELS}
-        maps = map_rows(view)
 
         def finish(connection: Connection) -> Mapping[str, int]:
             load(connection)
             map_table.ensure(connection)
             map_table.replace(connection, maps)
-            graph_schema.index(connection, NEXT_GRAPH, LATE)
-            graph_schema.analyze(connection, NEXT_GRAPH)
+            index_graph(connection, NEXT_GRAPH, LATE)
+            analyze_graph(connection, NEXT_GRAPH)
             found = _compared(connection, expected)
             return {**found, MAP_TABLE: len(maps)} if maps else found
 
@@ -157,16 +171,16 @@ class GraphShadow:
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
         wait_for_drop(connection, GraphSink.name)
-        graph_schema.lock(connection, GRAPH)
+        _lock(connection, GRAPH)
 
     def swap_in(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
         copy_privileges(connection, GRAPH, NEXT_GRAPH)
-        graph_schema.swap_in(connection, NEXT_GRAPH)
+        _swap_in(connection, NEXT_GRAPH)
 
-    def _load(self, rows_of: Mapping[Label, list[Any]]) -> Load:
+    def _load(self, rows_of: Mapping[Label, list[Row]]) -> Load:
         loads = [
-            _new_rows(self._loader, NEXT_GRAPH, label, rows) for label, rows in rows_of.items()
+            load_of_graph(self._loader, NEXT_GRAPH, label, rows) for label, rows in rows_of.items()
         ]
 
         def load(connection: Connection) -> None:
@@ -179,20 +193,12 @@ class GraphShadow:
 def _delete(
     connection: Connection, label: Label, ids: Sequence[int], statement: str = "delete"
 ) -> None:
-    query = statements("graph")[statement].format(
-        graph=sql.Identifier(GRAPH), label=sql.Identifier(label)
-    )
-    connection.execute(query, [[str(i) for i in ids]])
-
-
-def _new_rows(loader: Loader, graph: str, label: Label, rows: list[Any]) -> Load:
-    if label in EDGE_LABELS:
-        return loader.edges(graph, label, rows)
-    return loader.vertices(graph, label, rows)  # type: ignore[arg-type]
+    connection.execute(graph_statement(statement, GRAPH, label), [[str(i) for i in ids]])
 
 
 def _compared(connection: Connection, expected: Mapping[Label, int]) -> Mapping[str, int]:
-    found = graph_schema.counts(connection, NEXT_GRAPH)
+    """Rows by label. Raises DatabaseError where they are not as many as expected."""
+    found = count_graph(connection, NEXT_GRAPH)
     wrong = [
         f"{label}: {found[label]} rows, {expected[label]} in the map"
         for label in LABELS
@@ -204,3 +210,188 @@ def _compared(connection: Connection, expected: Mapping[Label, int]) -> Mapping[
             f" ({'; '.join(wrong)}); the old one stays, please report this"
         )
     return found
+
+
+def graph_exists(connection: Connection, graph: str) -> bool:
+    """Whether a graph of ours has this name. Raises DatabaseError when it is not ours."""
+    row = connection.execute(statements("graph")["state"], {"graph": graph}).fetchone()
+    if row is None:
+        return False
+    if not row[0] or not str(row[1]).startswith(_MARK):
+        renaming = _renaming(connection, graph, is_graph=row[0])
+        raise DatabaseError(
+            f"{describe_connection(connection)}: has a {'graph' if row[0] else 'schema'} {graph}"
+            f" that mapfold did not make; rename it by `{renaming}`, or use another database"
+        )
+    return True
+
+
+def _renaming(connection: Connection, graph: str, *, is_graph: bool) -> str:
+    """The SQL statement that renames a graph or a schema to an unused name."""
+    rows = connection.execute(statements("graph")["taken_names"], {"pattern": f"{graph}%"})
+    taken = {name for (name,) in rows}
+    names = (f"{graph}_{number}" for number in count(1))
+    free = next(name for name in names if name not in taken)
+    if is_graph:
+        return f"SELECT ag_catalog.alter_graph('{graph}', 'RENAME', '{free}');"
+    return f"ALTER SCHEMA {graph} RENAME TO {free};"
+
+
+def _adopt_if_empty(connection: Connection, graph: str) -> None:
+    """Take over a graph that another program made and that has no vertex, edge or other table.
+    Inside a transaction. The rights on its schema stay, unless it has labels: then another one
+    takes its place, because labels get their numbers in the order in which they are made. It is
+    renamed and dropped with the next replay: AGE 1.5 may end a session that drops a graph."""
+    run = statements("graph")
+    row = connection.execute(run["state"], {"graph": graph}).fetchone()
+    if row is None or not row[0] or row[1] or not _is_empty(connection, graph):
+        return
+    if not _is_bare(connection, graph) and graph_exists(connection, OLD_GRAPH):
+        return  # its place is taken until the next replay
+    parents = sql.SQL(", ").join(sql.Identifier(graph, parent) for parent in PARENTS)
+    connection.execute(run["lock"].format(tables=parents))
+    if not _is_empty(connection, graph):  # written to meanwhile
+        return
+    _use_age(connection)
+    connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    if not _is_bare(connection, graph):
+        drop_later = {"graph": graph, "new_name": OLD_GRAPH}
+        connection.execute(run["rename_graph"], drop_later)
+        connection.execute(run["create_graph"], {"graph": graph})
+        connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+
+
+def _is_empty(connection: Connection, graph: str) -> bool:
+    vertices, edges = (sql.Identifier(graph, parent) for parent in PARENTS)
+    query = statements("graph")["is_empty"].format(vertices=vertices, edges=edges)
+    row = connection.execute(query, {"graph": graph}).fetchone()
+    return row is not None and bool(row[0])
+
+
+def _is_bare(connection: Connection, graph: str) -> bool:
+    """Whether a graph has no labels but those that every graph has."""
+    return set(_label_ids(connection, graph)) <= set(PARENTS)
+
+
+def create_graph(connection: Connection, graph: str) -> None:
+    """An empty graph with all labels."""
+    _use_age(connection)
+    run = statements("graph")
+    connection.execute(run["create_graph"], {"graph": graph})
+    connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
+    _add_labels(connection, graph)
+
+
+def _add_labels(connection: Connection, graph: str) -> None:
+    """All labels of a graph that has none, in the order that gives them their constant ids."""
+    _use_age(connection)
+    run = statements("graph")
+    for label in LABELS:
+        kind = "create_vlabel" if label in VERTEX_LABELS else "create_elabel"
+        connection.execute(run[kind], {"graph": graph, "label": label})
+    for name in LABELS:
+        table = sql.Identifier(graph, name)
+        connection.execute(run["no_statistics"].format(table=table))
+    add_policies(connection, graph)
+    found = _label_ids(connection, graph)
+    if any(found.get(label) != number for label, number in LABEL_IDS.items()):
+        raise DatabaseError(
+            f"{describe_connection(connection)}: this version of Apache AGE numbers labels in"
+            f" another way ({found}); use AGE 1.5 to 1.8"
+        )
+
+
+def _label_ids(connection: Connection, graph: str) -> dict[str, int]:
+    rows = connection.execute(statements("graph")["label_ids"], {"graph": graph}).fetchall()
+    return dict(rows)
+
+
+def _refuse_older(connection: Connection, graph: str) -> None:
+    """Raise ProjectionMismatch for a graph that an older mapfold made, which lacks labels."""
+    missing = [label for label in LABELS if label not in _label_ids(connection, graph)]
+    if missing:
+        raise ProjectionMismatch(
+            f"{describe_connection(connection)}: an older mapfold made the graph there: it has no"
+            f" {', '.join(missing)}; run `{advised('replay')}`, which makes it again"
+        )
+
+
+def index_graph(
+    connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
+) -> None:
+    """Create the indexes for queries and upserts that AGE has not made itself."""
+    rows = connection.execute(statements("graph")["indexed"], {"graph": graph}).fetchall()
+    unique = {(table, column): is_unique for table, column, is_unique in rows}
+
+    def make(kind: str, label: Label, **parts: sql.Composable) -> None:
+        connection.execute(graph_statement(kind, graph, label, **parts))
+
+    for label in filter(labels.__contains__, LABELS):
+        if (label in VERTEX_LABELS or label in CHANGING_EDGES) and not unique.get((label, "id")):
+            make("index_unique", label, column=sql.Identifier("id"))
+        for end in ("start_id", "end_id") if label in EDGE_LABELS else ():
+            if (label, end) not in unique:
+                make("index", label, column=sql.Identifier(end))
+        if label in KEYS:
+            make("index_key", label, key=sql.Literal(f'"{KEYS[label]}"'))
+        if label in MATCHED:
+            make("index_match", label)
+
+
+def count_graph(connection: Connection, graph: str) -> dict[str, int]:
+    """Rows by label."""
+    select = sql.SQL("SELECT {}, count(*) FROM {}")
+    selects = [select.format(sql.Literal(each), sql.Identifier(graph, each)) for each in LABELS]
+    return dict(connection.execute(sql.SQL(" UNION ALL ").join(selects)).fetchall())
+
+
+def _lock(connection: Connection, graph: str) -> None:
+    """Lock all tables of a graph exclusively, if it is there; an older version's has fewer."""
+    if graph_exists(connection, graph):
+        there = _label_ids(connection, graph)
+        names = [*PARENTS, *filter(there.__contains__, LABELS)]
+        tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
+        connection.execute(statements("graph")["lock"].format(tables=tables))
+
+
+def _swap_in(connection: Connection, shadow: str) -> None:
+    """Rename the readers' graph to `OLD_GRAPH` and ``shadow`` to the readers' name."""
+    _use_age(connection)
+    run = statements("graph")
+    if graph_exists(connection, GRAPH):
+        connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
+    connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})
+
+
+def drop_graph(connection: Connection, graph: str) -> None:
+    """Drop a graph of ours, if it is there."""
+    if graph_exists(connection, graph):
+        _use_age(connection)
+        with connection.cursor() as cursor:
+            cursor.execute("SET LOCAL client_min_messages = warning")
+            cursor.execute(statements("graph")["drop_graph"], {"graph": graph})
+
+
+def _drop_in_background(connection: Connection, graph: str) -> None:
+    """Have the server drop a graph of ours, if it is there; closes the connection then."""
+    if graph_exists(connection, graph):
+        connection.execute("SET search_path = ag_catalog, public")
+        replaced_tables.send_and_close(
+            connection, statements("graph")["drop_named"].format(graph=sql.Literal(graph))
+        )
+
+
+def analyze_graph(connection: Connection, graph: str) -> None:
+    """Gather statistics, so that the planner knows which labels are large.
+
+    Inside a transaction. The keys that readers look up are nearly unique, which a small sample
+    shows.
+    """
+    connection.execute(statements("graph")["sample"])
+    for label in LABELS:
+        connection.execute(graph_statement("analyze", graph, label))
+
+
+def _use_age(connection: Connection) -> None:
+    """AGE's own functions find their operator classes only through the search path."""
+    connection.execute("SET LOCAL search_path = ag_catalog, public")

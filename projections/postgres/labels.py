@@ -62,7 +62,7 @@ CHANGING_EDGES: Final[tuple[EdgeLabel, ...]] = (
 )
 """Edges that a later event may move or remove; the others are written once."""
 
-KEYS: Final[dict[VertexLabel, str]] = {
+KEYS: Final[dict[Label, str]] = {
     "Run": "run_id",
     "Observation": "det_id",
     "Object": "object_id",
@@ -71,7 +71,7 @@ KEYS: Final[dict[VertexLabel, str]] = {
 }
 """The property by which readers find a vertex; each gets a btree index."""
 
-MATCHED: Final[tuple[VertexLabel, ...]] = ("Observation", "Object", "Place")
+MATCHED: Final[tuple[Label, ...]] = ("Observation", "Object", "Place")
 """Vertices that readers find by ``{key: value}``, which only a GIN index serves."""
 
 COUNT_KEYS: Final[dict[Label, str]] = {
@@ -91,6 +91,11 @@ COUNT_KEYS: Final[dict[Label, str]] = {
 def graphid_base(label: Label) -> int:
     """The graphid of number 0 of a label; add the number to get a row's id."""
     return LABEL_IDS[label] << 48
+
+
+def number_of(graphid: int) -> int:
+    """The number in a graphid."""
+    return graphid & (1 << 48) - 1
 
 
 def floor_part_number(floor: int) -> int:

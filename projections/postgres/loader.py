@@ -1,12 +1,12 @@
-"""Bulk insertion of new rows: the port `Loader` and its two implementations.
+"""Bulk insertion of new rows, in one of two ways that write the same.
 
-`CopyLoader` streams COPY, for rebuilds and large batches. `InsertLoader` sends ``INSERT … SELECT
-unnest``, for servers and proxies that do not let COPY through, and for batches so small that COPY's
-own round trips would cost more. Both write the same rows: one contract test class runs on both.
+``copy`` streams COPY, for rebuilds and large batches. ``insert`` sends ``INSERT … SELECT unnest``
+with the columns as bound arrays, for servers and proxies that do not let COPY through, and for
+batches so small that COPY's own round trips would cost more.
 
-A loader makes a `Load` of the rows: all work of this process is done then, and only sending is
-left. A rebuild sends in a thread; if the thread encoded rows too, it and the fold would take the
-interpreter from each other tens of thousands of times, a fifth of the time of both.
+A `Load` of rows is made when all work of this process is done, and only sending is left. A rebuild
+sends in a thread; if the thread encoded rows too, it and the fold would take the interpreter from
+each other tens of thousands of times, a fifth of the time of both.
 
 Rows of ``detection_embeddings`` are encoded here in COPY's binary format, as they are most of a
 rebuild's bytes: 2 KiB of float32 per row go through one numpy byte swap instead of a type adapter
@@ -24,7 +24,7 @@ bytes as the type's ``recv`` function takes them; an int16 -1 ends it. All big-e
 import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from psycopg import sql
@@ -33,8 +33,8 @@ from projections.fold.deltas import ObservationAdded
 from projections.fold.exact import to_float32
 
 from .connection import Connection
-from .graph_render import EdgeRow, VertexRow
-from .labels import EdgeLabel, VertexLabel
+from .graph_rows import Row
+from .labels import EDGE_LABELS, Label
 from .statements import statements
 from .vector_rows import VectorRow
 
@@ -141,94 +141,52 @@ COPY_CHUNK: Final = 60
 memory is allocated by the system each time."""
 
 
-class Loader(Protocol):
-    """Makes functions that insert rows not yet in the table."""
-
-    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
-        """Add vertices of one label."""
-
-    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
-        """Add edges of one label."""
-
-    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
-        """Add rows of ``detection_embeddings``."""
-
-
-class CopyLoader:
-    """COPY: text for the graph (agtype has no binary form), binary for the vectors."""
-
-    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
-        """Add vertices of one label."""
-        lines = [f"{i}\t{properties}\n" for i, properties in rows]
-        return _copy(_graph_statement("copy_vertex", graph, label), [_text_document(lines)])
-
-    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
-        """Add edges of one label."""
-        lines = [f"{i}\t{start}\t{end}\t{properties}\n" for i, start, end, properties in rows]
-        return _copy(_graph_statement("copy_edge", graph, label), [_text_document(lines)])
-
-    def vectors(
-        self,
-        schema: str,
-        vector: TypeName,  # noqa: ARG002 - COPY takes the type from the table
-        rows: Sequence[VectorRow],
-    ) -> Load:
-        """Add rows of ``detection_embeddings``."""
-        statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
-            sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COPIED))
-        )
-        starts = range(0, len(rows), COPY_CHUNK)
-        return _copy(
-            statement,
-            [
-                copy_document(rows[i : i + COPY_CHUNK], i == 0, i + COPY_CHUNK >= len(rows))
-                for i in starts
-            ],
-        )
+def load_of_graph(loader: LoaderName, graph: str, label: Label, rows: Sequence[Row]) -> Load:
+    """Adds vertices or edges of one label."""
+    kind = "edge" if label in EDGE_LABELS else "vertex"
+    if loader == "insert":
+        return unnest_columns(f"insert_{kind}", graph, label, rows)
+    # agtype text, which has no binary form, holds no raw tab or line end (they are escaped in
+    # strings), so the backslash is the only character that COPY's own format still has to escape.
+    line = "%d\t%d\t%d\t%s\n" if kind == "edge" else "%d\t%s\n"
+    document = "".join([line % row for row in rows]).replace("\\", "\\\\").encode()
+    return _copy(graph_statement(f"copy_{kind}", graph, label), [document])
 
 
-class InsertLoader:
-    """``INSERT … SELECT unnest(…)`` with the columns as bound arrays."""
-
-    def vertices(self, graph: str, label: VertexLabel, rows: Sequence[VertexRow]) -> Load:
-        """Add vertices of one label."""
-        return unnest_columns("insert_vertex", graph, label, rows)
-
-    def edges(self, graph: str, label: EdgeLabel, rows: Sequence[EdgeRow]) -> Load:
-        """Add edges of one label."""
-        return unnest_columns("insert_edge", graph, label, rows)
-
-    def vectors(self, schema: str, vector: TypeName, rows: Sequence[VectorRow]) -> Load:
-        """Add rows of ``detection_embeddings``."""
-        insert, where = statements("vectors")["insert"], sql.Identifier(schema)
-        fields = [_vector_fields(row) for row in rows]
+def load_of_vectors(
+    loader: LoaderName, schema: str, vector: TypeName, rows: Sequence[VectorRow]
+) -> Load:
+    """Adds rows of ``detection_embeddings``."""
+    where = sql.Identifier(schema)
+    if loader == "insert":
+        insert, fields = statements("vectors")["insert"], [_vector_fields(row) for row in rows]
         return _unnest(lambda: insert.format(schema=where, vector=vector()), fields, VECTOR_CHUNK)
+    statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
+        where, sql.SQL(", ").join(map(sql.Identifier, COPIED))
+    )
+    documents = [
+        copy_document(rows[i : i + COPY_CHUNK], i == 0, i + COPY_CHUNK >= len(rows))
+        for i in range(0, len(rows), COPY_CHUNK)
+    ]
+    return _copy(statement, documents)
 
 
 def unnest_columns(
-    statement: str, graph: str, label: str, rows: Sequence[VertexRow] | Sequence[EdgeRow]
+    statement: str, graph: str, label: str, rows: Sequence[tuple[object, ...]]
 ) -> Load:
     """Runs one of the unnest statements of ``sql/graph.sql`` with the columns of ``rows``."""
     as_text = [tuple(map(str, row)) for row in rows]
-    query = _graph_statement(statement, graph, label)
+    query = graph_statement(statement, graph, label)
     return _unnest(lambda: query, as_text, INSERT_CHUNK)
 
 
-def loader_of(name: LoaderName) -> Loader:
-    """The loader called ``name``."""
-    return CopyLoader() if name == "copy" else InsertLoader()
-
-
-def _graph_statement(statement: str, graph: str, label: str) -> sql.Composed:
+def graph_statement(
+    statement: str, graph: str, label: str, **parts: sql.Composable
+) -> sql.Composed:
+    """A statement of ``sql/graph.sql`` for the table of a label, with further parts in braces."""
     return statements("graph")[statement].format(
-        graph=sql.Identifier(graph), label=sql.Identifier(label)
+        graph=sql.Identifier(graph), label=sql.Identifier(label), **parts
     )
-
-
-def _text_document(lines: list[str]) -> bytes:
-    # agtype text holds no raw tab or line end (they are escaped in strings), so the backslash is
-    # the only character that COPY's own format still has to escape.
-    return "".join(lines).replace("\\", "\\\\").encode()
 
 
 def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:

@@ -16,10 +16,9 @@ from projections.fold.errors import ProjectionMismatch, ProjectionMissing
 from projections.fold.settings import Settings, settings_by_name
 
 from .inputs import MapInputs
-from .sink import Checkpoint, SinkName
+from .sink import SINKS, Checkpoint, SinkName
 
 _SETTINGS_OPTIONS: Final = ("--settings", "--preset", "--set")
-_WAS: Final[dict[SinkName, str]] = {"graph": "was", "vectors": "were"}
 
 Fault: TypeAlias = Literal["log", "settings", "corrections"]
 """The part of a projection's origin that differs from the expected one."""
@@ -95,21 +94,19 @@ def refuse_other_origin(
 ) -> None:
     """Raise ProjectionMismatch when a checkpoint was made from another log, with other settings or
     under other corrections."""
+    made = f"{where}: the {sink} there {SINKS[sink].was} made"
     fault = origin_fault(found, log_id, inputs)
     if fault == "log":
-        raise ProjectionMismatch(
-            f"{where}: the {sink} there {_WAS[sink]} made from log {found.log_id}, not from"
-            f" {log_id}; {advice}"
-        )
+        raise ProjectionMismatch(f"{made} from log {found.log_id}, not from {log_id}; {advice}")
     if fault == "corrections" and not _is_of_another_version(found, inputs):
         raise ProjectionMismatch(
-            f"{where}: the {sink} there {_WAS[sink]} made under other corrections than the log's"
-            f" commands before offset {found.known_to:,} give; {advice}"
+            f"{made} under other corrections than the log's commands before offset"
+            f" {found.known_to:,} give; {advice}"
         )
     if fault is not None:
         options = _options_to_match(found.settings, inputs.settings)
         raise ProjectionMismatch(
-            f"{where}: the {sink} there {_WAS[sink]} made with other settings"
+            f"{made} with other settings"
             f" ({', '.join(_settings_differences(found.settings, inputs.settings))});"
             f"{f' to go on with them add {options};' if options else ''} {advice}"
         )

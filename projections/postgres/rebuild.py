@@ -2,8 +2,13 @@
 
 Other processes read and parse a large log (`projections.map.parsed_log`), this one folds it and
 makes the rows, and a thread for each database sends them.
+
+Retry: a parked event, once folded, changes everything after it, so it cannot be added later. If all
+parked events of a sink can be read now (by a newer mapfold), the sink is rebuilt up to its
+checkpoint. If one still cannot, nothing is changed.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -12,6 +17,8 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from eventsrc.base.garbage import gc_paused
+from eventsrc.envelope.forms import read_envelope
+from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.errors import FoldError
@@ -20,15 +27,50 @@ from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
 
-from .connection import Targets
-from .foreign_embedding import ForeignEmbedding, first_foreign_embedding
+from . import checkpoints
+from .checkpoints import DeadLetter
+from .connection import Targets, connect, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf
 from .live_fold import LiveFold
 from .loader import LoaderName
-from .origin import command_for
+from .origin import command_for, refuse_mismatch
 from .shadows import FoldedLog, ShadowWriter, drop_replaced, stream, swap_in_new_map
+from .sink import SINKS, SinkName
 from .stores import Only, open_stores
-from .vector_table import HnswReport
+from .vector_sink import HnswReport
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignEmbedding:
+    """An embedding that is outside the map's space. A model is None when it has no name.
+
+    ``map_dim`` is None when the map has no embedding: none had the space that the settings ask for.
+    """
+
+    offset: Offset
+    det_id: str
+    model: str | None
+    dim: int
+    map_model: str | None
+    map_dim: int | None
+
+
+def first_foreign_embedding(fold: LiveFold, reader: LogReader) -> ForeignEmbedding | None:
+    """None when there is none. Read again from the log, as the fold does not keep it."""
+    first = next((o for o in fold.view.observations if o.foreign_space), None)
+    if first is None:
+        return None
+    offset, space = fold.view.keyframes[first.keyframe].offset, fold.map.space
+    (event,) = reader.read(offset, Offset(offset + 1))
+    parsed = read_envelope(event, max_bytes=sys.maxsize)
+    assert isinstance(parsed, Accepted)  # noqa: S101 - it was folded
+    vector = parsed.vectors[parsed.det_ids.index(first.det_id)]
+    assert vector is not None  # noqa: S101 - it was found to be of another space
+    dim = space.dim if space.is_decided else None
+    return ForeignEmbedding(
+        offset, first.det_id, first.embedding_model, len(vector), space.model, dim
+    )
+
 
 TICK_EVENTS: Final = 256
 """Events between two reports of progress; also between two checks of the number of waiting rows."""
@@ -165,3 +207,52 @@ def _advice(log: Path, inputs: MapInputs, offset: Offset) -> str:
         "the databases stay as they were; to leave it out run:"
         f" {before} && {command_for('tail', log, inputs)}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RetryReport:
+    """A sink's parked events: how many, which still fail, whether it was rebuilt."""
+
+    sink: SinkName
+    parked: int
+    still: tuple[DeadLetter, ...]
+    rebuilt: bool
+
+
+def retry(log: Path, targets: Targets, settings: Settings | SettingsOf) -> list[RetryReport]:
+    """Retry the parked events of both sinks. Raises ProjectionMismatch."""
+    return [_retry(log, targets, settings, sink, targets.url_of(sink)) for sink in SINKS]
+
+
+def _retry(
+    log: Path, targets: Targets, settings: Settings | SettingsOf, sink: SinkName, url: str
+) -> RetryReport:
+    opened = connect(url, application="mapfold retry")
+    with LogReader(log) as reader, opened as connection, database_errors(url):
+        letters = checkpoints.parked(connection, sink)
+        checkpoint = checkpoints.load(connection, sink)
+        if checkpoint is None or not letters:
+            return RetryReport(sink, 0, (), rebuilt=False)
+        inputs = LogInputs.read(reader, settings).at(checkpoint.known_to)
+        refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
+        still = tuple(_still_rejected(reader, letters))
+    if not still:
+        rebuild(
+            log,
+            targets,
+            settings,
+            until=checkpoint.next_offset,
+            known_at=checkpoint.known_to,
+            only=sink,
+        )
+    return RetryReport(sink, len(letters), still, rebuilt=not still)
+
+
+def _still_rejected(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
+    failing = []
+    for letter in letters:
+        (event,) = reader.read(letter.offset, Offset(letter.offset + 1))
+        parsed = read_envelope(event, max_bytes=sys.maxsize)
+        if isinstance(parsed, Rejected):
+            failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, parsed.reason))
+    return failing

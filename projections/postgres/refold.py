@@ -32,17 +32,17 @@ from projections.fold.errors import DatabaseError, ImpossibleCommand
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
-from . import checkpoints, vector_table
+from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter
 from .connection import Connection, database_errors, describe_connection
 from .inputs import LogInputs, MapInputs, commands_between
 from .labels import TABLE
 from .live_fold import LiveFold, batches
 from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
-from .sink import Checkpoint, Shadow, SinkName
+from .sink import SINKS, Checkpoint, Shadow, SinkName
 from .statements import statements
 from .stores import DatabaseSink, Store
-from .vector_table import READERS, has_hnsw
+from .vector_sink import READERS, count_vectors, has_hnsw
 
 BEAT_S: Final = 1.0
 
@@ -222,7 +222,7 @@ class Refold:
         """
         found = self.found[sink]
         observed = found.fingerprint if found.observed is None else found.observed
-        return sink == "vectors" and observed == self.base.observed and not self.parked
+        return SINKS[sink].is_kept and observed == self.base.observed and not self.parked
 
     def _swaps_indexed_vectors(self) -> bool:
         return any(
@@ -271,7 +271,7 @@ class KeptVectors:
         expected = sum(o.embedding_crc is not None for o in view.observations)
 
         def finish(connection: Connection) -> Mapping[str, int]:
-            found = vector_table.count(connection, READERS)
+            found = count_vectors(connection, READERS)
             if found != expected:
                 raise DatabaseError(
                     f"{describe_connection(connection)}: {TABLE} has {found:,} rows, the map"

@@ -1,6 +1,6 @@
 """Drop the tables that a swap has replaced, once their last readers have ended.
 
-The swap itself is `graph_schema.swap_in`, and for vectors `vector_table.set_aside` and `move_in`.
+The swap itself is ``swap_in`` of the shadows of `graph_sink` and `vector_sink`.
 
 A reader may have resolved a name just before the swap without holding a lock yet. Its transaction
 began before the swap was committed, so it is enough to wait for all transactions of this database
@@ -20,7 +20,7 @@ from typing import Final
 from psycopg import sql
 
 from .connection import Connection
-from .sink import SinkName
+from .sink import SINKS, SinkName
 from .statements import statements
 
 WAIT_SECONDS: Final = 10.0
@@ -50,19 +50,16 @@ def wait_for_earlier_transactions(connection: Connection) -> bool:
         time.sleep(POLL_SECONDS)
 
 
-_LOCK_NUMBERS: Final[dict[SinkName, int]] = {"graph": 17, "vectors": 18}
-
-
 def try_drop_lock(connection: Connection, sink: SinkName) -> bool:
     """Take the drop lock until the session ends; False while another session has it."""
-    number = {"number": _LOCK_NUMBERS[sink]}
+    number = {"number": SINKS[sink].drop_lock}
     row = connection.execute(statements("checkpoint")["lock"], number).fetchone()
     return row is not None and bool(row[0])
 
 
 def wait_for_drop(connection: Connection, sink: SinkName) -> None:
     """Wait for the drop lock and hold it until the transaction ends."""
-    number = {"number": _LOCK_NUMBERS[sink]}
+    number = {"number": SINKS[sink].drop_lock}
     connection.execute(statements("checkpoint")["wait_for_lock"], number)
 
 

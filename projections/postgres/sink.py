@@ -1,41 +1,64 @@
 """The interface (port) between the fold and the places to which the map is written.
 
-A sink that follows a log implements `LiveSink`. For each batch of events `tail_pass` calls
-`prepare` with the ids that the batch changed and the view; `writer` opens a transaction, calls
-``send`` of the prepared write, moves the sink's checkpoint and commits: both are written or none.
-After a lost connection it calls `ensure` and, if the batch was not committed, the same ``send``
-again.
+Each implements `Sink`. For each batch of events that a tail follows, `live_tail` calls `prepare`
+with the ids that the batch changed and the view; `batch_writer` opens a transaction, calls ``send``
+of the prepared write, moves the sink's checkpoint and commits: both are written or none. After a
+lost connection it calls `ensure` and, if the batch was not committed, the same ``send`` again.
 
-A sink that can also be rebuilt from the start of a log implements `RebuildSink`; a sink of the
-databases (`stores.DatabaseSink`) does both. `shadows` calls, in this order:
+For a rebuild from the start of a log `shadows` calls, in this order:
 
-1. `RebuildSink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
+1. `Sink.drop_leftovers`, outside a transaction; then it opens the one transaction of 2 to 5
 2. `Shadow.create`
 3. while the log is folded: `Shadow.load`, several times; at its end: `Shadow.finish`
 4. `Shadow.lock_readers`, for all shadows before any is swapped in; again for all if one fails
 5. `Shadow.swap_in`; then it commits, with a new checkpoint. Readers see the old map until then
-6. `RebuildSink.drop_replaced`, outside a transaction
+6. `Sink.drop_replaced`, outside a transaction
 
-``Conn`` is what the sink writes through: a psycopg connection for the databases, `MemoryTables` for
-memory. It is in a transaction, except in steps 1 and 6. A method that gets the view gets no
-connection: it returns a function that gets one, so that the fold can go on while a thread calls
-that function.
+``Conn`` is what the sink writes through: a psycopg connection, or in tests dictionaries in memory.
+It is in a transaction, except in steps 1 and 6. A method that gets the view gets no connection: it
+returns a function that gets one, so that the fold can go on while a thread calls that function.
 
 Each event's changes reach a sink once. Ordinals are the same in every fold of a log: a sink that
 computes its ids from them has the same rows after a tail and a rebuild, and never looks an id up.
-docs/architecture.md ("Where to add") lists the other files that name each sink.
+`SINKS` is the table of the sinks of the databases; `stores` makes them.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import Final, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from eventsrc.envelope.model import Offset
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
+from .labels import GRAPH, LABELS, MAP_TABLE, TABLE
+
 SinkName: TypeAlias = Literal["graph", "vectors"]
 """The ``name`` of a sink of the databases: the key of its checkpoint, dead letters and locks."""
+
+
+@dataclass(frozen=True, slots=True)
+class SinkTraits:
+    """What this folder's modules know of a sink of the databases: the numbers of the lock of its
+    writer and of the one that drops replaced tables; its tables, each schema and name; whether its
+    name is plural; whether a refold keeps its rows if no correction changes observations."""
+
+    writer_lock: int
+    drop_lock: int
+    tables: tuple[tuple[str, str], ...]
+    is_plural: bool = False
+    is_kept: bool = False
+
+    @property
+    def was(self) -> str:
+        """The verb of messages about it."""
+        return "were" if self.is_plural else "was"
+
+
+SINKS: Final[dict[SinkName, SinkTraits]] = {
+    "graph": SinkTraits(1, 17, (*((GRAPH, each) for each in LABELS), ("mapfold", MAP_TABLE))),
+    "vectors": SinkTraits(2, 18, (("public", TABLE),), is_plural=True, is_kept=True),
+}
 Conn = TypeVar("Conn", contravariant=True)
 
 
@@ -79,19 +102,6 @@ class PreparedWrite(Generic[Conn]):
     is_small: bool
 
 
-class LiveSink(Protocol[Conn]):
-    """A sink that follows the log."""
-
-    def ensure(self, connection: Conn) -> bool:
-        """Create what rows are written to, if it is missing; returns whether it was.
-
-        Raises DatabaseError when something that mapfold did not make has its name.
-        """
-
-    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
-        """The write that brings the rows up to date with ``view`` after a batch's ``changes``."""
-
-
 class Shadow(Protocol[Conn]):
     """The new rows of one rebuild, beside those that readers see."""
 
@@ -115,8 +125,17 @@ class Shadow(Protocol[Conn]):
         """Put the shadow in the place of what readers see."""
 
 
-class RebuildSink(Protocol[Conn]):
-    """A sink that can be rebuilt while readers use the old rows."""
+class Sink(Protocol[Conn]):
+    """Rows that follow a log, and that can be rebuilt while readers use the old ones."""
+
+    def ensure(self, connection: Conn) -> bool:
+        """Create what rows are written to, if it is missing; returns whether it was.
+
+        Raises DatabaseError when something that mapfold did not make has its name.
+        """
+
+    def prepare(self, changes: BatchChanges, view: MapView) -> PreparedWrite[Conn]:
+        """The write that brings the rows up to date with ``view`` after a batch's ``changes``."""
 
     def drop_leftovers(self, connection: Conn) -> None:
         """Drop tables that an earlier rebuild replaced or left behind. Raises DatabaseError like

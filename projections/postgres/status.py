@@ -31,7 +31,7 @@ from .connection import (
 from .cypher import unwanted_writers
 from .inputs import LogInputs, SettingsOf
 from .origin import command_for, refuse_other_origin, replay_advice
-from .sink import Checkpoint, SinkName
+from .sink import SINKS, Checkpoint, SinkName
 
 STALLED_S: Final = 20.0
 """A live tail's heartbeat comes every 5 s."""
@@ -98,12 +98,10 @@ def projection_status(log: Path, targets: Targets, settings: Settings | Settings
 
     Raises FoldError for a command in the log that cannot be read.
     """
-    sinks: tuple[tuple[SinkName, str], ...] = (
-        ("graph", targets.graph_url),
-        ("vectors", targets.vector_url),
-    )
     with LogReader(log) as reader:
-        found = tuple(_reachable_status(sink, url, reader, settings) for sink, url in sinks)
+        found = tuple(
+            _reachable_status(sink, targets.url_of(sink), reader, settings) for sink in SINKS
+        )
         return Status(reader.log_id, reader.next_offset, found)
 
 

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import psycopg
 
@@ -21,20 +21,14 @@ from .connection import (
 )
 from .graph_sink import GraphSink
 from .loader import LoaderName
-from .sink import LiveSink, RebuildSink, SinkName
+from .sink import SinkName
 from .vector_sink import VectorSink
 
 Only: TypeAlias = SinkName | None
 """The one sink to write, None for all."""
 
 
-class DatabaseSink(LiveSink[Connection], RebuildSink[Connection], Protocol):
-    """A sink of a database; connections are in autocommit where `sink` says "outside a
-    transaction"."""
-
-    @property
-    def name(self) -> SinkName:
-        """The key of its checkpoint, dead letters and locks."""
+DatabaseSink: TypeAlias = GraphSink | VectorSink
 
 
 @dataclass(slots=True)

@@ -24,7 +24,7 @@ import grimp
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("eventsrc", "projections")
-TAIL: Final = "projections.postgres.tail"
+TAIL: Final = "projections.postgres.live_tail"
 RUN: Final = "from projections.surfaces.cli import main; main()"
 
 SETTINGS: Final = ("--set", "eps_m=0.75", "--set", "min_samples=8")

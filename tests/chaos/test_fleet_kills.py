@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from projections.adapters.fleet.cluster import ClusterError, DaskCluster
-from projections.adapters.fleet.engine import RETRIES
-from projections.adapters.fleet.replaying import ReplayRequest, replay_site
-from projections.adapters.fleet.site_databases import SiteDatabases
+from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
+from projections.adapters.fleet.engines import RETRIES
+from projections.adapters.fleet.site_tasks import ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
+from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
 from scripts.programs.bench.fleet.killing import killed
 from scripts.programs.bench.fleet.speed import dask_cluster, make_sites
@@ -21,7 +21,7 @@ from tests.support.logs import write_log
 def test_a_request_that_is_begun_again_finds_its_site_done(pg_url: str, tmp_path: Path) -> None:
     """What a second worker does with a site whose first one was killed after it committed."""
     log = write_log(tmp_path / "log", [envelope(0, 0.0, 0.0)])
-    request = ReplayRequest(Site("a", log), SiteDatabases(pg_url, pg_url))
+    request = ReplayRequest(Site("a", log), Targets(pg_url, pg_url))
     assert [replay_site(request, print).outcome for _ in range(2)] == ["rebuilt", "up_to_date"]
 
 

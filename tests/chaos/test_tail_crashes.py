@@ -155,7 +155,7 @@ def test_commits_lost_while_no_event_comes_are_written_again(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The heartbeat finds the connection lost; there is no batch to compare with."""
-    monkeypatch.setattr(sys.modules["projections.postgres.tail_pass"], "HEARTBEAT_S", 0.0)
+    monkeypatch.setattr(sys.modules["projections.postgres.batch_writer"], "HEARTBEAT_S", 0.0)
     log = write_log(tmp_path / "log", walk(40))
     progress, stop, lost = TailProgress(), threading.Event(), threading.Event()
 

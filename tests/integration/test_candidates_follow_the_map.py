@@ -13,7 +13,7 @@ from projections.localize.relocalize import ExactIndex, MapConstants, QuestionCr
 from projections.localize.relocalize import candidates as candidates_module
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import CandidateReader
+from projections.postgres.queries.candidate_search import CandidateReader
 from tests.support.flickering_house import flickering_house
 from tests.support.logs import WEIRD, append_command, command, forget_keyframes, walk, write_log
 from tests.support.scenes import assert_equal, view_under_commands
@@ -85,7 +85,7 @@ def test_a_sample_of_a_large_map_is_the_same_in_both(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("projections.localize.relocalize.constants.SAMPLED", 64)
-    monkeypatch.setattr("projections.postgres.queries.known_constants.SAMPLED", 64)
+    monkeypatch.setattr("projections.postgres.queries.candidate_rows.SAMPLED", 64)
     log = tmp_path / "log"
     with_new = []
     for start in range(0, 200, 50):
@@ -125,7 +125,7 @@ class TestClasses:
         value: int,
     ) -> None:
         monkeypatch.setattr(candidates_module, bound, value)
-        for module in (candidates_module.__name__, "projections.postgres.queries.candidates"):
+        for module in (candidates_module.__name__, "projections.postgres.queries.candidate_search"):
             monkeypatch.setattr(f"{module}.OBSERVATIONS_OF_EACH", 3)
         rebuild(log, targets, Settings())
         view = view_under_commands(log)

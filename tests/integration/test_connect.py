@@ -20,7 +20,7 @@ from projections.postgres.connection import (
 )
 from projections.postgres.cypher import connect_for_cypher
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.queries.relocalize import CandidateReader
+from projections.postgres.queries.candidate_search import CandidateReader
 
 
 @pytest.fixture(autouse=True)

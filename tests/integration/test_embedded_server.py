@@ -291,7 +291,7 @@ def test_reset_stops_a_kept_server_whose_lock_file_is_damaged(home: Path) -> Non
 def test_a_server_that_damaged_data_keeps_in_recovery_is_not_left_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("projections.postgres.cluster.STOP_SECONDS", 5)
+    monkeypatch.setattr("projections.postgres.data_folder.STOP_SECONDS", 5)
     with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
         data = furnish(Path(folder)) / "pg"
         with EmbeddedServer(Path(folder)):

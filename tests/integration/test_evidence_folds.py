@@ -19,7 +19,7 @@ from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from projections.postgres.graph_render import expected_rows
+from projections.postgres.graph_rows import expected_rows
 from projections.postgres.labels import LABELS
 from projections.postgres.loader import LoaderName
 from projections.store.history_recorder import map_after

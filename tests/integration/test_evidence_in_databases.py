@@ -19,12 +19,12 @@ from projections.postgres.checkpoints import ensure_schema
 from projections.postgres.connection import Connection, Targets, connect, pin_session_settings
 from projections.postgres.graph_sink import GraphSink
 from projections.postgres.loader import LoaderName
-from projections.postgres.memory_sink import MemorySink, MemoryTables
+from projections.postgres.queries.candidate_search import prepare_graph
 from projections.postgres.queries.graph_reads import objects_near
 from projections.postgres.queries.map_queries import FoldedMap, LiveMap
-from projections.postgres.queries.relocalize import prepare_graph
 from projections.postgres.vector_sink import VectorSink
 from tests.integration.test_projections import parsed
+from tests.support.memory_sink import MemorySink, MemoryTables
 from tests.support.rows import all_rows, expected_graph
 from tests.support.synthetic_objects import (
     SyntheticDeltas,

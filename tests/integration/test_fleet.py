@@ -15,13 +15,13 @@ import pytest
 from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 
-from projections.adapters.fleet.asking import ask_sites
-from projections.adapters.fleet.engine import Ended, Progress, Task
-from projections.adapters.fleet.replaying import ChosenSettings, ReplayRequest, replay_site
-from projections.adapters.fleet.site_databases import SiteDatabases, exists
+from projections.adapters.fleet.engines import Ended, Progress, Task
+from projections.adapters.fleet.site_databases import exists
+from projections.adapters.fleet.site_tasks import ChosenSettings, ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
+from projections.adapters.fleet.which_site import ask_sites
 from projections.localize.relocalize import read_question
-from projections.postgres.connection import connect
+from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from tests.integration.test_time_travel_commands import InProcess
 from tests.support.commands import Commands
@@ -133,7 +133,7 @@ def test_what_is_up_to_date_is_skipped_and_what_fails_is_named(
 @pytest.mark.seconds
 def test_the_map_of_another_log_is_replaced_only_when_told(pg_url: str, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", walk(10))
-    site = ReplayRequest(Site("büro", log), SiteDatabases(pg_url, pg_url))
+    site = ReplayRequest(Site("büro", log), Targets(pg_url, pg_url))
 
     def outcome(request: ReplayRequest) -> str:
         done = replay_site(request, lambda _: None)
@@ -166,7 +166,7 @@ def test_the_map_of_another_log_is_replaced_only_when_told(pg_url: str, tmp_path
 def test_advised_commands_are_for_the_site(pg_url: str, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", walk(3))
     append_raw(log, b"{}")
-    done = replay_site(ReplayRequest(Site("a", log), SiteDatabases(pg_url, pg_url)), print)
+    done = replay_site(ReplayRequest(Site("a", log), Targets(pg_url, pg_url)), print)
     assert done.error is not None
     before, tail = done.error.partition("to leave it out run: ")[2].split(" && ")
     for command in (before, tail):
@@ -306,7 +306,7 @@ def test_a_site_whose_server_refuses_the_list_of_databases_is_not_asked(tmp_path
                 connection.execute("REVOKE SELECT ON pg_catalog.pg_database FROM PUBLIC")
             url = server.url_of("a").replace("://postgres@", "://asker@")
             question = read_question({"crops": [{"class": "chair"}]})
-            sites, databases = [Site("a", tmp_path)], {"a": SiteDatabases(url, url)}
+            sites, databases = [Site("a", tmp_path)], {"a": Targets(url, url)}
             answer = ask_sites(sites, databases, question, top=1, camera=None, jobs=1)
     assert "permission denied" in answer.not_asked["a"]
 
@@ -323,7 +323,7 @@ def test_a_user_who_may_not_create_databases_is_told_what_to_do(
         connection.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(user)))
         try:
             url = pg_server.url_of(f"{user}_a").replace("://postgres@", f"://{user}@")
-            done = replay_site(ReplayRequest(Site("a", log), SiteDatabases(url, url)), print)
+            done = replay_site(ReplayRequest(Site("a", log), Targets(url, url)), print)
         finally:
             connection.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(user)))
     assert done.error is not None

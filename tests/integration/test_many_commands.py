@@ -38,8 +38,8 @@ from projections.map.view import MapView
 from projections.postgres.connection import Targets
 from projections.postgres.inputs import LogInputs
 from projections.postgres.live_fold import LiveFold
+from projections.postgres.live_tail import tail
 from projections.postgres.rebuild import rebuild
-from projections.postgres.tail import tail
 from scripts.programs.bench.commands import (
     KINDS,
     commands_of,

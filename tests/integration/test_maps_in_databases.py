@@ -20,7 +20,7 @@ from projections.map.fold import fold_log
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import CandidateReader
+from projections.postgres.queries.candidate_search import CandidateReader
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY

@@ -14,6 +14,7 @@ from projections.map.own_events import read_corrections
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.queries.candidate_search import CandidateReader, prepare_graph
 from projections.postgres.queries.map_queries import (
     FoldedMap,
     LiveMap,
@@ -23,7 +24,6 @@ from projections.postgres.queries.map_queries import (
     similar_objects,
     where_is,
 )
-from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
 from projections.surfaces.serve import Answerer, Pools
 from tests.support.logs import append_command, name_place, walk, write_log
 

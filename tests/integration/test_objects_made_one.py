@@ -14,11 +14,11 @@ from projections.map.own_events import read_corrections
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
-from projections.postgres.graph_render import expected_rows
+from projections.postgres.graph_rows import expected_rows
 from projections.postgres.live_fold import LiveFold, batches
-from projections.postgres.memory_sink import MemorySink, MemoryTables
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import append_command, command, walk, write_log
+from tests.support.memory_sink import MemorySink, MemoryTables
 from tests.support.rows import all_rows, expected_graph, followed_and_rebuilt, parsed
 
 SETTINGS = Settings()

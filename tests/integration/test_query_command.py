@@ -11,6 +11,7 @@ from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets, connect
+from projections.postgres.queries.candidate_search import prepare_graph
 from projections.postgres.queries.map_queries import (
     FoldedMap,
     LiveMap,
@@ -20,7 +21,6 @@ from projections.postgres.queries.map_queries import (
     places_holding,
     where_is,
 )
-from projections.postgres.queries.relocalize import prepare_graph
 from tests.support.commands import Commands
 from tests.support.logs import walk, write_log
 

@@ -14,7 +14,7 @@ from projections.postgres import RebuildProgress, rebuild
 from projections.postgres.check import check
 from projections.postgres.connection import Connection, Targets, connect
 from projections.postgres.replaced_tables import try_drop_lock
-from projections.postgres.vector_table import build_hnsw
+from projections.postgres.vector_sink import build_hnsw
 from tests.support.logs import walk, write_log
 from tests.support.rows import all_rows, wait_for_drops
 

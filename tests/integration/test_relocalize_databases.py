@@ -15,7 +15,7 @@ from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import CandidateReader, relocalize
+from projections.postgres.queries.candidate_search import CandidateReader, relocalize
 from tests.support.commands import Commands
 from tests.support.envelopes import detection
 from tests.support.logs import WEIRD, walk, write_log

@@ -14,7 +14,7 @@ import pytest
 from eventsrc.base.errors import TransportError
 from projections.localize.relocalize import parse_question, question_schema
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import relocalize
+from projections.postgres.queries.candidate_search import relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from tests.support.serve_questions import (
     DEADLINE_S,

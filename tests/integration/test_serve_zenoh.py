@@ -9,7 +9,7 @@ import pytest
 from eventsrc.record.transport.session import Session
 from projections.localize.relocalize import Track, parse_question
 from projections.postgres.connection import Targets, connect
-from projections.postgres.queries.relocalize import relocalize
+from projections.postgres.queries.candidate_search import relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from tests.support.serve_questions import (
     DEADLINE_S,

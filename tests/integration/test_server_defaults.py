@@ -13,7 +13,7 @@ from psycopg import sql
 from projections.fold.errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild, tail
-from projections.postgres import cluster as _cluster
+from projections.postgres import data_folder as _cluster
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, pin_session_settings
 from projections.postgres.embedded import EmbeddedServer

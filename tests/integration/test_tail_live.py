@@ -1,6 +1,7 @@
 """A tail that follows a growing log: rows, status, metrics, stopping, dead letters."""
 
 import re
+import sys
 import threading
 import urllib.request
 from dataclasses import replace
@@ -16,9 +17,9 @@ from projections.fold.errors import ProjectionBusy, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets
-from projections.postgres.retry import retry
+from projections.postgres.rebuild import retry
 from projections.postgres.status import projection_status
-from projections.postgres.tail_metrics import serving_tail_metrics
+from projections.postgres.tail_progress import serving_tail_metrics
 from tests.support.envelopes import envelope, payload
 from tests.support.logs import append_raw, bridge, walk, write_log
 from tests.support.rows import all_rows
@@ -204,7 +205,7 @@ def test_parked_events_are_tried_again(
         mended = replace(event, payload=event.payload.replace(b'"none"', b"[]"))
         return read_envelope(mended, max_bytes=max_bytes)
 
-    monkeypatch.setattr("projections.postgres.retry.read_envelope", lenient)
+    monkeypatch.setattr(sys.modules["projections.postgres.rebuild"], "read_envelope", lenient)
     monkeypatch.setattr(
         "projections.map.fold.read_envelopes",
         lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],

@@ -28,7 +28,7 @@ from projections.localize.relocalize.ranking import Answer
 from projections.map.fold import fold_log
 from projections.postgres import TailProgress, rebuild, tail
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import CandidateReader, relocalize
+from projections.postgres.queries.candidate_search import CandidateReader, relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.guard import Guard
 from projections.surfaces.serve.http import create_app

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projections.fold.errors import QuestionError
-from projections.postgres.queries.place_graph import PlaceGraph, PlaceNode
+from projections.postgres.queries.graph_reads import PlaceGraph, PlaceNode
 
 SIZE = 6
 EDGES = st.dictionaries(

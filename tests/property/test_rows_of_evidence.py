@@ -14,9 +14,9 @@ from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker
 from projections.map.records import Estimate
 from projections.map.view import MapView
-from projections.postgres.graph_render import object_rows
+from projections.postgres.graph_rows import object_rows
 from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
-from projections.postgres.memory_sink import MemorySink, MemoryTables
+from tests.support.memory_sink import MemorySink, MemoryTables
 from tests.support.rows import memory_rows
 from tests.support.synthetic_objects import (
     STEPS,

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from eventsrc.envelope.commands import Join
 from projections.fold.deltas import KeyframePlaced, PlaceFormed, PlacesMerged
 from projections.fold.settings import Settings
-from projections.postgres.memory_sink import MemoryTables
 from tests.property.test_rows_of_evidence import followed, rebuilt
 from tests.property.test_whole_fold_corrected import World, compiled, corrected_worlds
 from tests.support.envelopes import envelope
 from tests.support.folds import Folded
+from tests.support.memory_sink import MemoryTables
 from tests.support.walks import anchor
 
 ROOMS = {"places": "rooms", "rooms": {"cell_m": 0.25, "drive_m": 0.75}}

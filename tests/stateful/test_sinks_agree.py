@@ -39,7 +39,6 @@ from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.loader import LoaderName
-from projections.postgres.memory_sink import MemorySink, MemoryTables
 from tests.support.envelopes import envelope
 from tests.support.logs import (
     append_command,
@@ -53,6 +52,7 @@ from tests.support.logs import (
     walk,
     write_log,
 )
+from tests.support.memory_sink import MemorySink, MemoryTables
 from tests.support.rows import ORDER, graph_rows, vector_rows, wait_for_drops
 from tests.support.thorough import THOROUGH
 

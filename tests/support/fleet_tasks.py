@@ -6,7 +6,7 @@ import threading
 from pathlib import Path
 from typing import NoReturn
 
-from projections.adapters.fleet.engine import Progress
+from projections.adapters.fleet.engines import Progress
 
 
 def double(number: int, progress: Progress) -> int:

@@ -33,9 +33,9 @@ from projections.map.view import MapView
 from projections.postgres import TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold, batches
-from projections.postgres.memory_sink import MemorySink, MemoryTables
 from projections.postgres.replaced_tables import wait_for_drop
 from tests.support.logs import bridge, walk, write_log
+from tests.support.memory_sink import MemorySink, MemoryTables
 
 ORDER = (
     "Run", "Keyframe", "Pose", "Observation", "Object", "Place", "HAS_KEYFRAME", "HAS_POSE",

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.base.errors import MisuseError
-from projections.adapters.fleet.engine import RETRIES, Ended
-from projections.adapters.fleet.local_pool import LocalPool
+from projections.adapters.fleet.engines import RETRIES, Ended, LocalPool
 from projections.surfaces.cli.fleet_options import open_engine
 from tests.support.fleet_tasks import double, fails, killed
 
@@ -53,7 +52,7 @@ def test_a_fault_is_an_error_of_its_site_alone() -> None:
 _PARENT = """
 import sys
 from pathlib import Path
-from projections.adapters.fleet.local_pool import LocalPool
+from projections.adapters.fleet.engines import LocalPool
 from tests.support.fleet_tasks import wait
 if __name__ == "__main__":
     with LocalPool(1) as pool:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from projections.postgres.loading_thread import WAITING_JOBS, LoadingThread, short_turns
+from projections.postgres.shadows import WAITING_JOBS, LoadingThread, short_turns
 
 
 def test_jobs_run_in_order_in_one_other_thread() -> None:

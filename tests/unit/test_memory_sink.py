@@ -9,9 +9,9 @@ from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
 from projections.postgres.live_fold import LiveFold, batches
-from projections.postgres.memory_sink import MemorySink, MemoryTables
-from projections.postgres.sink import LiveSink, RebuildSink
+from projections.postgres.sink import Sink
 from tests.support.logs import bridge, walk, write_log
+from tests.support.memory_sink import MemorySink, MemoryTables
 
 SETTINGS = Settings()
 
@@ -25,7 +25,7 @@ def log(tmp_path: Path) -> Path:
 def followed(log: Path, size: int, start: int = 0) -> tuple[LiveFold, MemoryTables]:
     """The rows of a sink that got the log in batches, from an offset on."""
     fold, tables, sink = LiveFold(SETTINGS), MemoryTables(), MemorySink()
-    live: LiveSink[MemoryTables] = sink
+    live: Sink[MemoryTables] = sink
     assert not live.ensure(tables)
     with LogReader(log) as reader:
         for batch in batches(reader.read(FIRST_OFFSET), size, [start]):
@@ -40,7 +40,7 @@ def followed(log: Path, size: int, start: int = 0) -> tuple[LiveFold, MemoryTabl
 
 def rebuilt(log: Path, size: int, tables: MemoryTables) -> tuple[LiveFold, dict[str, int]]:
     fold, rebuilds = LiveFold(SETTINGS), MemorySink()
-    sink: RebuildSink[MemoryTables] = rebuilds
+    sink: Sink[MemoryTables] = rebuilds
     sink.drop_leftovers(tables)
     shadow = sink.shadow()
     shadow.create(tables)

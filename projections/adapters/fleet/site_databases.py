@@ -9,7 +9,6 @@ import contextlib
 import os
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import quote
 
@@ -43,28 +42,10 @@ Template = tuple[str, str]
 """A URL with ``{site}``, and what messages call it."""
 
 
-@dataclass(frozen=True, slots=True)
-class SiteDatabases:
-    """The URLs of one site."""
-
-    graph_url: str = field(repr=False)
-    vector_url: str = field(repr=False)
-
-    @property
-    def targets(self) -> Targets:
-        """The same URLs as `Targets`, which functions for one map take."""
-        return Targets(self.graph_url, self.vector_url)
-
-    @property
-    def urls(self) -> tuple[str, ...]:
-        """Each database once."""
-        return tuple(dict.fromkeys((self.graph_url, self.vector_url)))
-
-
 @contextlib.contextmanager
 def site_databases(
     sites: Sequence[Site], db: str | None, vector_db: str | None
-) -> Iterator[dict[str, SiteDatabases]]:
+) -> Iterator[dict[str, Targets]]:
     """The databases of each site, by its name. The embedded server, if needed, runs while the
     context is open. Raises MisuseError for an invalid template or name, and where two sites would
     share a database."""
@@ -131,13 +112,11 @@ def _filled(template: Template, name: str) -> str:
     return filled
 
 
-def _databases(
-    sites: Sequence[Site], graph: Template, vectors: Template
-) -> dict[str, SiteDatabases]:
-    of: dict[str, SiteDatabases] = {}
+def _databases(sites: Sequence[Site], graph: Template, vectors: Template) -> dict[str, Targets]:
+    of: dict[str, Targets] = {}
     owners: dict[tuple[str, str, str], str] = {}
     for site in sites:
-        of[site.name] = SiteDatabases(_filled(graph, site.name), _filled(vectors, site.name))
+        of[site.name] = Targets(_filled(graph, site.name), _filled(vectors, site.name))
         for url in of[site.name].urls:
             parts = conninfo_to_dict(url)
             port = parts.get("port") or os.environ.get("PGPORT") or 5432

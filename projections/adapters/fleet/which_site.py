@@ -1,4 +1,4 @@
-"""Find the map that a question is from: the probability of each of several maps, and of none. Pure.
+"""Find the map that a question is from: ask the databases of all sites, several at once.
 
 Scores of places cannot be compared across maps: they are shares of one map's poses. The two
 probabilities of an answer can, as each map calibrates them: `known`, that it has the things shown,
@@ -9,11 +9,21 @@ is its share in the questions that the weights were fitted on.
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
+from eventsrc.base.advised import advised
+from eventsrc.base.errors import MapfoldError
+from eventsrc.log.reader import segments_of
 from projections.fold.exact_functions import exp
-from projections.localize.relocalize import Answer
+from projections.fold.settings import Camera
+from projections.localize.relocalize import Answer, Question, rank
+from projections.postgres.connection import Targets
+from projections.postgres.queries.candidate_search import CandidateReader
+
+from .site_databases import exists
+from .sites import Site
 
 KNOWN_WEIGHT: Final = 0.863
 CONFIDENCE_WEIGHT: Final = 0.470
@@ -72,10 +82,55 @@ def which_site(answers: Mapping[str, Answer]) -> WhichSite:
 
 
 def _evidence(answer: Answer) -> float:
-    logits: Sequence[float] = [_logit(answer.known), _logit(answer.confidence)]
-    return INTERCEPT + KNOWN_WEIGHT * logits[0] + CONFIDENCE_WEIGHT * logits[1]
+    of_confidence = CONFIDENCE_WEIGHT * _logit(answer.confidence)
+    return INTERCEPT + KNOWN_WEIGHT * _logit(answer.known) + of_confidence
 
 
 def _logit(probability: float) -> float:
     within = min(1.0 - _LEAST, max(_LEAST, probability))
     return math.log(within / (1.0 - within))
+
+
+@dataclass(frozen=True, slots=True)
+class FleetAnswer:
+    """The ranking of the sites that could be asked, and why the others could not."""
+
+    which: WhichSite
+    not_asked: Mapping[str, str]
+
+
+def ask_sites(
+    sites: Sequence[Site],
+    databases: Mapping[str, Targets],
+    question: Question,
+    *,
+    top: int,
+    camera: Camera | None,
+    jobs: int,
+) -> FleetAnswer:
+    """Ask each site; one that cannot be asked does not affect the ranking of the others."""
+    with ThreadPoolExecutor(jobs, "ask") as threads:  # it mostly waits for the databases
+        answers = threads.map(
+            lambda site: _ask(site, databases[site.name], question, top=top, camera=camera), sites
+        )
+        found = {site.name: answer for site, answer in zip(sites, answers, strict=True)}
+    return FleetAnswer(
+        which_site({name: a for name, a in found.items() if isinstance(a, Answer)}),
+        {name: a for name, a in found.items() if isinstance(a, str)},
+    )
+
+
+def _ask(
+    site: Site, databases: Targets, question: Question, *, top: int, camera: Camera | None
+) -> Answer | str:
+    """The answer of one site's map, or the reason why there is none."""
+    try:
+        for url in databases.urls:
+            if exists(url) is False:
+                segments_of(site.log)  # raises where there is no log to replay
+                return f"there is no such database yet; `{advised('fleet', 'replay')}` makes it"
+        with CandidateReader(databases) as reader:
+            candidates = reader.candidates(question.crops)
+        return rank(question, candidates, top=top, camera=camera)
+    except MapfoldError as error:
+        return str(error)

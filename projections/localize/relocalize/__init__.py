@@ -1,7 +1,7 @@
 """Re-localisation: ranked Places and a pose from a few object crops, as a pure ranking.
 
 `rank` turns crops (`question`) and candidates into an `Answer`; candidates come from the databases
-(`projections.postgres.queries.relocalize`) or from a folded map (`ExactIndex`).
+(`projections.postgres.queries.candidate_search`) or from a folded map (`ExactIndex`).
 """
 
 from .candidates import NEIGHBOURS, CandidatePlace, ExactIndex, MapCandidates, Match, ObjectEstimate

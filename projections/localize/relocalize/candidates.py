@@ -1,7 +1,7 @@
 """Candidates: the map's observations most similar to each crop, and their Places.
 
 `MapCandidates` is the whole input of the ranking. The databases make it with one query
-(`projections.postgres.queries.relocalize`), a folded map by exact search (`ExactIndex`). The
+(`projections.postgres.queries.candidate_search`), a folded map by exact search (`ExactIndex`). The
 ranking treats both alike.
 
 Exact search: unit vectors are multiples of 2⁻²⁰ and multiplied in float64, so every sum is exact

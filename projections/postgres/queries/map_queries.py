@@ -15,8 +15,14 @@ from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 from projections.postgres.connection import Connection
 
-from .graph_reads import read_object, read_object_counts, read_objects_of_place, read_place_graph
-from .place_graph import PlaceGraph, PlaceNode
+from .graph_reads import (
+    PlaceGraph,
+    PlaceNode,
+    read_object,
+    read_object_counts,
+    read_objects_of_place,
+    read_place_graph,
+)
 
 _OBJECT_FIELDS = (
     "object_id",

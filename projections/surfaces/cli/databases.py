@@ -31,6 +31,7 @@ from projections.postgres import (
 from projections.postgres.loader import LoaderName
 from projections.postgres.origin import command_line
 from projections.postgres.sink import SinkName
+from projections.postgres.tail_progress import serving_tail_metrics
 
 from .folded_log import LogSettings, W
 from .options import Databases, JsonOption
@@ -263,9 +264,6 @@ def _metrics(address: tuple[str, int] | None, progress: TailProgress, log: Path)
     if address is None:
         yield
         return
-    # Imported only when used.
-    from projections.postgres.tail_metrics import serving_tail_metrics
-
     with serving_tail_metrics(address, progress, log) as port:
         say_metrics(address, port)
         yield

@@ -11,7 +11,7 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
-from projections.adapters.fleet.engine import Ended, usable_cores
+from projections.adapters.fleet.engines import Ended, usable_cores
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
 
@@ -32,7 +32,7 @@ from .options import CameraOptions, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
-    from projections.adapters.fleet.replaying import ChosenSettings
+    from projections.adapters.fleet.site_tasks import ChosenSettings
 
 fleet_app = typer.Typer(
     help="Rebuild, check and ask many sites, each with a log and a database of its own.",
@@ -44,7 +44,7 @@ _NAMED: Final = 10
 
 def _chosen(given: FoldSettings) -> "ChosenSettings":
     """The values of ``--settings`` and ``--set``, read here: workers may be on other machines."""
-    from projections.adapters.fleet.replaying import ChosenSettings
+    from projections.adapters.fleet.site_tasks import ChosenSettings
 
     given.checked()
     base = None if given.settings_file is None else settings_from(given.settings_file, None)
@@ -85,7 +85,7 @@ def replay(
     It can be interrupted and run again: sites that are up to date are skipped. Databases that do
     not exist are created. A map made from another log is replaced only with --replace.
     """
-    from projections.adapters.fleet.replaying import ReplayRequest, SiteReplay, replay_site
+    from projections.adapters.fleet.site_tasks import ReplayRequest, SiteReplay, replay_site
 
     chosen = _chosen(settings)
     sites = sites_of(place)
@@ -170,7 +170,7 @@ def status(
 
     Exit 3 when a site is not up to date, has lost something or cannot be read.
     """
-    from projections.adapters.fleet.looking import SiteStatus, StatusRequest, look_at_site
+    from projections.adapters.fleet.site_tasks import SiteStatus, StatusRequest, look_at_site
 
     from .db import status_document
     from .log import info_document
@@ -208,7 +208,7 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Read every byte of all logs, as `log verify` does of one; exit 3 if anything is wrong."""
-    from projections.adapters.fleet.looking import SiteVerification, verify_site
+    from projections.adapters.fleet.site_tasks import SiteVerification, verify_site
 
     from .log import finding_text, verification_document
 
@@ -258,7 +258,7 @@ def relocalize(
     Each site's map is asked as by `mapfold relocalize`; its answer is in the output. Exit 3 when a
     site could not be asked.
     """
-    from projections.adapters.fleet.asking import ask_sites
+    from projections.adapters.fleet.which_site import ask_sites
 
     question, asked_by = question_from(query), camera.camera
     sites = sites_of(place)

@@ -12,10 +12,10 @@ import typer
 from eventsrc.base.errors import LogError, MisuseError
 from eventsrc.base.text import counted
 from eventsrc.log import LogReader
-from projections.adapters.fleet.engine import Ended, Engine, Task, usable_cores
-from projections.adapters.fleet.local_pool import LocalPool
-from projections.adapters.fleet.site_databases import SiteDatabases, site_databases
+from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Task, usable_cores
+from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import Site, find_sites
+from projections.postgres.connection import Targets
 
 from .terminal import Bar, people, say
 
@@ -30,7 +30,7 @@ def open_engine(engine: str, jobs: int | None, tasks: int) -> Engine:
         raise MisuseError(f"--engine {engine}: there are local and dask://HOST:PORT")
     if jobs is not None:
         raise MisuseError("--jobs is for --engine local; a cluster runs as many as it has workers")
-    from projections.adapters.fleet.cluster import DaskCluster  # its package is an extra
+    from projections.adapters.fleet.dask_cluster import DaskCluster  # its package is an extra
 
     return DaskCluster(address)
 
@@ -86,7 +86,7 @@ class FleetDatabases:
     db: TemplateOption = None
     vector_db: VectorTemplateOption = None
 
-    def opened(self, sites: Sequence[Site]) -> AbstractContextManager[dict[str, SiteDatabases]]:
+    def opened(self, sites: Sequence[Site]) -> AbstractContextManager[dict[str, Targets]]:
         """The databases by name of site."""
         return site_databases(sites, self.db, self.vector_db)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from eventsrc.base.text import visible
-from projections.adapters.fleet.looking import SiteStatus
+from projections.adapters.fleet.site_tasks import SiteStatus
 from projections.adapters.fleet.sites import Site
 from projections.adapters.fleet.which_site import WhichSite
 from projections.postgres.status import SinkStatus

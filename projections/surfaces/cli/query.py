@@ -12,6 +12,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.map.own_events import read_corrections
 from projections.postgres.connection import connect
+from projections.postgres.queries.candidate_search import CandidateReader, prepare_graph
 from projections.postgres.queries.map_queries import (
     FoldedMap,
     LiveMap,
@@ -22,7 +23,6 @@ from projections.postgres.queries.map_queries import (
     similar_objects,
     where_is,
 )
-from projections.postgres.queries.relocalize import CandidateReader, prepare_graph
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults

@@ -103,7 +103,7 @@ def relocalize(
         if log is None:
             chosen.of_past_map(log)
             # Here: `evaluate` and `whatif` import this module and ask no database.
-            from projections.postgres.queries.relocalize import CandidateReader
+            from projections.postgres.queries.candidate_search import CandidateReader
 
             targets = stack.enter_context(databases.opened())
             search: Search = stack.enter_context(CandidateReader(targets)).candidates

@@ -22,7 +22,7 @@ from projections.adapters.drawing import LostRobot, Spot
 from projections.localize.relocalize import Answer, rank, read_question
 from projections.map.view import MapView
 from projections.postgres.connection import Targets
-from projections.postgres.queries.relocalize import CandidateReader
+from projections.postgres.queries.candidate_search import CandidateReader
 
 from .folder import DemoFolder
 

@@ -24,9 +24,13 @@ from projections.postgres.connection import (
     database_errors,
     describe_target,
 )
-from projections.postgres.queries.candidates import CandidateSearch
-from projections.postgres.queries.known_constants import ConstantsMemory
-from projections.postgres.queries.relocalize import CandidateReader, prepare_graph, prepare_vectors
+from projections.postgres.queries.candidate_rows import ConstantsMemory
+from projections.postgres.queries.candidate_search import (
+    CandidateReader,
+    CandidateSearch,
+    prepare_graph,
+    prepare_vectors,
+)
 from projections.postgres.sink import SinkName
 
 OUTAGE_TIMEOUT_S: Final = 10.0

@@ -32,7 +32,7 @@ from projections.localize.relocalize import Question, QuestionCrop, QuestionView
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.queries.relocalize import CandidateReader
+from projections.postgres.queries.candidate_search import CandidateReader
 from tests.support.buildings import Building, drive
 from tests.support.scenes import crops_of
 

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.append import append_payload
-from projections.adapters.fleet.cluster import DaskCluster
-from projections.adapters.fleet.engine import Ended
-from projections.adapters.fleet.local_pool import LocalPool
-from projections.adapters.fleet.replaying import ReplayRequest, replay_site
+from projections.adapters.fleet.dask_cluster import DaskCluster
+from projections.adapters.fleet.engines import Ended, LocalPool
+from projections.adapters.fleet.site_tasks import ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
 from projections.fold.settings import Settings
 from projections.postgres.check import check
@@ -133,7 +132,7 @@ def _judge(requests: Sequence[ReplayRequest]) -> int:
     """How many sites were rebuilt twice; raises if one's rows are not those of its log."""
     twice = 0
     for request in requests:
-        reports = check(request.site.log, request.databases.targets, Settings())
+        reports = check(request.site.log, request.databases, Settings())
         if not all(report.sound for report in reports):
             raise AssertionError(f"{request.site.name}: {[report.differing for report in reports]}")
         with connect(request.databases.graph_url) as connection:

@@ -13,11 +13,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from projections.adapters.fleet.cluster import ClusterError, DaskCluster
-from projections.adapters.fleet.engine import Ended, Engine, Progress
-from projections.adapters.fleet.local_pool import LocalPool
-from projections.adapters.fleet.replaying import ReplayRequest, SiteReplay, replay_site
+from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
+from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Progress
 from projections.adapters.fleet.site_databases import site_databases
+from projections.adapters.fleet.site_tasks import ReplayRequest, SiteReplay, replay_site
 from projections.adapters.fleet.sites import Site
 from projections.postgres.embedded import EmbeddedServer
 from scripts.programs.bench.projections.world import make_log

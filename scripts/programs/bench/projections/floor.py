@@ -32,12 +32,24 @@ from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.parsed_log import default_workers
-from projections.postgres import graph_schema as _graph_ddl
-from projections.postgres import rebuild, vector_table
+from projections.postgres import rebuild
 from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer
+from projections.postgres.graph_sink import (
+    analyze_graph,
+    count_graph,
+    create_graph,
+    drop_graph,
+    index_graph,
+)
 from projections.postgres.labels import GRAPH, LABELS, TABLE
 from projections.postgres.replaced_tables import wait_for_drop
+from projections.postgres.vector_sink import (
+    analyze_vectors,
+    count_vectors,
+    create_vectors,
+    vector_type,
+)
 
 from .world import DIM, make_log
 
@@ -152,10 +164,10 @@ def _copy(
 
     with connection.transaction():
         connection.execute("SET LOCAL search_path = ag_catalog, public")
-        _graph_ddl.create(connection, FLOOR_GRAPH)
+        create_graph(connection, FLOOR_GRAPH)
         connection.execute("CREATE SCHEMA floor_vectors")
-        vector = vector_table.vector_type(connection)
-        vector_table.create(connection, FLOOR_VECTORS, vector, DIM)
+        vector = vector_type(connection)
+        create_vectors(connection, FLOOR_VECTORS, vector, DIM)
         if is_default:
             table = sql.Identifier(FLOOR_VECTORS, TABLE)
             connection.execute(sql.SQL("ALTER TABLE {} RESET (toast_tuple_target)").format(table))
@@ -168,17 +180,17 @@ def _copy(
         )
         _feed(connection, query, files["vectors"])
         lap()
-        _graph_ddl.index(connection, FLOOR_GRAPH)
-        _graph_ddl.analyze(connection, FLOOR_GRAPH)
-        vector_table.analyze(connection, FLOOR_VECTORS)
+        index_graph(connection, FLOOR_GRAPH)
+        analyze_graph(connection, FLOOR_GRAPH)
+        analyze_vectors(connection, FLOOR_VECTORS)
         lap()
-        _graph_ddl.counts(connection, FLOOR_GRAPH)
-        vector_table.count(connection, FLOOR_VECTORS)
+        count_graph(connection, FLOOR_GRAPH)
+        count_vectors(connection, FLOOR_VECTORS)
         lap()
     lap()
     connection.execute("DROP SCHEMA floor_vectors CASCADE")
     with connection.transaction():
-        _graph_ddl.drop(connection, FLOOR_GRAPH)
+        drop_graph(connection, FLOOR_GRAPH)
     lap()
     return Seconds(*(after - before for before, after in pairwise(laps)))
 

@@ -1,13 +1,31 @@
-"""One pass of a tail, from the checkpoints to the end of the log; `tail` has the rules."""
+"""Tail: keep the databases at the end of the log while it grows.
+
+A tail folds the log from its start, or from the last snapshot below the checkpoints (the fold's
+state is kept nowhere else), and writes to each sink from its own checkpoint on. One pass
+(`TailPass`) lasts until the tail is stopped, unless the server loses commits that it had not
+flushed: then the fold is ahead of the databases, and another pass begins at their checkpoints.
+
+A batch has the events since the last one: a single event at a low rate, up to `BATCH_EVENTS` when
+the tail is behind. Each batch is one transaction per database (`writer`).
+
+An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
+same transaction that moves past it. Parked events are left out at every later start too, so that
+the rows stay equal to the fold, until a rebuild tries them again.
+
+A command changes how earlier events are folded. One that only names places is applied at once, in
+the transaction that moves past it. Any other command interrupts the tail: a `refold` folds the log
+again, and the tail continues from there. At the start of a pass the checkpoints state which
+commands the map includes, so none is lost. If a command moves a keyframe out of bounds, the refold
+ends, the old map stays without later events, and the tail waits for another command.
+"""
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
@@ -15,47 +33,112 @@ from eventsrc.log import Event, LogReader, event_hash, follow
 from projections.fold.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.map.own_events import read_command
-from projections.store.column_rows import TableWriter
-from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
-from projections.store.timeline_cache import TimelineCache
 
 from . import checkpoints
+from .batch_writer import AWAY, Backoff, LostCommits, Writer
 from .checkpoints import DeadLetter, dead_letter
-from .connection import Targets, database_errors
+from .connection import Targets, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .live_fold import LiveFold, batches
-from .map_rows import maps_key
+from .loader import LoaderName
+from .map_table import maps_key
 from .origin import origin_fault, refuse_mismatch, refuse_other_events, replay_advice, rows_dropped
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
 from .sink import Checkpoint, SinkName
-from .stores import Store
-from .tail_progress import TailProgress, TailReport
-from .writer import AWAY, LostCommits, OnTrouble, SinkBatch, Writer
+from .stores import DatabaseSink, Only, Store, open_stores
+from .tail_progress import TailPlan, TailProgress, TailReport
 
-HEARTBEAT_S: Final = 5.0
-
-OnBatch: TypeAlias = Callable[[TailReport], None]
-OnRefold: TypeAlias = Callable[[int, int], None]
-Note: TypeAlias = Callable[[str], None]
+BATCH_EVENTS: Final = 500
+"""The most events in one transaction: about half a second of work when behind."""
+ONCE_TIMEOUT_S: Final = 60.0
+"""Seconds that `tail` with ``once`` waits for an unreachable database."""
 
 
-@dataclass(frozen=True, slots=True)
-class TailPlan:
-    """The arguments of `tail`."""
+def tail(
+    log: Path,
+    targets: Targets,
+    settings: Settings | SettingsOf,
+    *,
+    once: bool = False,
+    only: Only = None,
+    loader: LoaderName = "copy",
+    batch_events: int = BATCH_EVENTS,
+    stop: threading.Event | None = None,
+    on_fold: Callable[[int], None] = lambda _: None,
+    on_batch: Callable[[TailReport], None] = lambda _: None,
+    on_trouble: Callable[[str], None] = lambda _: None,
+    on_refold: Callable[[int, int], None] = lambda _done, _total: None,
+    note: Callable[[str], None] = lambda _: None,
+    progress: TailProgress | None = None,
+) -> TailReport:
+    """Follow ``log`` until ``stop`` is set, or with ``once`` only to its present end.
 
-    log: Path
-    targets: Targets
-    settings: Settings | SettingsOf
-    once: bool
-    stop: threading.Event
-    patience_s: float | None
-    batch_events: int
-    on_fold: Callable[[int], None]
-    on_batch: OnBatch
-    on_trouble: OnTrouble
-    on_refold: OnRefold
-    note: Note
-    progress: TailProgress
+    ``settings`` may depend on the log's corrections. ``on_batch`` is called after each commit;
+    ``on_fold`` is called with the number of events folded and written, at the start of a pass and
+    after each batch of it; ``on_refold`` with the number of events that a refold has folded and the
+    number that it has to fold. ``note`` is called with a message for each snapshot that could not
+    be used or kept, which costs time and nothing else, and for a command that cannot be applied;
+    with ``once`` such a command is raised (ImpossibleCommand). Raises ProjectionMismatch when the
+    databases were made from another log or with other settings, ProjectionBusy, CheckpointMoved.
+    """
+    plan = TailPlan(
+        log,
+        targets,
+        settings,
+        once,
+        stop or threading.Event(),
+        ONCE_TIMEOUT_S if once else None,
+        batch_events,
+        on_fold,
+        on_batch,
+        on_trouble,
+        on_refold,
+        note,
+        progress or TailProgress(),
+    )
+    report = TailReport()
+    outage: Backoff | None = None
+    while True:
+        try:
+            if _run_pass(plan, report, only, loader, outage):
+                return report
+        except LostCommits:
+            report.restarts += 1
+            # The database may be unreachable while the next pass begins.
+            at = describe_target(targets.graph_url)
+            outage = Backoff(at, plan)
+
+
+def _run_pass(
+    plan: TailPlan, report: TailReport, only: Only, loader: LoaderName, outage: Backoff | None
+) -> bool:
+    """Run one pass; False when the database was unreachable at its beginning. Raises LostCommits.
+
+    ``outage`` is None for the first pass, which does not wait for an unreachable database.
+    """
+    run: TailPass | None = None
+    try:
+        if outage is not None:
+            outage.wait()
+            plan.targets.restart_embedded()
+        with LogReader(plan.log) as reader:
+            inputs = LogInputs.read(reader, plan.settings)
+            opened = open_stores(
+                plan.targets,
+                inputs.latest.settings,
+                only=only,
+                application="mapfold tail",
+                loader=loader,
+            )
+            with opened as stores:
+                run = TailPass(plan, stores, report, inputs, inputs.latest)
+                run.run(reader)
+    except AWAY as error:
+        if (run is not None and run.began) or outage is None:
+            raise
+        outage.failed(error)
+        return False
+    return True
 
 
 @dataclass(slots=True)
@@ -63,8 +146,7 @@ class TailPass:
     """From the checkpoints to the end of the log, or for as long as it grows.
 
     Call `run`. ``current`` are the inputs of the map. ``parked`` has all dead letters by offset,
-    ``letters`` those that are to be written with the next batch. ``recorder`` keeps what is
-    folded.
+    ``letters`` those that are to be written with the next batch.
     """
 
     plan: TailPlan
@@ -76,7 +158,6 @@ class TailPass:
     parked: dict[Offset, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
     began: bool = False
-    recorder: HistoryRecorder | None = None
 
     def run(self, reader: LogReader) -> None:
         """Follow the log, and refold when commands make it necessary.
@@ -148,14 +229,12 @@ class TailPass:
             return True
         plan.progress.count_failure()
         plan.note(f"mapfold: {error}; until another command comes the old map stays as it is")
-        writers, last_beat = self._writers(), time.monotonic()
+        writers = self._writers()
         for event in follow(plan.log, known, stop=plan.stop):
             if event is not None and event.key == COMMAND_KEY:
                 return True
-            if time.monotonic() - last_beat > HEARTBEAT_S:
-                last_beat = time.monotonic()
-                for writer in writers:
-                    writer.write_heartbeat()
+            for writer in writers:
+                writer.beat()
         return False
 
     def _follow(self, reader: LogReader, folded: LiveFold | None) -> bool:
@@ -164,46 +243,27 @@ class TailPass:
         ``folded`` is the fold that the databases were made with just now.
         """
         plan = self.plan
-        fold = folded or self._resumed(reader)
+        fold = folded or LiveFold.resumed(
+            reader, self.current.settings, self.current.corrections, self._fold_limit(), plan.note
+        )
         start = fold.map.next_offset
         writers = self._writers()
-        last_beat = time.monotonic()
         plan.on_fold(start)
-        for batch in batches(
-            self._events(reader, start), plan.batch_events, self._checkpoint_offsets()
-        ):
+        # Batches end at the checkpoints, so that a sink gets a batch as a whole or not at all.
+        cuts = {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
+        for batch in batches(self._events(reader, start), plan.batch_events, cuts):
             if not self._knows(batch):
                 return False
             last = self._fold(fold, batch)
             if last is not None:
-                self._write(fold, writers, last)
+                self._write(fold, writers, reader.log_id, last)
                 plan.on_fold(Offset(last.offset + 1))
-            if time.monotonic() - last_beat > HEARTBEAT_S:
-                last_beat = time.monotonic()
-                for writer in writers:
-                    writer.write_heartbeat()
+            for writer in writers:
+                writer.beat()
             if plan.once and plan.stop.is_set():
                 break
-        self._keep(fold)
+        fold.keep()
         return True
-
-    def _resumed(self, reader: LogReader) -> LiveFold:
-        """The fold to go on with, from the latest one that was kept below the checkpoints."""
-        current, note = self.current, self.plan.note
-        settings, corrections = current.settings, current.corrections
-        cache = TimelineCache(reader, settings, corrections, note)
-        self.recorder = HistoryRecorder(reader, settings, corrections, cache, None)
-        found = resumed_under_other_names(reader, settings, corrections, self._fold_limit(), note)
-        writer: TableWriter | None = self.recorder.writer()
-        if found is not None and found[0].next_offset > self.recorder.end:  # of other names
-            writer = None
-        return LiveFold(settings, found, corrections=corrections, reader=reader, writer=writer)
-
-    def _keep(self, fold: LiveFold) -> None:
-        """Keep the history that was folded, to go on from the next time."""
-        if self.recorder is not None and fold.writer is not None:
-            self.recorder.keep(fold.writer, fold.map)
-            fold.writer = None
 
     def _knows(self, batch: Sequence[Event]) -> bool:
         """Record the commands of a batch; False when they change more than names."""
@@ -223,22 +283,7 @@ class TailPass:
         return follow(self.plan.log, start, stop=self.plan.stop)
 
     def _writers(self) -> list[Writer]:
-        plan = self.plan
-        return [
-            Writer(
-                store,
-                self.checkpoints,
-                plan.targets.restart_embedded,
-                plan.stop,
-                plan.on_trouble,
-                plan.patience_s,
-            )
-            for store in self.stores
-        ]
-
-    def _checkpoint_offsets(self) -> set[Offset]:
-        """Batches end there, so that a sink gets a batch as a whole or not at all."""
-        return {checkpoint.next_offset for checkpoint in self.checkpoints.values()}
+        return [Writer(store, self.checkpoints, self.plan) for store in self.stores]
 
     def _fold_limit(self) -> Offset:
         """The highest offset a fold to start from may have: the lowest checkpoint or parked event.
@@ -250,43 +295,39 @@ class TailPass:
 
         False when the map does not include all commands, or was made under other corrections.
         """
-        plan = self.plan
         reader.refresh()
-        self.inputs = LogInputs.read(reader, plan.settings)
-        parked: dict[Offset, DeadLetter] = {}
-        faults = False
+        self.inputs = LogInputs.read(reader, self.plan.settings)
+        self.parked, faults = {}, False
         for store in self.stores:
             with database_errors(store.url), store.connection.transaction():
                 for sink in store.sinks:
-                    made = sink.ensure(store.connection)
-                    checkpoints.create(
-                        store.connection, sink.name, reader.log_id, self.inputs.latest
-                    )
-                    found = checkpoints.load(store.connection, sink.name)
-                    assert found is not None  # noqa: S101 - created in this transaction
-                    faults |= self._refuse_mismatch(found, sink.name, store.place, reader)
-                    if made and found.next_offset:
-                        raise rows_dropped(
-                            found, sink.name, store.place, plan.log, self.inputs.latest
-                        )
-                    # Now, as `status` reports a sink as followed while its lock is held.
-                    checkpoints.write_refold(store.connection, sink.name, None, None)
-                    self.checkpoints[sink.name] = found
-                    letters = checkpoints.parked(store.connection, sink.name)
-                    parked.update((letter.offset, letter) for letter in letters)
-        self.parked = parked
+                    faults |= self._begin_sink(store, sink, reader)
         self.report.next_offset = min(c.next_offset for c in self.checkpoints.values())
         self.plan.progress.update(self.report)
         # Only the graph has names, so it decides which names the map has now.
         first = self.checkpoints.get("graph") or next(iter(self.checkpoints.values()))
         self.current = self.inputs.at(first.known_to)
+        others = [self.inputs.at(c.known_to) for c in self.checkpoints.values()]
         return not faults and all(
-            self.current.differs_only_in_names(other)
-            for other in (
-                self.inputs.latest,
-                *(self.inputs.at(c.known_to) for c in self.checkpoints.values()),
-            )
+            map(self.current.differs_only_in_names, [self.inputs.latest, *others])
         )
+
+    def _begin_sink(self, store: Store, sink: DatabaseSink, reader: LogReader) -> bool:
+        """Whether a sink was made under other corrections."""
+        connection, latest = store.connection, self.inputs.latest
+        made = sink.ensure(connection)
+        checkpoints.create(connection, sink.name, reader.log_id, latest)
+        found = checkpoints.load(connection, sink.name)
+        assert found is not None  # noqa: S101 - created in this transaction
+        has_fault = self._refuse_mismatch(found, sink.name, store.place, reader)
+        if made and found.next_offset:
+            raise rows_dropped(found, sink.name, store.place, self.plan.log, latest)
+        # Now, as `status` reports a sink as followed while its lock is held.
+        checkpoints.write_refold(connection, sink.name, None, None)
+        self.checkpoints[sink.name] = found
+        letters = checkpoints.parked(connection, sink.name)
+        self.parked.update((letter.offset, letter) for letter in letters)
+        return has_fault
 
     def _refuse_mismatch(
         self, found: Checkpoint, sink: SinkName, where: str, reader: LogReader
@@ -299,9 +340,6 @@ class TailPass:
         advice = replay_advice(log, self.inputs.latest)
         refuse_other_events(found, sink, where, log, reader, advice)
         return True
-
-    def _advice(self) -> str:
-        return replay_advice(self.plan.log, self.current)
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
         """Fold a batch; returns its last event, None for an empty one."""
@@ -323,42 +361,26 @@ class TailPass:
         if any(event.offset < c.next_offset for c in self.checkpoints.values()):
             raise ProjectionMismatch(
                 f"{error}, but it is in the databases already: they were made by another version;"
-                f" {self._advice()}"
+                f" {replay_advice(self.plan.log, self.current)}"
             )
         letter = dead_letter(event, error.reason)
         self.parked[letter.offset] = letter
         self.letters.append(letter)
         self.report.parked.append(letter)
 
-    def _write(self, fold: LiveFold, writers: list[Writer], last: Event) -> None:
+    def _write(self, fold: LiveFold, writers: list[Writer], log_id: str, last: Event) -> None:
         """Write a batch to the sinks that do not have it yet."""
-        next_offset = Offset(last.offset + 1)
         self._use_names(fold, last.offset)
-        changes, maps = fold.tracker.drain(), maps_key(fold.view)
-        written = 0
-        for writer in writers:
-            parts = [
-                SinkBatch(
-                    sink,
-                    sink.prepare(changes, fold.view),
-                    tuple(self.letters),
-                    at,
-                    checkpoints.at_offset(
-                        at.log_id, self.current, next_offset, event_hash(last), maps=maps
-                    ),
-                )
-                for sink in writer.store.sinks
-                if (at := self.checkpoints[sink.name]).next_offset < next_offset
-            ]
-            if parts:
-                for part, after in zip(parts, writer.write(parts), strict=True):
-                    written = max(written, after.next_offset - part.before.next_offset)
-                    self.checkpoints[part.sink.name] = after
+        after = checkpoints.at_offset(
+            log_id, self.current, fold.map.next_offset, event_hash(last), maps=maps_key(fold.view)
+        )
+        changes = fold.tracker.drain()
+        written = max(writer.write(changes, fold.view, self.letters, after) for writer in writers)
         self.letters.clear()
         if written:
             self.report.events += written
             self.report.batches += 1
-            self.report.next_offset = next_offset
+            self.report.next_offset = after.next_offset
             self.plan.progress.update(self.report)
             self.plan.on_batch(self.report)
 
@@ -372,5 +394,5 @@ class TailPass:
         known = self.inputs.at(known_at)
         if self.current.differs_only_in_names(known):
             self.current = known
-            self._keep(fold)
+            fold.keep()
             fold.use_names(offset, known.corrections)

@@ -1,4 +1,4 @@
-"""Run tasks in worker processes on this machine.
+"""Engines run a task for each site; this one, `LocalPool`, in worker processes on this machine.
 
 Each worker is a pool of one process (`concurrent.futures`). When one is killed, only its pool
 breaks, which identifies the interrupted site; the site is started again in a new process, at most
@@ -14,17 +14,59 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.text import counted
 
-from .engine import RETRIES, Ended, Progress, Task
+RETRIES: Final = 2
+"""The most times that the task of a killed worker is started again."""
+
+Progress: TypeAlias = Callable[[int], None]
+"""A function that receives the number of events that a task has processed."""
+Task: TypeAlias = Callable[[Any, Progress], Any]
+"""A task is a module-level function, which workers import; request and result are pickled. Errors
+of the site's log or database are in the result, not raised."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The outcome of the request with this index: a result, or ``error`` when its workers were
+    killed `RETRIES` + 1 times or the task raised. ``attempts`` counts its starts, as far as the
+    engine can count them."""
+
+    index: int
+    result: Any
+    error: str | None
+    attempts: int
+
+
+class Engine(Protocol):
+    """Runs tasks. A context manager; leaving it ends or cancels what still runs."""
+
+    def run(
+        self, task: Task, requests: Sequence[Any], progress: Progress | None = None
+    ) -> Iterator[Ended]:
+        """Run the task for each request; yields each as soon as it has ended. ``progress`` receives
+        the sum of the events that tasks have reported, several times a second."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, kind: object, error: object, at: object, /) -> None: ...
+
+
+def usable_cores() -> int:
+    """The cores this process may run on, which may be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return max(1, len(os.sched_getaffinity(0)))
+    return os.cpu_count() or 1
+
 
 _POLL_S: Final = 0.25
 _ERROR_CHARS: Final = 400
@@ -49,7 +91,7 @@ class LocalPool:
     def run(
         self, task: Task, requests: Sequence[Any], progress: Progress | None = None
     ) -> Iterator[Ended]:
-        """See `projections.adapters.fleet.engine.Engine`."""
+        """See `Engine.run`."""
         for slot in range(self._jobs):
             self._discard(slot)  # it has the counters of an earlier run
         self._done = self._context.RawArray("q", max(1, len(requests)))

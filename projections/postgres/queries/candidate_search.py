@@ -1,4 +1,4 @@
-"""Candidates from the live databases, in one round trip to each for crops with embeddings.
+"""MapCandidates from the live databases, in one round trip to each for crops with embeddings.
 
 Crops without one are answered with observations of Objects of their class, which takes three more.
 
@@ -12,22 +12,30 @@ import contextlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Self
 
 import numpy as np
 import psycopg
+from pgvector.psycopg import register_vector
 from psycopg import sql
 
 from eventsrc.base.advised import advised
-from projections.fold.deltas import ObservationOrdinal, PlaceOrdinal
-from projections.fold.errors import ProjectionMismatch, ProjectionMissing, QuestionError
+from projections.fold.errors import (
+    DatabaseError,
+    ExtensionMissing,
+    ProjectionMismatch,
+    ProjectionMissing,
+    QuestionError,
+)
+from projections.fold.settings import Camera
 from projections.localize.relocalize import (
     NEIGHBOURS,
-    CandidatePlace,
+    Answer,
     MapCandidates,
-    Match,
-    ObjectEstimate,
     QuestionCrop,
+    Method,
+    Question,
+    rank,
 )
 from projections.localize.relocalize.candidates import (
     OBSERVATIONS_OF_EACH,
@@ -35,19 +43,24 @@ from projections.localize.relocalize.candidates import (
     objects_of_a_class,
     refuse_unknown_classes,
 )
-from projections.localize.relocalize.question import Box
-from projections.postgres.connection import Connection, Targets, database_errors, describe_target
-from projections.postgres.graph_render import text
+from projections.postgres.connection import (
+    Connection,
+    Targets,
+    connect,
+    database_errors,
+    describe_connection,
+    describe_target,
+)
+from projections.postgres.cypher import refuse_without_age
+from projections.postgres.graph_rows import text
 from projections.postgres.labels import LABEL_IDS
 from projections.postgres.map_table import read_with_key
 from projections.postgres.statements import statements, tables
 
-from .known_constants import ConstantsMemory, KnownConstants
+from .candidate_rows import NO_LINKS, ConstantsMemory, KnownConstants, Linked, Rows, assemble
 
-_NUMBER_MASK: Final = (1 << 48) - 1
 _NEAR: Final = 12
 """Number of columns of the statement ``near``."""
-_Rows = list[tuple[Any, ...]]
 
 
 def refuse_mixed(
@@ -85,15 +98,13 @@ class CandidateSearch:
         self._vectors, self._graph = vectors, graph
         self._known: KnownConstants = memory.known
 
-    def candidates(
-        self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
-    ) -> MapCandidates:
+    def candidates(self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places; of a crop
         without embedding observations of its class."""
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
-        near: _Rows = []
-        linked = _NOTHING
+        near: Rows = []
+        linked = NO_LINKS
         if looked or not named:
             near, linked = self._nearest([crops[number] for number in looked], neighbours)
             if named:
@@ -102,7 +113,7 @@ class CandidateSearch:
             of_classes, more = self._of_classes(crops, named)
             near, linked = near + of_classes, linked.union(more)
         self._memory.known = self._known
-        found = _assemble(len(crops), near, linked, self._known)
+        found = assemble(len(crops), near, linked, self._known)
         refuse_unknown_classes(crops, found.matches, self._class_names)
         return found
 
@@ -116,7 +127,7 @@ class CandidateSearch:
         if row is not None:
             self.candidates([QuestionCrop(np.array(row[0], np.float32))])
 
-    def _nearest(self, crops: Sequence[QuestionCrop], neighbours: int) -> "tuple[_Rows, _Linked]":
+    def _nearest(self, crops: Sequence[QuestionCrop], neighbours: int) -> tuple[Rows, Linked]:
         """Rows of crop, similarity, det_pk and further columns of ``near``; and their Objects and
         Places."""
         one = self._vectors is self._graph
@@ -133,11 +144,9 @@ class CandidateSearch:
         if not one:
             return near, self._follow([row[2] for row in near], origin)
         of_graph = next((row[_NEAR:] for row in rows if row[_NEAR] is not None), None)
-        return near, _NOTHING if of_graph is None else self._linked(of_graph, origin)
+        return near, NO_LINKS if of_graph is None else self._linked(of_graph, origin)
 
-    def _of_classes(
-        self, crops: Sequence[QuestionCrop], named: Sequence[int]
-    ) -> "tuple[_Rows, _Linked]":
+    def _of_classes(self, crops: Sequence[QuestionCrop], named: Sequence[int]) -> tuple[Rows, Linked]:
         """As `_nearest`, for crops of which only the class is known; ``named`` are their
         indices."""
         names = sorted({crops[number].class_name or "" for number in named})
@@ -166,14 +175,14 @@ class CandidateSearch:
         ]
         return near, linked
 
-    def _near(self, rows: _Rows) -> tuple[_Rows, str | None]:
+    def _near(self, rows: Rows) -> tuple[Rows, str | None]:
         """Store the cosines; returns the rows that have an observation, from the column ``crop``
         on, and the origin."""
         cosines, origin = next((row[0] for row in rows if row[0] is not None), (None, None))
         self._known = self._known.with_cosines(cosines)
         return [row[1:_NEAR] for row in rows if row[3] is not None], origin
 
-    def _follow(self, det_pks: Iterable[int], origin: str | None) -> "_Linked":
+    def _follow(self, det_pks: Iterable[int], origin: str | None) -> Linked:
         """Object and Places of observations; ``origin`` is that of the vectors."""
         values = {"det_pks": sorted(set(det_pks)), "observation": LABEL_IDS["Observation"]}
         with _query_errors(self._targets.graph_url):
@@ -181,7 +190,7 @@ class CandidateSearch:
             rows = self._graph.execute(_statement("graph"), values, binary=True).fetchall()
             return self._linked(rows[0], origin)
 
-    def _linked(self, row: tuple[Any, ...], origin: str | None) -> "_Linked":
+    def _linked(self, row: tuple[Any, ...], origin: str | None) -> Linked:
         """Store the settings and check the origin; ``row`` has the columns of ``of_graph``."""
         settings, graph, maps, things, places = row[0]
         if graph != origin or settings is not None:
@@ -190,7 +199,7 @@ class CandidateSearch:
             self._known = self._known.with_settings(settings, place)
         if maps is not None:
             self._known = self._with_maps(maps[0])
-        return _Linked.of(row[1:], things or {}, places or {})
+        return Linked.of(row[1:], things or {}, places or {})
 
     def _with_maps(self, key: str | None) -> KnownConstants:
         if key is None:
@@ -234,120 +243,6 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
     return " ".join(line for line in lines if line).encode()
 
 
-class _Thing(NamedTuple):
-    object_id: str
-    class_name: str
-    estimate: ObjectEstimate | None
-
-
-_NONE: Final = 0
-"""Stands for no graph id; ids are never 0."""
-_NO_EDGES: Final = (_NONE, _NONE, _NONE)
-
-
-class _Linked(NamedTuple):
-    """Ids of Object, its Place and the keyframe's Place by det_pk; and the Objects and Places with
-    these ids."""
-
-    ids: dict[int, tuple[int, int, int]]
-    things: dict[int, _Thing]
-    places: dict[int, tuple[PlaceOrdinal, CandidatePlace]]
-
-    @classmethod
-    def of(
-        cls, edges: Sequence[list[int]], things: dict[str, str], places: dict[str, str]
-    ) -> "_Linked":
-        """Made from the edges in the statement ``graph`` and the properties of Objects and
-        Places."""
-        observes, located, has, in_place = (
-            dict(zip(starts, ends, strict=True))
-            for starts, ends in zip(edges[::2], edges[1::2], strict=True)
-        )
-        ids = {
-            observation & _NUMBER_MASK: (
-                thing := observes.get(observation, _NONE),
-                located.get(thing, _NONE),
-                in_place.get(has.get(observation, _NONE), _NONE),
-            )
-            for observation in observes.keys() | has.keys()
-        }
-        return cls(
-            ids,
-            {int(thing): _thing(properties) for thing, properties in things.items()},
-            {
-                int(place): (_ordinal(int(place)), _place(properties))
-                for place, properties in places.items()
-            },
-        )
-
-    def union(self, more: "_Linked") -> "_Linked":
-        """The union with ``more``."""
-        return _Linked(self.ids | more.ids, self.things | more.things, self.places | more.places)
-
-
-_NOTHING: Final = _Linked({}, {}, {})
-
-
-def _assemble(crops: int, near: _Rows, linked: _Linked, known: KnownConstants) -> MapCandidates:
-    ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
-    matches: list[list[Match]] = [[] for _ in range(crops)]
-    ordinals = {place: ordinal for place, (ordinal, _) in linked.places.items()}
-    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in ordered:
-        thing_id, its, there = linked.ids.get(det_pk, _NO_EDGES)
-        thing = linked.things.get(thing_id)
-        matches[crop].append(
-            Match(
-                ObservationOrdinal(det_pk - 1),
-                det_id,
-                run_id,
-                float(similarity),
-                None if x is None else (x, y, yaw),
-                _box(bbox),
-                class_name if thing is None else thing.class_name,
-                None if thing is None else thing.object_id,
-                ordinals.get(its),
-                ordinals.get(there),
-                None if thing is None else thing.estimate,
-            )
-        )
-    rows = tuple(map(tuple, matches))
-    return MapCandidates(rows, dict(linked.places.values()), known.constants, known.walls)
-
-
-def _box(array: str) -> Box:
-    """A box from the text form of its array, which gives the log's numbers; the binary form would
-    be rounded to 32 bits."""
-    x0, y0, x1, y1 = array[1:-1].split(",")
-    return float(x0), float(y0), float(x1), float(y1)
-
-
-def _thing(properties: str) -> _Thing:
-    """An Object; without an estimate under ``fusion = "page"`` and in a map of an older version,
-    which has no covariance."""
-    found = json.loads(properties)
-    estimate = None
-    if "est_xx" in found:
-        estimate = ObjectEstimate(
-            *(found[f"est_{name}"] for name in ("x", "y", "xx", "xy", "yy", "spots"))
-        )
-    return _Thing(found["object_id"], found["class_name"], estimate)
-
-
-def _place(properties: str) -> CandidatePlace:
-    found = json.loads(properties)
-    return CandidatePlace(
-        found["place_id"],
-        found["centroid_x"],
-        found["centroid_y"],
-        found.get("name"),
-        found.get("floor"),
-    )
-
-
-def _ordinal(graphid: int) -> PlaceOrdinal:
-    return PlaceOrdinal((graphid & _NUMBER_MASK) - 1)
-
-
 @contextlib.contextmanager
 def _query_errors(url: str) -> Iterator[None]:
     """Translate errors of a question that does not fit the map, and of a database without a map."""
@@ -364,3 +259,109 @@ def _query_errors(url: str) -> Iterator[None]:
                 f"the question does not fit the map: {error.diag.message_primary}; ask with the"
                 " model that made the map"
             ) from None
+
+
+_EF_SEARCH = max(100, NEIGHBOURS)
+
+
+def relocalize(
+    targets: Targets,
+    question: Question | Sequence[QuestionCrop],
+    *,
+    top: int = 3,
+    method: Method = "joint",
+    camera: Camera | None = None,
+) -> Answer:
+    """Answer a question for re-localisation from the databases as they are now."""
+    crops = question.crops if isinstance(question, Question) else question
+    with CandidateReader(targets) as reader:
+        return rank(question, reader.candidates(crops), top=top, method=method, camera=camera)
+
+
+def question_error(targets: Targets) -> str | None:
+    """Why questions cannot be answered, found by asking one; None if they can."""
+    try:
+        with CandidateReader(targets) as reader:
+            reader.try_question()
+    except DatabaseError as error:
+        return str(error)
+    return None
+
+
+def prepare_graph(connection: Connection) -> None:
+    """Set up a session for joins of the graph's tables by id; ag_catalog comes last in the path.
+
+    Raises ExtensionMissing for a user who may not use AGE.
+
+    A question joins a few hundred ids. By default the planner reads whole tables into hashes for
+    that: 300 ms instead of 10 at 300,000 observations.
+    """
+    refuse_without_age(connection)
+    connection.execute('SET search_path = "$user", public, ag_catalog')
+    for setting in ("jit", "enable_hashjoin", "enable_mergejoin"):
+        connection.execute(sql.SQL("SET {} = off").format(sql.Identifier(setting)))
+
+
+def prepare_vectors(connection: Connection) -> None:
+    """Set up a session for vector search: vectors in binary, a wider HNSW search.
+
+    Without a wider ``ef_search`` an HNSW index silently returns fewer rows than asked for.
+    """
+    try:
+        register_vector(connection)
+    except psycopg.ProgrammingError:
+        raise ExtensionMissing(
+            f"{describe_connection(connection)}: nothing has been projected there yet, not even"
+            f" the extension vector is created; run `{advised('replay')}`"
+        ) from None
+    connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
+    connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
+
+
+class CandidateReader:
+    """Connections to the databases of one projection, for one question after the other."""
+
+    def __init__(self, targets: Targets, memory: ConstantsMemory | None = None) -> None:
+        self._targets, self._memory = targets, memory or ConstantsMemory()
+        self._vectors = connect(targets.vector_url, application="mapfold query", autocommit=True)
+        self._graph = self._vectors
+        try:
+            with database_errors(targets.vector_url):
+                prepare_vectors(self._vectors)
+            if not targets.one_database:
+                self._graph = connect(
+                    targets.graph_url, application="mapfold query", autocommit=True
+                )
+            with database_errors(targets.graph_url):
+                prepare_graph(self._graph)
+        except BaseException:
+            self.close()
+            raise
+
+    def candidates(self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS) -> MapCandidates:
+        """The ``neighbours`` observations most similar to each crop, with their Places."""
+        return self._search().candidates(crops, neighbours)
+
+    def try_question(self) -> None:
+        """Ask one question. Raises DatabaseError when questions cannot be answered."""
+        self._search().try_question()
+
+    def _search(self) -> CandidateSearch:
+        return CandidateSearch(self._targets, self._vectors, self._graph, self._memory)
+
+    def disable_index(self) -> None:
+        """From now on search exactly, without the HNSW index: slow."""
+        self._vectors.execute("SET enable_indexscan = off")
+        # plans made before would still use the index
+        self._vectors.execute("SET plan_cache_mode = force_custom_plan")
+
+    def close(self) -> None:
+        """Close the connections. May be called twice."""
+        self._vectors.close()
+        self._graph.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

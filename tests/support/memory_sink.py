@@ -1,6 +1,6 @@
 """The sink that keeps rows in memory: the same rows as the databases, in plain dictionaries.
 
-Tests compare the databases with it; it also serves where there is no database.
+Tests compare the databases with it.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,12 +9,11 @@ from typing import Any
 
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
-
-from .graph_rows import GraphRows, changed_rows, changing_rows, fixed_rows
-from .labels import LABELS, TABLE, Label
-from .map_rows import MapRow, map_rows
-from .sink import PreparedWrite
-from .vector_rows import VectorRow, new_rows
+from projections.postgres.graph_rows import GraphRows, changed_rows, changing_rows, fixed_rows
+from projections.postgres.labels import LABELS, TABLE, Label
+from projections.postgres.map_table import MapRow, map_rows
+from projections.postgres.sink import PreparedWrite
+from projections.postgres.vector_rows import VectorRow, new_rows
 
 
 @dataclass(slots=True)
@@ -40,9 +39,9 @@ class MemoryTables:
 
 
 class MemorySink:
-    """Implements `LiveSink` and `RebuildSink` for both graph and vectors."""
+    """Implements `Sink` for both graph and vectors."""
 
-    def ensure(self, connection: MemoryTables) -> bool:  # noqa: ARG002 - the port
+    def ensure(self, connection: MemoryTables) -> bool:
         """Nothing to do: `MemoryTables` begins with its tables."""
         return False
 
@@ -76,13 +75,13 @@ class MemoryShadow:
     def __init__(self) -> None:
         self._new = MemoryTables()
 
-    def create(self, connection: MemoryTables) -> None:  # noqa: ARG002 - the port
+    def create(self, connection: MemoryTables) -> None:
         """Create it, empty."""
         self._new = MemoryTables()
 
     def load(self, changes: BatchChanges, view: MapView) -> Callable[[MemoryTables], None]:
         """Rows of new keyframes and observations that never change again."""
-        graph = fixed_rows(view, changes.keyframes, changes.observations)
+        graph = fixed_rows(view, changes)
         vectors = new_rows(changes, view)
 
         def load(_: MemoryTables) -> None:

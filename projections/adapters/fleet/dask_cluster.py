@@ -16,7 +16,7 @@ from uuid import uuid4
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import counted
 
-from .engine import RETRIES, Ended, Progress, Task
+from .engines import RETRIES, Ended, Progress, Task
 
 _CONNECT_S: Final = 10.0
 _ANSWER_S: Final = 12.0
@@ -73,7 +73,7 @@ class DaskCluster:
     def run(
         self, task: Task, requests: Sequence[Any], progress: Progress | None = None
     ) -> Iterator[Ended]:
-        """See `projections.adapters.fleet.engine.Engine`; ``progress`` always receives 0."""
+        """See `Engine.run`; ``progress`` always receives 0."""
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         name = f"mapfold-{uuid4().hex[:8]}"
         futures: dict[str, tuple[int, Any]] = {}
