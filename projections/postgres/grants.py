@@ -8,6 +8,7 @@ from psycopg import sql
 from .connection import Connection
 from .cypher import FIRST_ENFORCING_VERSION
 from .labels import Label
+from .sink import SINKS
 from .statements import statements
 
 _PRIVILEGES: Final = {
@@ -73,9 +74,9 @@ def _grant(connection: Connection, privilege: str, what: sql.Composable, role: s
         )
 
 
-def roles_sql(sinks: Collection[str] = ("graph", "vectors")) -> str:
+def roles_sql(sinks: Collection[str] = tuple(SINKS)) -> str:
     """SQL for psql that makes the roles of a database that holds ``sinks``."""
     parts = statements("roles")
-    wanted = ["reader", "writer", *(name for name in ("graph", "vectors") if name in sinks)]
+    wanted = ["reader", "writer", *(name for name in SINKS if name in sinks)]
     first = sql.Literal(list(FIRST_ENFORCING_VERSION))
     return "\n\n".join(parts[name].format(first=first).as_string() for name in wanted) + "\n"

@@ -26,8 +26,6 @@ from .vector_sink import VectorSink
 
 Only: TypeAlias = SinkName | None
 """The one sink to write, None for all."""
-
-
 DatabaseSink: TypeAlias = GraphSink | VectorSink
 
 
@@ -85,7 +83,7 @@ def open_stores(
     """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
     stores: list[Store] = []
     try:
-        for url, sinks in _sinks_by_url(targets, settings, only, loader):
+        for url, sinks in _sinks_by_url(targets, settings, only, loader).items():
             stores.append(Store(url, application, sinks, _open(url, application, sinks)))
         yield stores
     finally:
@@ -95,16 +93,13 @@ def open_stores(
 
 def _sinks_by_url(
     targets: Targets, settings: Settings, only: Only, loader: LoaderName
-) -> list[tuple[str, tuple[DatabaseSink, ...]]]:
-    graph = GraphSink(loader)
-    vectors = VectorSink(loader, dimension=settings.embedding_dim)
-    if only == "graph":
-        return [(targets.graph_url, (graph,))]
-    if only == "vectors":
-        return [(targets.vector_url, (vectors,))]
-    if targets.one_database:
-        return [(targets.graph_url, (graph, vectors))]
-    return [(targets.graph_url, (graph,)), (targets.vector_url, (vectors,))]
+) -> dict[str, tuple[DatabaseSink, ...]]:
+    found: dict[str, tuple[DatabaseSink, ...]] = {}
+    for sink in (GraphSink(loader), VectorSink(loader, dimension=settings.embedding_dim)):
+        if only in (None, sink.name):
+            url = targets.url_of(sink.name)
+            found[url] = (*found.get(url, ()), sink)
+    return found
 
 
 def _open(url: str, application: str, sinks: tuple[DatabaseSink, ...]) -> Connection:

@@ -9,7 +9,7 @@ SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHER
 CREATE SCHEMA mapfold;
 COMMENT ON SCHEMA mapfold IS 'mapfold: progress of the projections; made and removed by mapfold';
 CREATE TABLE mapfold.checkpoint (
-    sink         text PRIMARY KEY CHECK (sink IN ('graph', 'vectors')),
+    sink         text PRIMARY KEY,
     log_id       text NOT NULL,
     fingerprint  text NOT NULL,           -- of the settings and the corrections
     settings     text NOT NULL,           -- canonical JSON, to say what differs
