@@ -32,9 +32,9 @@ from projections.localize.relocalize import (
     NEIGHBOURS,
     Answer,
     MapCandidates,
-    QuestionCrop,
     Method,
     Question,
+    QuestionCrop,
     rank,
 )
 from projections.localize.relocalize.candidates import (
@@ -98,7 +98,9 @@ class CandidateSearch:
         self._vectors, self._graph = vectors, graph
         self._known: KnownConstants = memory.known
 
-    def candidates(self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS) -> MapCandidates:
+    def candidates(
+        self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
+    ) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places; of a crop
         without embedding observations of its class."""
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
@@ -146,7 +148,9 @@ class CandidateSearch:
         of_graph = next((row[_NEAR:] for row in rows if row[_NEAR] is not None), None)
         return near, NO_LINKS if of_graph is None else self._linked(of_graph, origin)
 
-    def _of_classes(self, crops: Sequence[QuestionCrop], named: Sequence[int]) -> tuple[Rows, Linked]:
+    def _of_classes(
+        self, crops: Sequence[QuestionCrop], named: Sequence[int]
+    ) -> tuple[Rows, Linked]:
         """As `_nearest`, for crops of which only the class is known; ``named`` are their
         indices."""
         names = sorted({crops[number].class_name or "" for number in named})
@@ -338,7 +342,9 @@ class CandidateReader:
             self.close()
             raise
 
-    def candidates(self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS) -> MapCandidates:
+    def candidates(
+        self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
+    ) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places."""
         return self._search().candidates(crops, neighbours)
 
