@@ -1,4 +1,4 @@
-"""Every relative link of README and docs leads somewhere in the repository."""
+"""Every relative link of README and docs, and each module they name, is in the repository."""
 
 import re
 from pathlib import Path
@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "logs" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+_MODULE = re.compile(r"`((?:eventsrc|projections|tests|scripts)/[\w/]+\.py)`")
 _LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)(?:#[^)]*)?\)")
 
 
@@ -14,6 +15,12 @@ _LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)(?:#[^)]*)?\)")
 def test_links_lead_somewhere(page: Path) -> None:
     for link in _LINK.findall(page.read_text("utf-8")):
         assert (page.parent / link).exists(), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_named_modules_are_there(page: Path) -> None:
+    for path in _MODULE.findall(page.read_text("utf-8")):
+        assert (ROOT / path).is_file(), path
 
 
 def test_links_are_found() -> None:
