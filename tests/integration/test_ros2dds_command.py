@@ -13,9 +13,10 @@ import zenoh
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.log import follow
-from eventsrc.record.recorder.bridged import HOLD_MESSAGES, token_selectors, topic_of, type_of_token
+from eventsrc.record.recorder.bridged import HOLD_MESSAGES
 from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
 from eventsrc.record.transport.session import Session
+from eventsrc.ros.derivation import token_selectors, topic_of, type_of_token
 from projections.surfaces.cli.bridged import recording_of
 from tests.support import ros2dds
 from tests.support.commands import Commands

@@ -11,12 +11,12 @@ from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
 from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent, VerbatimEvent, verify_log
 from eventsrc.record.gap_history import ledger_of
 from eventsrc.record.importers.run import import_files
-from eventsrc.record.recorder.bridged import Bridge, append_missing, message_of
+from eventsrc.record.recorder.bridged import Bridge, append_missing, derive
 from eventsrc.record.recorder.checking import Checker
 from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
 from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
-from eventsrc.ros.derivation import RosRecording, derive, read_recording
+from eventsrc.ros.derivation import RosRecording, read_recording
 from projections.surfaces.cli.bridged import recording_of
 from tests.support import ros2dds
 from tests.support.fixtures_log import KEY, read_log
@@ -76,7 +76,7 @@ def test_a_killed_recording_is_completed_by_the_next(tmp_path: Path) -> None:
         grids = sum(e.key == "/map" for e in after)
         assert sum(e.key == MAP_KEY for e in after) == grids
         assert made == len(after) - end - 1
-        ready = [d.payload for _, d in derive(events[:end], TYPES, message_of)]
+        ready = [d.payload for _, d in derive(events[:end], TYPES)]
         assert sorted(ready) == sorted(
             e.payload for e in after if e.is_envelope or e.key == MAP_KEY
         )

@@ -9,11 +9,11 @@ from typing import Any
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 from eventsrc.record.gap_history import ledger_of
-from eventsrc.record.recorder.bridged import Bridge, message_of, topic_of
+from eventsrc.record.recorder.bridged import Bridge, derive
 from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
-from eventsrc.ros.derivation import derive
+from eventsrc.ros.derivation import topic_of
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
@@ -111,7 +111,7 @@ def check_derived(log: Path) -> None:
     """Every envelope and map stands right behind the message that completes it, or at the end, and
     is made again of the messages alone."""
     events = read_log(log)
-    made = list(derive(events, TYPES, message_of))
+    made = list(derive(events, TYPES))
     recorded = [event for event in events if event.is_envelope or event.key == MAP_KEY]
     assert [each.derived.payload for each in made] == [event.payload for event in recorded]
     for (completed_at, _), event in zip(made, recorded, strict=True):

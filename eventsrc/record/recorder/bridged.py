@@ -1,21 +1,6 @@
 """Record messages of a zenoh-bridge-ros2dds verbatim, and the envelopes that they complete.
 
-Keys, types and caches: a message of topic ``/tf`` comes under the key ``tf``, or ``bot1/tf`` from a
-bridge whose namespace is ``/bot1``. Its payload is the message in CDR, with the four bytes of
-encapsulation before it. In a log its topic is the key with a slash before it. The type is in a
-liveliness token that the bridge declares for each topic that it publishes, with ``§`` for each
-slash of the key and of the type::
-
-    @/<zenoh id>/@ros2_lv/MP/bot1§tf/tf2_msgs§msg§TFMessage/<quality of service>
-    @ros2_lv/<zenoh id>/MP/…                                     (older bridges)
-
-The last messages of a transient-local topic (``/tf_static``) are in a cache of the bridge, which
-answers queries::
-
-    bot1/tf_static/@adv/pub/**
-    @/<zenoh id>/@ros2_pub_cache/bot1/tf_static  (older bridges)
-
-Recording: Zenoh's threads put messages into the queue and note tokens of types. The writer thread
+Zenoh's threads put messages into the queue and note tokens of types. The writer thread
 gives the messages to `Bridge.take`, which finds the type of each and returns what is to be
 appended: the message with its schema, and right behind it the envelopes that it completes
 (`eventsrc.ros`). A message whose type no token has given yet is held back, for at most `HOLD_NS`
@@ -30,7 +15,6 @@ log (`eventsrc.ros.derivation`), so the next recorder appends them before it rec
 nothing to do. A recording that has lost events to damage is left as it is.
 """
 
-import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -38,11 +22,10 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import msgspec
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import visible
-from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset, RunId
 from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
 from eventsrc.record.append import append_payload, map_event
@@ -53,71 +36,15 @@ from eventsrc.ros.derivation import (
     Derivation,
     Derived,
     RosRecording,
-    derive,
-    identity_of,
-    recording_of,
+    key_of,
+    read_recording,
+    type_of_token,
 )
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.stream import Counts
 
 from .checking import CheckedMessage
 from .queue import BridgedMessage
-
-SLASH: Final = "§"
-MAX_TOKEN: Final = 4_096
-_ANY_KEY: Final = "?_anyke"
-"""The parameter of a query that accepts answers under other keys than its own."""
-_TOKEN: Final = re.compile(r"(?:@/[^/]+/@ros2_lv|@ros2_lv/[^/]+)/MP/([^/]+)/([^/]+)(?:/.*)?")
-_TYPE: Final = re.compile(r"[A-Za-z]\w{0,99}/msg/[A-Za-z]\w{0,99}", re.ASCII)
-_NAME: Final = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
-_MAX_NAME: Final = 500
-
-
-def topic_of(namespace: str, topic: str, option: str) -> str:
-    """The topic in a log of messages of the ROS topic ``topic`` from a bridge with ``namespace``.
-    Raises MisuseError, which names ``option``, for an invalid name."""
-    name = topic.removeprefix("/")
-    if not _is_name(name):
-        raise MisuseError(
-            f"{option} {visible(repr(topic[:80]))} is no name of a ROS 2 topic; examples: "
-            "/detections, /camera/detections"
-        )
-    bare = namespace.strip("/")
-    if bare and not _is_name(bare):
-        raise MisuseError(
-            f"--namespace {visible(repr(namespace[:80]))} is no ROS 2 namespace; example: /bot1"
-        )
-    return f"/{bare}/{name}" if bare else f"/{name}"
-
-
-def _is_name(text: str) -> bool:
-    return len(text) <= _MAX_NAME and _NAME.fullmatch(text) is not None
-
-
-def key_of(topic: str) -> str:
-    """The Zenoh key of a topic in a log."""
-    return topic.removeprefix("/")
-
-
-def token_selectors(key: str) -> tuple[str, ...]:
-    """The key expressions that match the type tokens of a key, of current and older bridges."""
-    escaped = key.replace("/", SLASH)
-    return f"@/*/@ros2_lv/MP/{escaped}/**", f"@ros2_lv/*/MP/{escaped}/**"
-
-
-def cache_selectors(key: str) -> tuple[str, ...]:
-    """The queries for the cached messages of a key, of current and older bridges."""
-    return f"{key}/@adv/pub/**{_ANY_KEY}", f"@/*/@ros2_pub_cache/{key}{_ANY_KEY}"
-
-
-def type_of_token(token: str) -> tuple[str, str] | None:
-    """Key and type (``tf2_msgs/msg/TFMessage``) of a token; None if it is no token of a topic."""
-    found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN else None
-    if found is None:
-        return None
-    key, type_name = (part.replace(SLASH, "/") for part in found.groups())
-    return (key, type_name) if _TYPE.fullmatch(type_name) else None
-
 
 HOLD_NS: Final = 10_000_000_000
 HOLD_MESSAGES: Final = 4_096
@@ -325,7 +252,7 @@ def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) ->
     return len(missing)
 
 
-def message_of(event: Event) -> tuple[str, str] | None:
+def _message_of(event: Event) -> tuple[str, str] | None:
     """Type and definition of an event that is a message of ROS in CDR, with its schema."""
     if not isinstance(event, VerbatimEvent):
         return None
@@ -351,7 +278,7 @@ def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Deri
                 made.pop(identity_of(event.payload), None)
             yield event
 
-    for _, derived in derive(watched(), types, message_of):
+    for _, derived in derive(watched(), types):
         if derived.key == MAP_KEY:
             maps.append(derived)
         else:
@@ -368,3 +295,53 @@ def _is_rot(event: Event) -> bool:
         return Loss.model_validate_json(event.payload).cause == "rot"
     except ValidationError:
         return False
+
+
+class DerivedFrom(NamedTuple):
+    """A derived event, and the offset of the message that completed it; None for the end of its
+    recording."""
+
+    offset: int | None
+    derived: Derived
+
+
+def derive(events: Iterable[Event], types: MessageTypes) -> Iterator[DerivedFrom]:
+    """Yield the envelopes and maps of all recordings among ``events``, in the order of the log.
+    Raises LogDamaged for an event on ``mapfold/ros`` that cannot be read."""
+    derivation: Derivation | None = None
+    for event in events:
+        if event.key == ROS_KEY:
+            if derivation is not None:
+                yield from (DerivedFrom(None, each) for each in derivation.finish())
+            recording = recording_of(event)
+            derivation = Derivation(recording, types) if recording.streams else None
+        elif derivation is not None and (found := _message_of(event)) is not None:
+            made = derivation.add(event.key, *found, event.logged_ns, event.payload)
+            yield from (DerivedFrom(event.offset, each) for each in made)
+    if derivation is not None:
+        yield from (DerivedFrom(None, each) for each in derivation.finish())
+
+
+def recording_of(event: Event) -> RosRecording:
+    """The content of an event on ``mapfold/ros``. Raises LogDamaged."""
+    try:
+        return read_recording(event.payload)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"]
+        raise LogDamaged(
+            f"the event on {ROS_KEY} at offset {event.offset} cannot be read: {reason}"
+        ) from None
+
+
+class _Identity(BaseModel):
+    run_id: RunId
+    keyframe_id: int
+
+
+def identity_of(payload: bytes) -> tuple[str, int] | None:
+    """Run and keyframe of an envelope's JSON; None if it has none."""
+    try:
+        found = _Identity.model_validate_json(payload)
+    except ValidationError:
+        return None
+    return found.run_id, found.keyframe_id

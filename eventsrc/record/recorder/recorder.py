@@ -10,7 +10,6 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogWriter
-from eventsrc.record.recorder.bridged import cache_selectors, token_selectors
 from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
 from eventsrc.record.transport.session import (
     Query,
@@ -19,6 +18,7 @@ from eventsrc.record.transport.session import (
     SizeLimit,
     check_keys,
 )
+from eventsrc.ros.derivation import cache_selectors, token_selectors
 
 from .bridged import Bridge
 from .edits import EditRequest, Edits, edit_key

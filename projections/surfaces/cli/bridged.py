@@ -14,10 +14,10 @@ from eventsrc.base.text import counted, visible
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.record.recorder.bridged import Bridge, append_missing, topic_of
+from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport
-from eventsrc.ros.derivation import RosRecording
+from eventsrc.ros.derivation import RosRecording, topic_of
 from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 
