@@ -209,9 +209,15 @@ def test_topics_of_other_types_make_nothing_and_are_counted() -> None:
     batch = [BridgedMessage(key, text) for key in (*told, *told)]
     taken = bridge.take(batch, START, lambda _: iter(()))
     assert [each.key for each in taken] == ["/detections", "/map"] * 2
-    assert bridge.refused == {"/detections": 2, "/map": 2}
-    assert bridge.reasons["/detections"] == "yolo_msgs/msg/DetectionArray: no such type is known"
-    assert bridge.reasons["/map"] == "it is std_msgs/msg/String, not nav_msgs/msg/OccupancyGrid"
+    derivation = bridge.derivation
+    assert derivation.refused == {"/detections": 2, "/map": 2}
+    assert (
+        derivation.reasons["/detections"] == "yolo_msgs/msg/DetectionArray: no such type is known"
+    )
+    assert (
+        bridge.derivation.reasons["/map"]
+        == "it is std_msgs/msg/String, not nav_msgs/msg/OccupancyGrid"
+    )
 
 
 def test_broken_messages_are_kept_counted_and_harm_no_other(

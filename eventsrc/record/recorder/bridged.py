@@ -72,7 +72,7 @@ class Bridge:
         self.topics = tuple(topics)
         self.keys = tuple(map(key_of, self.topics))
         self._topics = dict(zip(self.keys, self.topics, strict=True))
-        self._derivation = Derivation(recording, types)
+        self.derivation = Derivation(recording, types)
         self._types = types
         self._lock = threading.Lock()
         self._new_types: dict[str, str] = {}
@@ -85,32 +85,18 @@ class Bridge:
         """Messages left out, since their keys belong to no recorded topic."""
 
     @property
-    def refused(self) -> dict[str, int]:
-        """How many messages are kept but cannot be read, by topic."""
-        return self._derivation.refused
-
-    @property
-    def reasons(self) -> dict[str, str]:
-        """Why the first of each topic cannot be read."""
-        return self._derivation.reasons
-
-    @property
-    def counts(self) -> dict[str, Counts]:
-        """Counts of the envelopes made, by topic of detections."""
-        return self._derivation.counts
-
-    @property
     def unread(self) -> tuple[tuple[str, int, str], ...]:
         """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
-        reasons, counts = self.reasons, [*self.refused.items()]
-        return tuple((topic, count, reasons.get(topic, "")) for topic, count in counts)
+        refused, reasons = self.derivation.refused, self.derivation.reasons
+        return tuple((topic, count, reasons.get(topic, "")) for topic, count in [*refused.items()])
 
     @property
     def streams(self) -> tuple[tuple[str, Counts], ...]:
-        """Copies of `counts`, for other threads: the writer thread goes on counting."""
+        """Copies of the counts of envelopes made, by topic of detections: the writer thread goes on
+        counting."""
         return tuple(
             (topic, replace(counts, unused=dict(counts.unused), reasons=dict(counts.reasons)))
-            for topic, counts in self.counts.items()
+            for topic, counts in self.derivation.counts.items()
         )
 
     @property
@@ -165,7 +151,7 @@ class Bridge:
         taken = self.take((), logged_ns, check)
         while self._held:
             taken += self._give_up(self._next_held(), logged_ns, check)
-        for derived in self._derivation.finish():
+        for derived in self.derivation.finish():
             taken += _checked(derived, check)
         return taken
 
@@ -216,7 +202,7 @@ class Bridge:
         yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
         if form.schema:  # without a known definition no envelope is made, which is counted
             definition = form.schema_text.decode()
-            made = self._derivation.add(topic, form.schema, definition, logged_ns, payload)
+            made = self.derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:
                 yield from _checked(derived, check)
 

@@ -159,7 +159,7 @@ def record(
             if accept_edits:
                 say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
-            for line in stream_lines({} if bridge is None else bridge.counts):
+            for line in stream_lines({} if bridge is None else bridge.derivation.counts):
                 say(line)
     summary.finish()
 
