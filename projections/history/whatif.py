@@ -18,7 +18,7 @@ from projections.store.history import NEVER
 
 from .known import Progress
 from .names import NoSuchThing
-from .parallel import NO_NUMBER, FoldResult, Rules, fold_all
+from .rule_folds import NO_NUMBER, FoldResult, Rules, fold_all
 
 if TYPE_CHECKING:
     from projections.localize.evaluate.truth import Truth

@@ -5,7 +5,7 @@ import re
 
 from eventsrc.envelope.commands import KINDS, MAX_COMMAND_BYTES, MAX_REASON
 from eventsrc.envelope.trajectory import MAX_POSES
-from projections.edit.poses import DEFAULT_SLACK_S
+from projections.edit.correct_poses import DEFAULT_SLACK_S
 from tests.docs.console import ROOT
 
 PAGE = (ROOT / "docs" / "corrections.md").read_text("utf-8")

@@ -29,7 +29,7 @@ from projections.fold.corrections import Corrections, RecordedCommand, compile_c
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.history import Timeline
-from projections.history.parallel import Rules, fold_in_this_process
+from projections.history.rule_folds import Rules, fold_in_this_process
 from projections.localize.calibrate.rounds import calibrate
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log

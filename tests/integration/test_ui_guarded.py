@@ -12,7 +12,7 @@ import pytest
 
 from eventsrc.base.text import visible
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
-from projections.surfaces.ui.live import MOST_STREAMS
+from projections.surfaces.ui.live_watch import MOST_STREAMS
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.http_attacks import answer, request, status

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-import multiprocessing
 import shutil
 import threading
 from collections.abc import Iterator
@@ -14,22 +13,20 @@ from starlette.datastructures import QueryParams
 from starlette.requests import Request
 from starlette.types import Message
 
-from eventsrc.base.errors import LogError, MapfoldError
+from eventsrc.base.errors import LogError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
-from projections.history import parallel
-from projections.history.parallel import Rules, fold_all
+from projections.history.rule_folds import Rules, fold_all
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.surfaces.ui.app import create_app
 from projections.surfaces.ui.comparisons import whatif_answer
-from projections.surfaces.ui.edits import Edit, Editor
-from projections.surfaces.ui.live import LiveWatch
-from projections.surfaces.ui.log_map import MOST_ALTERNATIVES, LogMap
-from projections.surfaces.ui.opened import Opened
-from projections.surfaces.ui.service import GivenUp, UiService
+from projections.surfaces.ui.editor import Edit, Editor
+from projections.surfaces.ui.live_watch import LiveWatch
+from projections.surfaces.ui.log_map import MOST_ALTERNATIVES, LogMap, Opened
+from projections.surfaces.ui.question_threads import GivenUp, UiService
 from tests.support.logs import walk, write_log
 
 WAIT_S = 60.0
@@ -122,15 +119,6 @@ def test_processes_of_a_what_if_stop_when_it_is_given_up(log: Path) -> None:
     rules = [Rules(Settings(eps_m=eps)) for eps in (0.5, 1.0)]
     with pytest.raises(GivenUp):
         fold_all(log, rules, Offset(1300), processes=2, progress=progress)
-    assert multiprocessing.active_children() == []
-
-
-def test_a_worker_stops_at_its_next_report(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shared = multiprocessing.get_context("spawn").Value("q", parallel._STOP)
-    monkeypatch.setattr(parallel, "_done", shared)
-    with pytest.raises(MapfoldError):
-        parallel._fold_share(log, [Rules(Settings())], Offset(1300), None, keep_views=False)
-    assert shared.value == parallel._STOP
 
 
 def test_another_log_in_the_same_place_is_not_folded(tmp_path: Path) -> None:

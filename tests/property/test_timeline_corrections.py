@@ -16,7 +16,7 @@ from projections.fold.corrections import Corrections, compile_corrections
 from projections.fold.settings import Settings
 from projections.history import Timeline
 from projections.history.diff import rows_of
-from projections.history.parallel import Rules
+from projections.history.rule_folds import Rules
 from projections.history.whatif import command_trials, what_if
 from projections.map.digest import map_digest
 from projections.map.export import state_document

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.model import KeyframeId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
-from projections.edit.poses import RunKeyframe, lay
+from projections.edit.correct_poses import RunKeyframe, lay
 
 MILLISECONDS = st.integers(0, 60_000)
 METRES = st.floats(-100.0, 100.0)

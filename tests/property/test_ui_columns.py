@@ -18,10 +18,9 @@ from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_log
 from projections.map.own_events import read_corrections
 from projections.map.view import MapView
-from projections.surfaces.ui.binary import packed_arrays
-from projections.surfaces.ui.log_map import LogMap
+from projections.surfaces.ui.log_map import LogMap, Opened
 from projections.surfaces.ui.map_answers import history_columns
-from projections.surfaces.ui.opened import Opened
+from projections.surfaces.ui.requests import packed_arrays
 from tests.support.logs import write_log
 from tests.support.thorough import rounds
 from tests.support.ui_page import ReplayedMap, as_float32, read_arrays, replay

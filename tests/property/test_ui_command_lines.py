@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.surfaces.ui.moment import shell_line
+from projections.surfaces.ui.requests import shell_line
 
 HOSTILE = (
     "'; rm -rf ~ #", "$(reboot)", "`reboot`", "a\x03\nreboot\n", "\x1b[201~\nreboot\n", "-rf", "!!",

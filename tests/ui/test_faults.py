@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import Page, Route, expect
 
-from projections.surfaces.ui.live import MOST_STREAMS
+from projections.surfaces.ui.live_watch import MOST_STREAMS
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import write_log

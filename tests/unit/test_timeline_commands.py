@@ -25,7 +25,6 @@ from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
 from projections.fold.settings import Settings
 from projections.history import NoSuchThing, Timeline
 from projections.history.merges import merge_document, object_merge_document, refusal_document
-from projections.history.parallel import Rules
 from projections.history.rendering import (
     difference_text,
     merge_text,
@@ -33,6 +32,7 @@ from projections.history.rendering import (
     object_merges_text,
     refusals_text,
 )
+from projections.history.rule_folds import Rules
 from projections.history.whatif import command_trials, what_if
 from projections.history.whatif_rendering import whatif_text
 from projections.map.export import state_document, state_text

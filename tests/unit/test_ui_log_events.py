@@ -10,9 +10,7 @@ from eventsrc.log import NEVER, LogReader, LogWriter
 from projections.fold.settings import Settings
 from projections.surfaces.ui import log_map
 from projections.surfaces.ui.log_events import LogEvents
-from projections.surfaces.ui.log_map import LogMap
-from projections.surfaces.ui.log_prefix import PrefixReader
-from projections.surfaces.ui.opened import Opened
+from projections.surfaces.ui.log_map import LogMap, Opened, PrefixReader
 from tests.support.envelopes import envelope, payload
 from tests.support.logs import walk, write_log
 

@@ -15,12 +15,11 @@ from eventsrc.envelope.model import KeyframeId
 from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.log import LogReader
 from projections.edit import make
-from projections.edit.correct_poses import Span, by_trajectory, by_transform
+from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
 from projections.edit.current import CurrentMap
 from projections.edit.effect import effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
-from projections.edit.poses import DEFAULT_SLACK_S
 
 from .edit_command import EditOptions, NewCommand
 from .folded_log import AssignedSettings, LogArgument, LogSettings, settings_from

@@ -15,8 +15,7 @@ from eventsrc.base.text import visible
 from eventsrc.log import LogReader
 from projections.edit.effect import cache_effect
 from projections.edit.make import Stamp
-from projections.edit.outcome import void_text
-from projections.edit.record import Made, MakeCommand, make_command, record_command
+from projections.edit.record import Made, MakeCommand, make_command, record_command, void_text
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.settings import Settings
 from projections.history.rendering import difference_text

@@ -21,8 +21,8 @@ from .terminal import say
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from projections.surfaces.ui.edits import Editor
-    from projections.surfaces.ui.service import UiService
+    from projections.surfaces.ui.editor import Editor
+    from projections.surfaces.ui.question_threads import UiService
 
 _EVERY_ADDRESS: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  not a bind
 """The address of this machine for a server that listens on all addresses."""
@@ -102,9 +102,9 @@ def ui(
             f"mapfold ui needs {error.name}, which is not installed; pip install 'mapfold[ui]'"
         ) from None
     from projections.localize.evaluate.truth import read_truth
-    from projections.surfaces.ui.live import LiveWatch
-    from projections.surfaces.ui.opened import Opened
-    from projections.surfaces.ui.service import UiService
+    from projections.surfaces.ui.live_watch import LiveWatch
+    from projections.surfaces.ui.log_map import Opened
+    from projections.surfaces.ui.question_threads import UiService
 
     scored = read_truth(truth) if truth else None
     with ExitStack() as stack:
@@ -166,7 +166,7 @@ def _moment(at: Offset | None, select: str | None) -> str:
 
 def _editor(service: "UiService", client: ZenohClient) -> "Editor":
     """Records commands, through a recorder where one holds the log."""
-    from projections.surfaces.ui.edits import Editor
+    from projections.surfaces.ui.editor import Editor
 
     from .edit_command import user_at_host
 

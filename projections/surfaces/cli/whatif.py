@@ -10,7 +10,7 @@ from eventsrc.base.text import counted
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
 from projections.fold.settings import Settings
-from projections.history.parallel import Rules
+from projections.history.rule_folds import Rules
 from projections.history.whatif import (
     Alternative,
     WhatIf,

@@ -9,8 +9,7 @@ from projections.fold.settings import Settings
 from projections.localize.relocalize import Answer, Question
 
 from .folding import fold, open_log
-from .map import Map
-from .questions import relocalize
+from .map import Map, relocalize
 from .time_travel import Timeline
 
 __all__ = [

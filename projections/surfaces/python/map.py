@@ -1,13 +1,27 @@
-"""`Map`: a folded map for scripts and notebooks."""
+"""`Map`: a folded map for scripts and notebooks; and `relocalize`, which asks it."""
 
 import html
 from base64 import b64encode
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
+from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
+from projections.fold.settings import Camera
+from projections.localize.relocalize import (
+    Answer,
+    ExactIndex,
+    Method,
+    Question,
+    parse_question,
+    rank,
+    read_question,
+)
+from projections.localize.relocalize.reading import MAX_QUESTION_BYTES
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
 from projections.map.view import MapView
@@ -34,6 +48,11 @@ class Map:
     def digest(self) -> str:
         """SHA-256 of the whole map, in hex; the same log and settings give the same one."""
         return map_digest(self.view)
+
+    @cached_property
+    def index(self) -> ExactIndex:
+        """The map's vectors, laid out for `relocalize`."""
+        return ExactIndex(self.view)
 
     @cached_property
     def state(self) -> dict[str, Any]:
@@ -99,3 +118,45 @@ def _cell(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.2f}" if isinstance(value, float) else html.escape(visible(str(value)))
+
+
+QuestionLike: TypeAlias = Question | Mapping[str, Any] | Sequence[Mapping[str, Any]] | str | Path
+
+
+def relocalize(
+    house: Map,
+    question: QuestionLike,
+    *,
+    top: int = 3,
+    method: Method = "joint",
+    camera: Camera | None = None,
+) -> Answer:
+    """The likeliest Places and the pose of a robot that sees some crops.
+
+    ``question`` is an envelope, a list of crops, a document of views (docs/relocalization.md), or
+    the path of a file of these. ``top`` Places are listed. The search is exact; the map's vectors
+    are laid out at its first question. Raises QuestionError for a question that cannot be read, of
+    another embedding space, or of a class that the map does not have, MisuseError for a map folded
+    without embeddings.
+
+    Examples:
+        >>> house = fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+        >>> answer = relocalize(house, [{"class": "toilet"}, {"class": "mirror"}])
+        >>> [place.place_id for place in answer.places]
+        ['sim-7-a_p0', 'sim-7-a_p12', 'sim-7-a_p11']
+    """
+    if not house.view.keep_embeddings:
+        raise MisuseError("this map was folded with embeddings=False; fold it with them to ask it")
+    asked = _read(question)
+    return rank(asked, house.index.search(asked.crops), top=top, method=method, camera=camera)
+
+
+def _read(question: QuestionLike) -> Question:
+    if isinstance(question, Question):
+        return question
+    if not isinstance(question, str | Path):
+        return read_question(question)
+    try:
+        return parse_question(read_file(Path(question), MAX_QUESTION_BYTES))
+    except FileFault as fault:
+        raise MisuseError(f"question {question}: {fault}; give a file of JSON") from None

@@ -26,7 +26,6 @@ from eventsrc.envelope.model import Offset
 from projections.surfaces.serve.answering import TooMuchError
 from projections.surfaces.serve.http import add_openapi, only, read_body
 
-from .binary import encoded
 from .comparisons import (
     WHATIF_OPTIONS,
     bisect_answer,
@@ -35,15 +34,15 @@ from .comparisons import (
     merges_answer,
     whatif_answer,
 )
-from .edits import MOST_BYTES as MOST_EDIT_BYTES
-from .edits import Editor, corrections_answer, read_edit
-from .live import MOST_STREAMS, LiveWatch
+from .editor import MOST_BYTES as MOST_EDIT_BYTES
+from .editor import Editor, corrections_answer, read_edit
+from .live_watch import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
 from .map_answers import digest_answer, history_answer, walls_answer
-from .requests import assignments_of, refusal
+from .question_threads import GoOn, UiService
+from .requests import assignments_of, encoded, refusal
 from .search import keyframe_answer, search_answer
-from .service import GoOn, UiService
 from .stories import why_answer
 from .token_gate import EDIT_PATH
 

@@ -16,17 +16,14 @@ from projections.fold.corrections import compile_corrections
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
 from projections.history.merges import merge_document
-from projections.history.parallel import Rules
 from projections.history.rendering import difference_text, search_text
+from projections.history.rule_folds import Rules
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
 from projections.history.whatif_rendering import whatif_text
 from projections.map.own_events import read_commands
 
-from .log_map import LogMap
-from .log_prefix import PrefixReader
-from .moment import Moment, command_line
-from .opened import Opened
-from .requests import assignments_of, text_of
+from .log_map import LogMap, Opened, PrefixReader
+from .requests import AskedPoint, assignments_of, command_line, text_of
 
 MOST_LINES: Final = 200
 _FLAGS: Final = ("1", "true", "yes")
@@ -55,7 +52,7 @@ def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """When ``condition`` became true between ``from`` (default: the start) and ``to`` (default: the
     end); with ``scan=1`` every turn."""
     expression = Expression(text_of(query, "condition"))
-    moment = Moment.of(shown, query, "to")
+    moment = AskedPoint.of(shown, query, "to")
     start = shown.point(text_of(query, "from", "0"))
     scan = query.get("scan", "") in _FLAGS
     found = moment.known.bisect(expression, start, moment.end, scan=scan)
@@ -98,7 +95,7 @@ def _error(text: str) -> dict[str, Any] | None:
 
 def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """Every merge of places up to W."""
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     known = moment.known
     return {
         **moment.document(),

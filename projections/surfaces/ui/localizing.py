@@ -35,11 +35,8 @@ from projections.localize.relocalize.layout import Hypotheses
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 
-from .log_map import LogMap
-from .log_prefix import PrefixReader
-from .moment import Moment, command_line, shell_line
-from .opened import Opened
-from .requests import assignments_of, text_of
+from .log_map import LogMap, Opened, PrefixReader
+from .requests import AskedPoint, assignments_of, command_line, shell_line, text_of
 from .search import keyframe_of
 
 MOST_BYTES: Final = 1_000_000
@@ -157,7 +154,7 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
     ``ask_at`` is a W at which the map lacks the keyframe's run, or the keyframe.
     """
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     history = moment.known.history
     ordinal = keyframe_of(history, query)
     keyframe = history.keyframes[ordinal]

@@ -19,9 +19,8 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, LOSS_KEY, REJECTED_KEY, Loss
 from eventsrc.log import Event, LogReader
 from projections.map.phrases import command_title
+from projections.store.columns import Array
 from projections.store.history import History
-
-from .binary import Column
 
 KINDS: Final = (
     "keyframe",
@@ -139,7 +138,7 @@ _DESCRIBE: Final = {"loss": _loss, "rejected": _rejected}
 
 def event_columns(
     history: History, start: Offset, log_events: LogEvents
-) -> tuple[dict[str, Column], dict[str, Any]]:
+) -> tuple[dict[str, Array], dict[str, Any]]:
     """The columns ``ev_`` from ``start`` on, and what the header says about them.
 
     ``ev_ref`` is a keyframe, run, place or object; of ``place_merged`` and ``objects_merged`` the

@@ -1,4 +1,4 @@
-"""The map of one log under one choice of settings, up to where the log can be read and folded.
+"""The log as the page reads it, and its map under one choice of settings.
 
 Where the log cannot be read or folded, the map ends, with a sentence in ``problems``. The history
 is folded once, later questions are look-ups; new events are folded when `refresh` finds them. Not
@@ -6,24 +6,128 @@ for several threads at once.
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, MapfoldError
 from eventsrc.base.text import counted
-from eventsrc.envelope.model import Offset
-from eventsrc.log import LogReader
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
+from eventsrc.log import Event, LogReader, Unreadable
 from eventsrc.log.format import list_growing
+from eventsrc.log.reader import OnGap
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.errors import FoldError
 from projections.fold.settings import Settings
 from projections.history import Progress, Timeline
+from projections.history.timeline import SettingsChoice
+from projections.localize.evaluate.truth import Truth
 
 from .log_events import MOST_REPORTS, LogEvents
-from .log_prefix import PrefixReader
-from .opened import Opened
+
+_NO_LIMIT = Offset(sys.maxsize)
+_ASK_EVERY = 500
+
+
+class PrefixReader(LogReader):
+    """A `LogReader` that takes a log to end at ``limit``, if it has as many events.
+
+    Nothing beyond the limit is read, so damage there is no error. ``go_on`` is called regularly
+    while events are read; an exception from it ends the reading.
+    """
+
+    def __init__(
+        self, path: Path, limit: Offset = _NO_LIMIT, go_on: Callable[[], None] = lambda: None
+    ) -> None:
+        self.limit, self._go_on = limit, go_on
+        super().__init__(path)
+
+    @property
+    def next_offset(self) -> Offset:
+        """The number of events up to the limit."""
+        return self.limit if self.is_limited else super().next_offset
+
+    @property
+    def readable_end(self) -> Offset:
+        """The number of events up to the limit and before those that cannot be read."""
+        return min(super().readable_end, self.limit)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the log has events beyond the limit."""
+        end = super().readable_end
+        return self.limit < end or (self.limit == end and self._unreadable_end is not None)
+
+    def refresh(self) -> Offset:
+        """Find what was committed since; the new `next_offset`."""
+        if not self.is_limited:
+            super().refresh()
+        return self.next_offset
+
+    def check_end(self) -> None:
+        """As that of a `LogReader`, but segments beyond the limit may be missing."""
+        if not self.is_limited:
+            super().check_end()
+
+    def read(
+        self,
+        start: Offset = FIRST_OFFSET,
+        end: Offset | None = None,
+        *,
+        keys: Collection[str] | None = None,
+        on_gap: OnGap | None = None,
+    ) -> Iterator[Event]:
+        """Events from ``start`` to before ``end``, at most to the limit."""
+        if self.is_limited:
+            end = self.next_offset if end is None else min(end, self.next_offset)
+        for number, event in enumerate(super().read(start, end, keys=keys, on_gap=on_gap)):
+            if number % _ASK_EVERY == 0:
+                self._go_on()
+            yield event
+
+    def first_unreadable(self) -> Offset | None:
+        """The first offset whose event cannot be read; None if all can. Reads the whole log."""
+        found: list[Unreadable] = []
+        for _ in super().read(on_gap=found.append):
+            if found:
+                break
+        return found[0].first if found else None
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A log and the options of the debugger.
+
+    ``settings`` gives those of the map under some corrections: of ``settings_file`` or the log,
+    changed by ``sets`` (``name=value``). ``truth``, of ``truth_files``, scores what-ifs. ``edits``:
+    the log may be changed. ``token_needed``: every question needs the token. ``cache``: histories
+    are read and kept beside the log.
+    """
+
+    log: Path
+    settings: SettingsChoice
+    sets: tuple[str, ...] = ()
+    settings_file: Path | None = None
+    truth_files: tuple[Path, ...] = ()
+    truth: Truth | None = None
+    edits: bool = False
+    token_needed: bool = False
+    cache: bool = True
+
+    def words(self, *sets: str) -> list[str]:
+        """The options that give a command the same settings, changed by ``sets``."""
+        words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
+        return words + [word for text in (*self.sets, *sets) for word in ("--set", text)]
+
+    def base_words(self) -> list[str]:
+        """The options that give ``mapfold whatif`` the same base."""
+        words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
+        words += ["--base", " ".join(self.sets)] if self.sets else []
+        return words + [word for file in self.truth_files for word in ("--truth", str(file))]
+
 
 MOST_HISTORIES: Final = 4
 """Histories of the log's own settings that are kept: one for each set of commands asked about."""

@@ -21,16 +21,14 @@ from projections.history.names import keyframe_name
 from projections.map.digest import map_digest
 from projections.map.view import MapView
 from projections.map.wall_segments import wall_segments
-from projections.store.columns import NONE
+from projections.store.columns import NONE, Array
 from projections.store.history import History
 from projections.store.object_states import ObjectStates
 from projections.store.tables import Tables
 
-from .binary import Column, packed_arrays
 from .log_events import LogEvents, event_columns
 from .log_map import LogMap
-from .moment import Moment
-from .requests import number_of, text_of
+from .requests import AskedPoint, number_of, packed_arrays, text_of
 
 _UM2_PER_M2: Final = float(UM_PER_M) ** 2
 _INT32_MAX: Final = 2**31 - 1
@@ -66,7 +64,7 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``, and
     the type of each place."""
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     view = moment.known.at(moment.end)
     return {
         **moment.document(),
@@ -103,7 +101,7 @@ def walls_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 def history_columns(
     history: History, start: Offset, log_events: LogEvents
-) -> tuple[dict[str, Any], dict[str, Column]]:
+) -> tuple[dict[str, Any], dict[str, Array]]:
     """The header and the columns of everything that the events from ``start`` on did.
 
     ``strings`` of the header are those that are new since ``start``; ``first`` says how many there
@@ -165,13 +163,13 @@ class _Since:
         """The number of rows before."""
         return self.tables.before(table, self._start)
 
-    def of(self, table: str, column: str) -> Column:
+    def of(self, table: str, column: str) -> Array:
         return self.tables.column(table, column)[self.first(table) :]
 
     def texts(self, table: str, column: str) -> list[str | None]:
         return self.tables.texts(table, column, self.first(table), self.tables.count(table))
 
-    def named(self, table: str, **columns: str) -> dict[str, Column]:
+    def named(self, table: str, **columns: str) -> dict[str, Array]:
         """Columns of int32 by the name that they have here."""
         return {name: self.of(table, column).astype("<i4") for name, column in columns.items()}
 
@@ -202,7 +200,7 @@ def _class_names(tables: Tables) -> list[str]:
     return sorted(first, key=first.__getitem__)
 
 
-def _numbered(codes: Column, strings: Sequence[str]) -> tuple[Column, list[str]]:
+def _numbered(codes: Array, strings: Sequence[str]) -> tuple[Array, list[str]]:
     """Texts numbered by their first row, -1 for none, and the texts in that order."""
     names: dict[str, int] = {}
     unique, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
@@ -215,7 +213,7 @@ def _numbered(codes: Column, strings: Sequence[str]) -> tuple[Column, list[str]]
 
 def _keyframe_columns(
     rows: _Since, origin: tuple[float, float], *, number_is_id: bool
-) -> dict[str, Column]:
+) -> dict[str, Array]:
     table = "keyframe"
     ids = rows.of(table, "keyframe_id")
     first = rows.first(table)
@@ -236,7 +234,7 @@ def _keyframe_columns(
     }
 
 
-def _place_columns(history: History, rows: _Since) -> dict[str, Column]:
+def _place_columns(history: History, rows: _Since) -> dict[str, Array]:
     placed = rows.named("placed", pl_offset="offset", pl_keyframe="keyframe", pl_place="place")
     order = np.lexsort((placed["pl_keyframe"], placed["pl_offset"]))
     formed = rows.named("formed", pf_offset="offset", pf_founder="founder")
@@ -255,7 +253,7 @@ def _place_columns(history: History, rows: _Since) -> dict[str, Column]:
     }
 
 
-def _adjacency_columns(rows: _Since) -> dict[str, Column]:
+def _adjacency_columns(rows: _Since) -> dict[str, Array]:
     """By event, and within one by the pair that was adjacent first."""
     a, b = (rows.tables.integers("linked", each) for each in ("a", "b"))
     _, first, pair = np.unique(a << 32 | b, return_index=True, return_inverse=True)
@@ -267,14 +265,14 @@ def _adjacency_columns(rows: _Since) -> dict[str, Column]:
 
 def _object_columns(
     tables: Tables, start: Offset, classes: Sequence[str], origin: tuple[float, float]
-) -> dict[str, Column]:
+) -> dict[str, Array]:
     """The columns of objects, of their changes and of their merges."""
     rows, states = _Since(tables, start), ObjectStates.since(tables, start)
     numbers = {name: number for number, name in enumerate(classes)}
     found = rows.texts("found", "class_name")
     first = rows.first("found")
     has_estimate = states.has("estimated")
-    columns: dict[str, Column] = {
+    columns: dict[str, Array] = {
         "of_offset": rows.of("found", "offset").astype("<i4"),
         "of_object": np.arange(first, first + len(found), dtype="<i4"),
         "of_class": np.array([numbers[name or ""] for name in found], "<i4"),
@@ -300,7 +298,7 @@ def _object_columns(
     }
 
 
-def _by_name(names: Sequence[str], rows: Sequence[Sequence[int]]) -> dict[str, Column]:
+def _by_name(names: Sequence[str], rows: Sequence[Sequence[int]]) -> dict[str, Array]:
     """A column of int32 for each name, from rows in the order of the names."""
     table = np.array(rows, "<i4").reshape(-1, len(names))
     return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}

@@ -15,8 +15,7 @@ from projections.map.records import ObservationRecord
 from projections.store.history import History
 
 from .log_map import LogMap
-from .moment import Moment
-from .requests import text_of
+from .requests import AskedPoint, text_of
 
 MOST_FOUND: Final = 50
 _MOST_TEXT: Final = 300
@@ -33,7 +32,7 @@ def _rank(name: str, wanted: str) -> int:
     return 1 if tail == wanted or name.startswith(wanted) else 2 if name.endswith(wanted) else 3
 
 
-def _places(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+def _places(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
     for place in moment.known.history.places:
         called = [named.name for named in place.names if named.name is not None]
         yield {
@@ -43,7 +42,7 @@ def _places(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def _objects(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+def _objects(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
     history = moment.known.history
     classes = {each.ordinal: each.class_name for each in history.objects_at(moment.end)}
     for each in history.objects:
@@ -55,7 +54,7 @@ def _objects(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def _runs(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
+def _runs(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
     for number, seen in enumerate(moment.known.history.runs):
         yield {
             "kind": "run", "id": seen[0].run_id, "number": number, "offset": seen[0].offset,
@@ -63,7 +62,7 @@ def _runs(moment: Moment, _: str) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def _keyframes(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
+def _keyframes(moment: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
     history = moment.known.history
     for keyframe in history.keyframes:
         name = keyframe_name(history, keyframe.keyframe)
@@ -75,7 +74,7 @@ def _keyframes(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _detections(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
+def _detections(moment: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
     history = moment.known.history
     for seen in moment.known.latest.observations:
         if wanted in seen.det_id.casefold():
@@ -88,7 +87,7 @@ def _detections(moment: Moment, wanted: str) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
-_SOURCES: Final[Mapping[str, Callable[[Moment, str], Iterator[dict[str, Any]]]]] = {
+_SOURCES: Final[Mapping[str, Callable[[AskedPoint, str], Iterator[dict[str, Any]]]]] = {
     "place": _places,
     "object": _objects,
     "run": _runs,
@@ -103,7 +102,7 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The things whose name matches ``q``, best first: equal names, then names that begin or end
     with it, then names that contain it. Letter case does not matter. ``kind`` asks for one kind
     only."""
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")
     if kind is not None and kind not in _SOURCES:
@@ -125,7 +124,7 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """A keyframe with its detections; `keyframe_of` reads which."""
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     history = moment.known.history
     ordinal = keyframe_of(history, query)
     view = moment.known.latest

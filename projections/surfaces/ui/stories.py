@@ -34,13 +34,12 @@ from projections.store.history import History
 from projections.store.records import Merge, ObjectMerge, RefusedMerge
 
 from .log_map import LogMap
-from .moment import Moment
-from .requests import text_of
+from .requests import AskedPoint, text_of
 
 _MOST_CORE: Final = 2000
 
 
-def merge_answer(moment: Moment, name: str) -> dict[str, Any]:
+def merge_answer(moment: AskedPoint, name: str) -> dict[str, Any]:
     """The merges of the event at an offset: of places, refused, and of objects."""
     if not (name.isascii() and name.isdecimal() and len(name) <= 18):
         raise QuestionError(f"merge:{name[:40]} names no offset; write merge:348")
@@ -80,7 +79,7 @@ def merge_answer(moment: Moment, name: str) -> dict[str, Any]:
     }
 
 
-def _command(moment: Moment, merges: list[Merge], *, refused: bool) -> str:
+def _command(moment: AskedPoint, merges: list[Merge], *, refused: bool) -> str:
     if merges:
         return moment.command("merges", "--show", merges[0].number)
     return moment.command("merges", "--refused" if refused else "--objects")
@@ -177,7 +176,7 @@ _MOST_REFS: Final = 50
 def why_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The explanation of the thing named by ``what``; with ``other``, a keyframe, since when both
     keyframes are in one place."""
-    moment = Moment.of(shown, query)
+    moment = AskedPoint.of(shown, query)
     what = text_of(query, "what")
     kind, _, name = what.partition(":")
     if kind == "merge":
@@ -187,12 +186,12 @@ def why_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     return _keyframe_story(moment, name) if kind == "keyframe" else _story_of(moment, name)
 
 
-def _story_of(moment: Moment, name: str) -> dict[str, Any]:
+def _story_of(moment: AskedPoint, name: str) -> dict[str, Any]:
     found = moment.known.why(name, moment.end)
     return _document(moment, found, moment.command("why", name))
 
 
-def _keyframe_story(moment: Moment, name: str) -> dict[str, Any]:
+def _keyframe_story(moment: AskedPoint, name: str) -> dict[str, Any]:
     history = moment.known.history
     names = [_keyframe_name(name)]
     if other := moment.query.get("other"):
@@ -227,7 +226,7 @@ def _line(entry: Entry) -> str:
     return visible(f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}")
 
 
-def _document(moment: Moment, found: Explanation, command: str) -> dict[str, Any]:
+def _document(moment: AskedPoint, found: Explanation, command: str) -> dict[str, Any]:
     return {
         **moment.document(),
         "kind": found.kind,

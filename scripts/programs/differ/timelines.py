@@ -14,7 +14,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.edit.current import CurrentMap
 from projections.history import Timeline
-from projections.history.parallel import Rules, fold_all
+from projections.history.rule_folds import Rules, fold_all
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api

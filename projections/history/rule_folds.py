@@ -9,23 +9,17 @@ depends on the corrections. Places are numbered here by the event that founded t
 their first member, and two folds have the same numbers until they differ.
 """
 
-import multiprocessing
-import os
-import signal
 import time
 from array import array
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.garbage import gc_paused
+from eventsrc.base.worker_process import ProcessGone, Report, call_in_processes, usable_processors
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
@@ -60,15 +54,11 @@ Offsets: TypeAlias = "array[int]"
 
 MIN_PARALLEL_EVENTS = 20_000
 """Events times settings from which processes are started: about two seconds of folding."""
-_POLL_S = 0.2
 _PLACE_DELTAS = frozenset({RunSeen, KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
 _OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
 """Also needed where objects may merge."""
 
-_done: "Synchronized[int] | None" = None
-"""In a worker process: the number of events that all workers have folded, or `_STOP`."""
-_STOP = -1
 NO_NUMBER: Final = -1
 """In the arrays of a `FoldResult`: no place, or no object."""
 
@@ -207,11 +197,11 @@ def fold_all(
     With ``keep_views`` each has its map too, without embeddings. Raises FoldError at an event that
     cannot be folded, and what ``progress`` raises, which ends the folds.
     """
-    workers = min(processes or _processors(), len(rules))
+    workers = min(processes or usable_processors(), len(rules))
     if workers <= 1 or (processes is None and end * len(rules) < MIN_PARALLEL_EVENTS):
         return fold_in_this_process(log, rules, end, truth, progress, keep_views=keep_views)
     shares = [list(rules[index::workers]) for index in range(workers)]
-    results = _in_processes(log, shares, end, truth, progress, keep_views=keep_views)
+    results = _in_processes(log, shares, end, progress, truth=truth, keep_views=keep_views)
     return [results[index % workers][index // workers] for index in range(len(rules))]
 
 
@@ -270,87 +260,30 @@ def _fold_stretch(stretch: Sequence[ParsedEvent], folds: Sequence[_Fold]) -> Non
 
 
 def _in_processes(
-    log: Path,
-    shares: list[list[Rules]],
-    end: Offset,
-    truth: "Truth | None",
-    progress: Progress | None,
-    *,
-    keep_views: bool,
+    log: Path, shares: list[list[Rules]], end: Offset, progress: Progress | None, **more: Any
 ) -> list[list[FoldResult]]:
-    # Spawned, not forked: the caller may have threads (a writer, a Zenoh session) whose locks a
-    # fork would copy in whatever state they are.
-    context = multiprocessing.get_context("spawn")
-    done = context.Value("q", 0)
-    with ProcessPoolExecutor(
-        len(shares), mp_context=context, initializer=_start_worker, initargs=(done,)
-    ) as pool:
-        with _sigint_blocked():
-            futures = [
-                pool.submit(_fold_share, log, each, end, truth, keep_views) for each in shares
-            ]
-        try:
-            _report_progress(futures, done, end * len(shares), progress)
-        except BaseException:
-            with done.get_lock():
-                done.value = _STOP
-            raise  # when the workers have stopped
-        try:
-            return [future.result() for future in futures]
-        except BrokenProcessPool:
-            raise MapfoldError(
-                f"{log}: a process that folded it was killed, perhaps for lack of memory; "
-                "try fewer --processes"
-            ) from None
+    calls = [partial(_fold_share, log, share, end, **more) for share in shares]
+    total = end * len(shares)
 
+    def report(folded: int) -> None:
+        if progress is not None:
+            progress(folded, total)
 
-@contextmanager
-def _sigint_blocked() -> Iterator[None]:
-    """Block SIGINT; processes started inside inherit that, until they set their own handler."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    results: dict[int, list[FoldResult]] = {}
     try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _start_worker(done: "Synchronized[int]") -> None:
-    global _done
-    _done = done
-    # Ctrl-C reaches the whole process group: the parent reports it, its workers just end.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        for called in call_in_processes(calls, len(calls), report):
+            if called.error is not None:
+                raise called.error
+            results[called.number] = called.result or []
+    except ProcessGone:
+        raise MapfoldError(
+            f"{log}: a process that folded it was killed, perhaps for lack of memory; "
+            "try fewer --processes"
+        ) from None
+    return [results[number] for number in range(len(calls))]
 
 
 def _fold_share(
-    log: Path, rules: list[Rules], end: Offset, truth: "Truth | None", keep_views: bool
+    log: Path, rules: list[Rules], end: Offset, report: Report, **more: Any
 ) -> list[FoldResult]:
-    reported = 0
-
-    def report(folded: int, _: int) -> None:
-        nonlocal reported
-        if _done is not None:
-            with _done.get_lock():
-                if _done.value == _STOP:
-                    raise MapfoldError("given up")  # never read: the caller raised
-                _done.value += folded - reported
-        reported = folded
-
-    return fold_in_this_process(log, rules, end, truth, report, keep_views=keep_views)
-
-
-def _report_progress(
-    futures: "list[Future[list[FoldResult]]]",
-    done: "Synchronized[int]",
-    total: int,
-    progress: Progress | None,
-) -> None:
-    while wait(futures, timeout=_POLL_S).not_done:
-        if progress is not None:
-            progress(done.value, total)
-
-
-def _processors() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return fold_in_this_process(log, rules, end, progress=lambda folded, _: report(folded), **more)

@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 
 from eventsrc.base.errors import MapfoldError
 
-from .service import UiService
+from .question_threads import UiService
 
 LOOK_S: Final = 0.3
 TAILS_S: Final = 5.0

@@ -22,16 +22,21 @@ from projections.edit.current import CurrentMap
 from projections.edit.effect import cache_effect, effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
-from projections.edit.outcome import void_text
-from projections.edit.record import Made, MakeCommand, OpenSession, make_command, record_command
+from projections.edit.record import (
+    Made,
+    MakeCommand,
+    OpenSession,
+    make_command,
+    record_command,
+    void_text,
+)
 from projections.fold.errors import QuestionError
 from projections.fold.settings import Settings
 from projections.history.rendering import difference_text
 
 from .comparisons import MOST_LINES
-from .log_prefix import PrefixReader
-from .moment import command_line
-from .opened import Opened
+from .log_map import Opened, PrefixReader
+from .requests import command_line
 
 MOST_BYTES: Final = 64 * 1024
 _MOST_ARGUMENTS: Final = 1000
