@@ -21,7 +21,7 @@ from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.pair_groups import ApartPairs
 from projections.map.phrases import command_on
 
-from .current import CurrentMap
+from .current import MapToEdit
 
 
 class EditRefused(MisuseError):
@@ -48,7 +48,7 @@ def refusal(what: str, recorded: RecordedCommand, log: object) -> EditRefused:
     )
 
 
-def check_apart(current: CurrentMap, anchors: Iterable[Keyframe]) -> None:
+def check_apart(current: MapToEdit, anchors: Iterable[Keyframe]) -> None:
     """Raises EditRefused if two of the anchors are joined by commands."""
     named = list(anchors)
     for i, first in enumerate(named):
@@ -59,7 +59,7 @@ def check_apart(current: CurrentMap, anchors: Iterable[Keyframe]) -> None:
                 _refuse("these places are joined", found, current)
 
 
-def check_join(current: CurrentMap, first: Keyframe, second: Keyframe) -> None:
+def check_join(current: MapToEdit, first: Keyframe, second: Keyframe) -> None:
     """Raises EditRefused if the places, or what is joined to them, are kept apart."""
     corrections = current.corrections
     groups = [_made_one(corrections.joined, anchor).keys() for anchor in (first, second)]
@@ -104,12 +104,12 @@ def _pairs_apart(
     return sorted({*apart.between(*groups), *apart.between(one, other)})
 
 
-def _refuse(what: str, found: RecordedCommand | None, current: CurrentMap) -> None:
+def _refuse(what: str, found: RecordedCommand | None, current: MapToEdit) -> None:
     if found is not None:
         raise refusal(what, found, current.reader.path)
 
 
-def check_same(current: CurrentMap, first: DetId, second: DetId) -> None:
+def check_same(current: MapToEdit, first: DetId, second: DetId) -> None:
     """Raises EditRefused if the objects of two observations, or what is one with them by commands,
     are kept apart."""
     corrections = current.corrections
@@ -120,7 +120,7 @@ def check_same(current: CurrentMap, first: DetId, second: DetId) -> None:
         _refuse("these objects are kept apart", found, current)
 
 
-def check_different(current: CurrentMap, first: DetId, second: DetId) -> None:
+def check_different(current: MapToEdit, first: DetId, second: DetId) -> None:
     """Raises EditRefused if the two observations are made one by commands."""
     pair = _made_one(current.corrections.same, first).get(second)
     if pair is not None:
@@ -129,19 +129,19 @@ def check_different(current: CurrentMap, first: DetId, second: DetId) -> None:
 
 
 def _objects_command(
-    current: CurrentMap,
+    current: MapToEdit,
     kind: type[SameObject] | type[DifferentObjects],
     pair: tuple[DetId, DetId],
 ) -> RecordedCommand | None:
     return _last(current, lambda c: isinstance(c, kind) and {*c.det_ids} == {*pair})
 
 
-def _object(current: CurrentMap, det_id: DetId) -> object:
+def _object(current: MapToEdit, det_id: DetId) -> object:
     found = current.observations.get(det_id)
     return det_id if found is None or found.object is None else found.object
 
 
-def check_not_dropped(current: CurrentMap, det_id: DetId) -> None:
+def check_not_dropped(current: MapToEdit, det_id: DetId) -> None:
     """Raises EditRefused if the detection is left out already."""
     if det_id in current.corrections.dropped:
         found = _last(
@@ -152,14 +152,14 @@ def check_not_dropped(current: CurrentMap, det_id: DetId) -> None:
             raise EditRefused(f"detection {det_id!r} is left out already, by {describe(found)}")
 
 
-def check_run_in_map(current: CurrentMap, run_id: str) -> None:
+def check_run_in_map(current: MapToEdit, run_id: str) -> None:
     """Raises EditRefused if the whole run is left out already."""
     found = _last(current, lambda c: isinstance(c, ForgetRun) and c.run_id == run_id)
     if found is not None:
         raise refusal(f"run {run_id!r} is left out of the map", found, current.reader.path)
 
 
-def forgetting(current: CurrentMap, run_id: RunId, first: KeyframeId, last: KeyframeId) -> str:
+def forgetting(current: MapToEdit, run_id: RunId, first: KeyframeId, last: KeyframeId) -> str:
     """``, by command …`` for keyframes that are left out already; empty if none is."""
     found = _last(
         current,
@@ -173,6 +173,6 @@ def forgetting(current: CurrentMap, run_id: RunId, first: KeyframeId, last: Keyf
     return "" if found is None else f"; some are left out already by {describe(found)}"
 
 
-def _last(current: CurrentMap, holds: Callable[[Command], bool]) -> RecordedCommand | None:
+def _last(current: MapToEdit, holds: Callable[[Command], bool]) -> RecordedCommand | None:
     in_force = reversed(current.corrections.in_force)
     return next((each for each in in_force if holds(each.command)), None)

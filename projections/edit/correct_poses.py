@@ -25,7 +25,7 @@ from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
 
 from .conflicts import check_run_in_map
-from .current import CurrentMap
+from .current import MapToEdit
 from .make import Stamp, build, keyframes_of
 
 DEFAULT_SLACK_S = 0.05
@@ -124,7 +124,7 @@ class Span(NamedTuple):
 
 
 def by_trajectory(
-    current: CurrentMap,
+    current: MapToEdit,
     stamp: Stamp,
     run_id: str,
     trajectory: Trajectory,
@@ -156,7 +156,7 @@ def by_trajectory(
 
 
 def by_transform(
-    current: CurrentMap, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
+    current: MapToEdit, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
 ) -> CorrectPoses:
     """One rigid transform of the keyframes of a run."""
     for name, value, most in (
@@ -179,7 +179,7 @@ def by_transform(
     )
 
 
-def _keyframes(current: CurrentMap, run_id: str, span: Span) -> list[RunKeyframe]:
+def _keyframes(current: MapToEdit, run_id: str, span: Span) -> list[RunKeyframe]:
     if span.first is not None and span.last is not None and span.last < span.first:
         raise MisuseError(f"--from {span.first} is more than --to {span.last}; swap them")
     check_run_in_map(current, run_id)
@@ -195,7 +195,7 @@ def _keyframes(current: CurrentMap, run_id: str, span: Span) -> list[RunKeyframe
     return found
 
 
-def _refuse_unknown(current: CurrentMap, run_id: str, trajectory: Trajectory, laid: Laid) -> None:
+def _refuse_unknown(current: MapToEdit, run_id: str, trajectory: Trajectory, laid: Laid) -> None:
     first = min(laid.unknown, key=lambda pose: pose.line)
     count = len(laid.unknown)
     more = f" (and {count - 1:,} more such lines)" if count > 1 else ""

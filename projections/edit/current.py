@@ -18,14 +18,14 @@ from projections.map.own_events import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
-from projections.store.records import Merge
+from projections.store.history_records import Merge
 from projections.store.timeline_cache import TimelineCache
 
 SettingsOf = Callable[[Corrections], Settings]
 """The settings of the map, given the log's corrections."""
 
 
-class CurrentMap:
+class MapToEdit:
     """A log, the commands in it, and the map that it is folded to under ``settings_of`` these.
 
     With ``until`` it is the log as of its first ``until`` events. ``note`` is called with a

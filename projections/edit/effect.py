@@ -20,7 +20,7 @@ from projections.fold.settings import Settings
 from projections.history.diff import Difference, difference_of, rows_of
 from projections.map.view import MapView
 
-from .current import CurrentMap, SettingsOf
+from .current import MapToEdit, SettingsOf
 
 _CACHE = "effects.json"
 _COMPARING = "comparing the maps"
@@ -57,14 +57,14 @@ class Change:
     Folds only if needed: names of places alone need no fold.
     """
 
-    def __init__(self, current: CurrentMap, commands: Sequence[RecordedCommand]) -> None:
+    def __init__(self, current: MapToEdit, commands: Sequence[RecordedCommand]) -> None:
         self.current = current
         self.corrections = compile_corrections(commands)
         self.settings = current.settings_of(self.corrections)
         self._after: MapView | None = None
 
     @classmethod
-    def by(cls, current: CurrentMap, command: Command) -> "Change":
+    def by(cls, current: MapToEdit, command: Command) -> "Change":
         """The change made by one further command."""
         return cls(current, [*current.commands, RecordedCommand(current.end, command)])
 
@@ -113,7 +113,7 @@ def effect_of(before: MapView, after: MapView) -> Effect:
         )
 
 
-def _names(current: CurrentMap, corrections: Corrections) -> dict[PlaceOrdinal, str]:
+def _names(current: MapToEdit, corrections: Corrections) -> dict[PlaceOrdinal, str]:
     """Places by ordinal, and their names; the later name counts."""
     placed = ((current.place_of(named.anchor), named.name) for named in corrections.names)
     return {place: name for place, name in placed if place is not None}
@@ -128,7 +128,7 @@ class EffectCache:
     """A cache of effects: ``<log>.history/effects.json``, safe to delete. Its keys are those of
     `effect_keys`."""
 
-    def __init__(self, current: CurrentMap) -> None:
+    def __init__(self, current: MapToEdit) -> None:
         self._note = current.note
         log = current.reader.path
         self._log_id = current.reader.log_id
@@ -165,7 +165,7 @@ class EffectCache:
             return {}
 
 
-def cache_effect(current: CurrentMap, command: Command, effect: Effect) -> None:
+def cache_effect(current: MapToEdit, command: Command, effect: Effect) -> None:
     """Keep the effect of a command that was recorded right behind the events of the map."""
     commands = [*current.commands, RecordedCommand(current.end, command)]
     *_, key = effect_keys(current.settings_of, commands)
@@ -196,9 +196,7 @@ def effect_keys(settings_of: SettingsOf, commands: Iterable[RecordedCommand]) ->
         yield digest.hexdigest()[:32]
 
 
-def effects_of(
-    current: CurrentMap, known_only: bool
-) -> list[tuple[RecordedCommand, Effect | None]]:
+def effects_of(current: MapToEdit, known_only: bool) -> list[tuple[RecordedCommand, Effect | None]]:
     """Every command of a log with its effect on the map of the events before it.
 
     With ``known_only`` nothing is folded, and effects not in the cache are None.
@@ -215,7 +213,7 @@ def effects_of(
         if effect is not None:
             change = None
             continue
-        then = CurrentMap(
+        then = MapToEdit(
             current.reader,
             current.settings_of,
             until=recorded.offset,

@@ -27,7 +27,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.corrections import RecordedCommand
 from projections.fold.settings import Settings, assignment_texts, settings_by_name
 from projections.map.phrases import command_document
-from projections.store.records import iso_time
+from projections.store.history_records import iso_time
 
 from .effect import Effect
 from .make import undone_by

@@ -48,7 +48,7 @@ from .conflicts import (
     forgetting,
     refusal,
 )
-from .current import CurrentMap
+from .current import MapToEdit
 
 _C = TypeVar("_C", bound=Command)
 
@@ -74,7 +74,7 @@ def build(model: type[_C], stamp: Stamp, **fields: Any) -> _C:
 _OPTIONS = {"command_id": "--command-id", "issued_by": "--issued-by", "reason": "--reason"}
 
 
-def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> NamePlace:
+def name_place(current: MapToEdit, stamp: Stamp, place: str, name: str) -> NamePlace:
     """The command that names a place."""
     anchor = current.find_place(place)
     number = current.place_of(anchor)
@@ -89,7 +89,7 @@ def name_place(current: CurrentMap, stamp: Stamp, place: str, name: str) -> Name
     return build(NamePlace, stamp, place=_anchor(anchor), name=name)
 
 
-def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> KeepApart:
+def keep_apart(current: MapToEdit, stamp: Stamp, first: str, second: str) -> KeepApart:
     """The command that keeps two places apart."""
     pair = _two_places(current, first, second)
     if pair in current.corrections.apart:
@@ -98,7 +98,7 @@ def keep_apart(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Ke
     return build(KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
 
 
-def undo_merge(current: CurrentMap, stamp: Stamp, offset: int) -> UndoMerge:
+def undo_merge(current: MapToEdit, stamp: Stamp, offset: int) -> UndoMerge:
     """The command that keeps apart the places merged at ``offset``."""
     anchors = merged_at(current, offset)
     check_apart(current, anchors)
@@ -107,7 +107,7 @@ def undo_merge(current: CurrentMap, stamp: Stamp, offset: int) -> UndoMerge:
     )
 
 
-def join(current: CurrentMap, stamp: Stamp, first: str, second: str) -> Join:
+def join(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Join:
     """The command that joins two places."""
     pair = _two_places(current, first, second)
     if current.place_of(pair[0]) == current.place_of(pair[1]):
@@ -126,7 +126,7 @@ def _check_floor(what: str, one: str | None, other: str | None) -> None:
         raise EditRefused(f"{what} are on two floors, {names}; nothing on two floors is ever one")
 
 
-def _two_places(current: CurrentMap, first: str, second: str) -> tuple[Keyframe, Keyframe]:
+def _two_places(current: MapToEdit, first: str, second: str) -> tuple[Keyframe, Keyframe]:
     pair = current.find_place(first), current.find_place(second)
     if pair[0] == pair[1]:
         raise EditRefused(
@@ -140,7 +140,7 @@ def _anchor(keyframe: Keyframe) -> Anchor:
     return Anchor(run_id=keyframe.run_id, keyframe_id=keyframe.keyframe_id)
 
 
-def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> SameObject:
+def same_object(current: MapToEdit, stamp: Stamp, first: str, second: str) -> SameObject:
     """The command that makes two objects one."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.object == other.object:
@@ -158,7 +158,7 @@ def same_object(current: CurrentMap, stamp: Stamp, first: str, second: str) -> S
 
 
 def different_objects(
-    current: CurrentMap, stamp: Stamp, first: str, second: str
+    current: MapToEdit, stamp: Stamp, first: str, second: str
 ) -> DifferentObjects:
     """The command that keeps two objects apart. Two observations of one object are named by their
     det_ids."""
@@ -174,14 +174,14 @@ def different_objects(
     return build(DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))
 
 
-def drop_object(current: CurrentMap, stamp: Stamp, thing: str) -> DropObject:
+def drop_object(current: MapToEdit, stamp: Stamp, thing: str) -> DropObject:
     """The command that leaves an object's present observations out of the map."""
     found = current.find_object(thing)
     det_ids = tuple(current.view.observations[number].det_id for number in found.observations)
     return build(DropObject, stamp, det_ids=det_ids)
 
 
-def drop_detection(current: CurrentMap, stamp: Stamp, det_ids: Sequence[str]) -> DropDetection:
+def drop_detection(current: MapToEdit, stamp: Stamp, det_ids: Sequence[str]) -> DropDetection:
     """The command that leaves detections out of the map."""
     named = tuple(dict.fromkeys(map(DetId, det_ids)))
     for det_id in named:
@@ -191,7 +191,7 @@ def drop_detection(current: CurrentMap, stamp: Stamp, det_ids: Sequence[str]) ->
     return build(DropDetection, stamp, det_ids=named)
 
 
-def forget_run(current: CurrentMap, stamp: Stamp, run_id: str) -> ForgetRun:
+def forget_run(current: MapToEdit, stamp: Stamp, run_id: str) -> ForgetRun:
     """The command that leaves a run out of every fold."""
     check_run_in_map(current, run_id)
     current.run(run_id)
@@ -201,7 +201,7 @@ def forget_run(current: CurrentMap, stamp: Stamp, run_id: str) -> ForgetRun:
 _RANGE = re.compile(r"(-?[0-9]{1,19})\.\.(-?[0-9]{1,19})")
 
 
-def forget_keyframes(current: CurrentMap, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
+def forget_keyframes(current: MapToEdit, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
     """The command that leaves keyframes ``A..B`` of a run, both included, out of every fold."""
     found = _RANGE.fullmatch(span)
     if found is None:
@@ -219,13 +219,13 @@ def forget_keyframes(current: CurrentMap, stamp: Stamp, run_id: str, span: str) 
     return build(ForgetKeyframes, stamp, run_id=run_id, first=first, last=last)
 
 
-def keyframes_of(current: CurrentMap, run_id: str) -> str:
+def keyframes_of(current: MapToEdit, run_id: str) -> str:
     """``it has 912 keyframes, 1 to 912``."""
     ids = [k.keyframe_id for k in current.run(run_id)]
     return f"it has {counted(len(ids), 'keyframe')}, {min(ids)} to {max(ids)}"
 
 
-def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSettings:
+def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> UseSettings:
     """The command that changes the settings of the map from here on."""
     if settings == (current.corrections.settings or Settings()):
         raise EditRefused("these are the settings of the log already")
@@ -233,7 +233,7 @@ def use_settings(current: CurrentMap, stamp: Stamp, settings: Settings) -> UseSe
     return build(UseSettings, stamp, settings=plain)
 
 
-def undo(current: CurrentMap, stamp: Stamp, command_id: str) -> Undo:
+def undo(current: MapToEdit, stamp: Stamp, command_id: str) -> Undo:
     """The command that undoes another one."""
     found = current.find_command(command_id)
     if found is None:
@@ -266,7 +266,7 @@ def undone_by(commands: Sequence[RecordedCommand]) -> dict[str, RecordedCommand]
 _MOST_OFFSETS = 10
 
 
-def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
+def merged_at(current: MapToEdit, offset: int) -> tuple[Keyframe, ...]:
     """The founding keyframes of the places that the event at ``offset`` made one.
 
     Raises MisuseError with the offsets of merges when nothing merged there, and EditRefused when a
@@ -296,14 +296,14 @@ def merged_at(current: CurrentMap, offset: int) -> tuple[Keyframe, ...]:
     return tuple(current.founder(place) for place in merged[0])
 
 
-def _check_not_undone(current: CurrentMap, offset: int) -> None:
+def _check_not_undone(current: MapToEdit, offset: int) -> None:
     for recorded in current.corrections.in_force:
         command = recorded.command
         if isinstance(command, UndoMerge) and command.merge_offset == offset:
             raise EditRefused(f"the merge at {offset} is undone already, by {describe(recorded)}")
 
 
-def _nothing_merged(current: CurrentMap, offset: int) -> str:
+def _nothing_merged(current: MapToEdit, offset: int) -> str:
     offsets = sorted(
         {m.cause.offset for m in current.merges}, key=lambda at: (abs(at - offset), at)
     )

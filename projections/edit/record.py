@@ -42,7 +42,7 @@ from projections.map.own_events import read_commands
 from projections.map.view import MapView
 
 from .conflicts import EditRefused, describe
-from .current import CurrentMap, SettingsOf
+from .current import MapToEdit, SettingsOf
 from .effect import Change, Effect
 from .make import Stamp
 
@@ -57,7 +57,7 @@ class Outcome(NamedTuple):
     void: tuple[tuple[RecordedCommand, str], ...] = ()
 
 
-def outcome_of(current: CurrentMap, command: Command, *, recorded: bool) -> Outcome:
+def outcome_of(current: MapToEdit, command: Command, *, recorded: bool) -> Outcome:
     """The outcome of a command. One that is not ``recorded`` is refused with EditRefused if the map
     can be folded without it but not with it, or if it would not have its effect."""
     change = Change.by(current, command)
@@ -203,7 +203,7 @@ def _keyframe(anchor: Anchor) -> Keyframe:
     return Keyframe(anchor.run_id, anchor.keyframe_id)
 
 
-MakeCommand = Callable[[CurrentMap, Stamp], Command]
+MakeCommand = Callable[[MapToEdit, Stamp], Command]
 """A function that makes the command from the current map. Raises MisuseError."""
 OpenSession = Callable[[], AbstractContextManager[Session]]
 TIMEOUT_S: Final = 10.0
@@ -219,7 +219,7 @@ class Made(NamedTuple):
     recorded, ``repeated`` if it was recorded by an earlier call."""
 
     command: Command
-    current: CurrentMap
+    current: MapToEdit
     outcome: Outcome
     offset: Offset | None
     repeated: bool = False
@@ -235,10 +235,10 @@ def make_command(
     """Make a command, fold the log with it, and record nothing. One that is in the log already is
     made as it was made then. Raises MisuseError, also if the log has another command of this id or
     cannot be folded with this one."""
-    current = CurrentMap(reader, settings_of, note=note)
+    current = MapToEdit(reader, settings_of, note=note)
     known = current.find_command(stamp.command_id)
     if known is not None:
-        current = CurrentMap(reader, settings_of, until=known.offset, note=note)
+        current = MapToEdit(reader, settings_of, until=known.offset, note=note)
     command = make(current, stamp)
     check_settings(command)
     if known is not None and known.command != command:

@@ -1,12 +1,12 @@
 """Time travel: past maps, why the map is what it is, and what it would be under other settings.
 
-`Timeline` answers for one log: the map at any offset under the commands known at another, every
+`LogTimeline` answers for one log: the map at any offset under the commands known at another, every
 merge and its cause, the explanation of a place or an object, the difference of two maps, and the
 event that made a condition true. `what_if` folds the log under other settings, or without one of
 its commands, and compares.
 """
 
-from projections.store.records import Cause
+from projections.store.history_records import Cause
 
 from .bisect import Search, Turn
 from .conditions import Expression, ExpressionError
@@ -14,7 +14,7 @@ from .diff import Difference
 from .explanation import Entry, Explanation
 from .known import KnownHistory, Progress
 from .names import NoSuchThing
-from .timeline import Timeline
+from .timeline import LogTimeline
 from .whatif import WhatIf, what_if
 
 __all__ = [
@@ -25,10 +25,10 @@ __all__ = [
     "Expression",
     "ExpressionError",
     "KnownHistory",
+    "LogTimeline",
     "NoSuchThing",
     "Progress",
     "Search",
-    "Timeline",
     "Turn",
     "WhatIf",
     "what_if",

@@ -17,7 +17,7 @@ import numpy as np
 
 from eventsrc.envelope.model import Offset
 from projections.store.history import NEVER, History
-from projections.store.records import Cause, ObjectHistory, PlaceHistory
+from projections.store.history_records import Cause, ObjectHistory, PlaceHistory
 
 from .condition_functions import Direction, Names, Value
 from .conditions import Expression

@@ -26,7 +26,7 @@ from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
 from projections.fold.pose_corrections import PoseCorrection
 from projections.map.phrases import command_document, command_name, command_title
 from projections.store.history import History
-from projections.store.records import Cause, PlaceHistory, RefusedMerge
+from projections.store.history_records import Cause, PlaceHistory, RefusedMerge
 
 from .explanation import Entry
 from .merges import refusal_reason

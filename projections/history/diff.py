@@ -17,7 +17,7 @@ from projections.map.digest import map_digest
 from projections.map.phrases import command_document
 from projections.map.records import Estimate, KeyframeRecord, Relocation
 from projections.map.view import MapView
-from projections.store.records import Cause
+from projections.store.history_records import Cause
 
 
 @dataclass(frozen=True, slots=True)

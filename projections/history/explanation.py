@@ -16,7 +16,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal, Pose
 from projections.fold.exact import mean_m
 from projections.store.history import NEVER, History
-from projections.store.records import Cause, Merge, PlaceHistory, count_before
+from projections.store.history_records import Cause, Merge, PlaceHistory, count_before
 
 from .merges import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title

@@ -23,7 +23,7 @@ from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_recorder import HistoryRecorder
 from projections.store.history_recorder import Progress as Progress
-from projections.store.records import Merge, ObjectMerge, RefusedMerge
+from projections.store.history_records import Merge, ObjectMerge, RefusedMerge
 from projections.store.stored_view import StoredView
 from projections.store.timeline_cache import TimelineCache
 

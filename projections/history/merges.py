@@ -33,7 +33,7 @@ from projections.fold.deltas import (
 from projections.fold.exact import UM_PER_M
 from projections.map.phrases import command_document, command_on, command_title
 from projections.store.history import History
-from projections.store.records import EdgeChange, Merge, ObjectMerge, RefusedMerge
+from projections.store.history_records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
 from .names import keyframe_name, log_name, place_name
 

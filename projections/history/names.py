@@ -13,7 +13,7 @@ from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from projections.fold.corrections import Keyframe
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
 from projections.store.history import History
-from projections.store.records import ObjectHistory, PlaceHistory
+from projections.store.history_records import ObjectHistory, PlaceHistory
 
 MOST_NAMES = 5
 """Names that an error message lists."""

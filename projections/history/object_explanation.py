@@ -15,7 +15,7 @@ from projections.fold.deltas import ObjectMissing, ObjectSeen, ObservationOrdina
 from projections.fold.exact import Q40, UM_PER_M
 from projections.map.records import Estimate, ObjectRecord, ObservationRecord
 from projections.store.history import History
-from projections.store.records import ObjectHistory, ObjectMerge, count_before
+from projections.store.history_records import ObjectHistory, ObjectMerge, count_before
 
 from .explanation import Entry, Explanation, passed_milestone, position_text
 from .merges import evidence_document, evidence_text

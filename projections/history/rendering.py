@@ -10,7 +10,7 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.map.phrases import command_title
 from projections.map.records import Estimate
 from projections.store.history import History
-from projections.store.records import EdgeChange, Merge, ObjectMerge, RefusedMerge
+from projections.store.history_records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m

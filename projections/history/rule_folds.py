@@ -42,7 +42,7 @@ from projections.map.view import MapView
 from projections.store.column_rows import TableWriter
 from projections.store.history import History
 from projections.store.history_recorder import map_at
-from projections.store.records import PlaceHistory
+from projections.store.history_records import PlaceHistory
 from projections.store.tables import Tables
 
 from .known import Progress

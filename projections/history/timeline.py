@@ -18,7 +18,7 @@ from projections.map.fold import FoldedEvent
 from projections.map.own_events import read_commands
 from projections.map.view import MapView
 from projections.store.history import History
-from projections.store.records import Cause, Merge
+from projections.store.history_records import Cause, Merge
 
 from .bisect import HistoryFacts, Search
 from .conditions import Expression
@@ -37,7 +37,7 @@ _MOST_COMPILED = 16
 """Corrections that are kept, of the moments of knowledge asked about last."""
 
 
-class Timeline:
+class LogTimeline:
     """A context manager over a log. An ``end`` means the map after that many events.
 
     ``settings`` are those of every fold, or a function of the corrections; by default those
@@ -69,7 +69,7 @@ class Timeline:
         self._compiled: dict[int, Corrections] = {}
         self._histories: dict[tuple[str, tuple[Offset, ...]], KnownHistory] = {}
 
-    def __enter__(self) -> "Timeline":
+    def __enter__(self) -> "LogTimeline":
         return self
 
     def __exit__(self, *_: object) -> None:

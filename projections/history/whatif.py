@@ -138,7 +138,7 @@ class WhatIf:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class TrialRules:
     """One alternative to try: its name and rules, and the command that it leaves out."""
 
     name: str
@@ -146,10 +146,11 @@ class Trial:
     without: RecordedCommand | None = None
 
 
-def setting_trials(base: Rules, others: Sequence[Settings]) -> list[Trial]:
+def setting_trials(base: Rules, others: Sequence[Settings]) -> list[TrialRules]:
     """A trial for each of other settings, under the base's corrections."""
     return [
-        Trial(settings_name(base.settings, each), Rules(each, base.corrections)) for each in others
+        TrialRules(settings_name(base.settings, each), Rules(each, base.corrections))
+        for each in others
     ]
 
 
@@ -157,20 +158,20 @@ def command_trials(
     commands: Sequence[RecordedCommand],
     command_ids: Sequence[str],
     settings: Callable[[Corrections], Settings],
-) -> list[Trial]:
+) -> list[TrialRules]:
     """A trial for each of some commands that is left out. Raises NoSuchThing."""
     trials = []
     for command_id in dict.fromkeys(command_ids):
         recorded, corrections = without_command(commands, command_id)
         rules = Rules(settings(corrections), corrections)
-        trials.append(Trial(f"without {command_name(recorded.command)}", rules, recorded))
+        trials.append(TrialRules(f"without {command_name(recorded.command)}", rules, recorded))
     return trials
 
 
 def what_if(
     log: Path,
     base: Rules | Settings,
-    others: Sequence[Trial | Settings],
+    others: Sequence[TrialRules | Settings],
     end: Offset,
     *,
     truth: "Truth | None" = None,
@@ -197,13 +198,13 @@ def what_if(
     name = settings_name(Settings(), rules.settings) if changed else "defaults"
     return WhatIf(
         end=end,
-        base=_compare(first, first, Trial(f"base: {name}", rules)),
+        base=_compare(first, first, TrialRules(f"base: {name}", rules)),
         alternatives=tuple(_compare(first, results[trial.rules.key], trial) for trial in trials),
         corrections=rules.corrections.fingerprint(),
     )
 
 
-def _compare(base: FoldResult, other: FoldResult, trial: Trial) -> Alternative:
+def _compare(base: FoldResult, other: FoldResult, trial: TrialRules) -> Alternative:
     base, other = _aligned(base, other)
     posed = sorted({*base.posed, *other.posed})
     return Alternative(

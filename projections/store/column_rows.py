@@ -17,7 +17,7 @@ from projections.fold.deltas import (
 )
 
 from .columns import ROWS, STRIPE_EVENTS, Row, Stripe, stripe_of
-from .records import EdgeChange, Merge, cause_of
+from .history_records import EdgeChange, Merge, cause_of
 from .tables import Tables, last_rows
 
 SHORT_STRIPE_EVENTS: Final = 4_096

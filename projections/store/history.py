@@ -32,10 +32,7 @@ from projections.fold.settings import Settings
 from projections.map.records import ObjectRecord
 
 from .columns import Array
-from .lazy_rows import Chunks, Items, OrdinalsByName
-from .neighbours import Neighbours, posed
-from .object_states import ObjectStates
-from .records import (
+from .history_records import (
     Cause,
     Merge,
     ObjectHistory,
@@ -44,6 +41,9 @@ from .records import (
     RefusedMerge,
     last_before,
 )
+from .lazy_rows import Chunks, Items, OrdinalsByName
+from .neighbours import Neighbours, posed
+from .object_states import ObjectStates
 from .tables import Groups, Tables
 
 NEVER: Final = Offset(2**63 - 1)

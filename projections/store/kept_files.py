@@ -88,7 +88,7 @@ def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> int:
     return info.header_offset + _LOCAL_HEADER + len(name.encode()) + len(info.extra)
 
 
-class Part:
+class PartFile:
     """An open file of stripes. Raises OSError, and DamagedPart for one that is not as written."""
 
     def __init__(self, path: Path) -> None:

@@ -46,7 +46,7 @@ from projections.map.digest import VERSION
 from projections.map.own_events import with_vectors
 
 from .columns import Stripe, joined_short
-from .kept_files import FORMAT, MalformedState, Part, Unwritable, pack, unpack, write_part
+from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, unpack, write_part
 from .tables import DamagedPart
 
 FOLD_VERSION: Final = 5
@@ -248,9 +248,9 @@ class TimelineCache:
             "last_event": self._event_hash(end),
         }
 
-    def _open(self, file: _File) -> Part | None:
+    def _open(self, file: _File) -> PartFile | None:
         try:
-            opened = Part(file.path)
+            opened = PartFile(file.path)
             self._check(opened.about, *opened.span)
             self._check(opened.about, file.start, file.end)
         except FileNotFoundError:

@@ -18,7 +18,7 @@ from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.commands import Command, NamePlace, parse_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.effect import Change, Effect, effect_of
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
@@ -273,7 +273,7 @@ def test_a_command_recorded_meanwhile_is_seen(
     log = mapfold.folder / "log"
     made = []
 
-    def join(current: CurrentMap, stamp: make.Stamp) -> Command:
+    def join(current: MapToEdit, stamp: make.Stamp) -> Command:
         made.append(current.known_at)
         if len(made) == 1:
             mapfold("edit", "log", "keep-apart", LEFT, FAR, *WHY)
@@ -384,7 +384,7 @@ def test_effects_of_another_log_are_not_taken(mapfold: Commands) -> None:
 
 def test_a_change_that_is_none_is_folded_no_second_time(mapfold: Commands) -> None:
     with LogReader(mapfold.folder / "log") as reader:
-        current = CurrentMap(reader, lambda _: Settings())
+        current = MapToEdit(reader, lambda _: Settings())
         change = Change(current, current.commands)
         assert change.effect().none
         assert change.after is current.view

@@ -8,7 +8,7 @@ from eventsrc.envelope.model import Offset
 from projections.edit import make as m
 from projections.edit.conflicts import EditRefused
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from tests.property.test_floors import drive
 from tests.support.commands import Commands
 from tests.support.logs import make, write_log
@@ -52,7 +52,7 @@ def test_the_height_of_a_floor_is_a_setting(mapfold: Commands, log: Path) -> Non
 
 def test_a_past_map_has_the_floors_until_then(mapfold: Commands, log: Path) -> None:
     assert mapfold("state", log, "--json", "--at", "6").json["floors"] == ["ground"]
-    with Timeline(log, Settings()) as timeline:
+    with LogTimeline(log, Settings()) as timeline:
         past = timeline.at(Offset(9))
     assert list(past.floors) == ["ground", "1"]
     assert [k.floor for k in past.keyframes] == ["ground"] * 6 + ["1"] * 3

@@ -11,7 +11,7 @@ import pytest
 
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
 from projections.map.own_events import new_map
@@ -31,7 +31,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def digests(log: Path, ends: list[int], *, cache: bool = True) -> list[str]:
-    with kept_early(), Timeline(log, RULES, cache=cache) as timeline:
+    with kept_early(), LogTimeline(log, RULES, cache=cache) as timeline:
         _ = timeline.history
         return [map_digest(timeline.at(end)) for end in ends]
 
@@ -57,7 +57,7 @@ def test_the_second_who_asks_gets_the_digest_that_was_kept(log: Path) -> None:
 
 def test_a_map_that_was_folded_on_has_a_digest_of_its_own(log: Path) -> None:
     digests(log, ENDS)
-    with kept_early(), Timeline(log, RULES) as timeline, LogReader(log) as reader:
+    with kept_early(), LogTimeline(log, RULES) as timeline, LogReader(log) as reader:
         view = timeline.at(EVENTS // 2)
         semantic_map = new_map(reader, RULES, NO_CORRECTIONS)
         for folded in fold_events(reader.read(), semantic_map):
@@ -85,7 +85,7 @@ def test_a_damaged_digest_is_named_and_computed_again(log: Path) -> None:
     content[-3] ^= 1
     path.write_bytes(content)
     notes: list[str] = []
-    with kept_early(), Timeline(log, RULES, note=notes.append) as timeline:
+    with kept_early(), LogTimeline(log, RULES, note=notes.append) as timeline:
         assert map_digest(timeline.at(50)) == right[0]
     assert notes == [f"{path} is not used: its checksum does not match"]
     with patch("projections.map.digest._computed", none_is_computed):

@@ -22,13 +22,13 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.effect import effect_keys, effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.rule_folds import Rules, fold_in_this_process
 from projections.localize.calibrate.rounds import calibrate
 from projections.map.digest import map_digest
@@ -86,7 +86,7 @@ def test_twice_the_commands_are_about_twice_the_work(kind: Any, given: Any) -> N
         corrections.fingerprint()
         SemanticMap(Settings(), corrections)
         with LogReader(SAMPLE) as reader:
-            current = CurrentMap(reader, settings_of, commands=commands, corrections=corrections)
+            current = MapToEdit(reader, settings_of, commands=commands, corrections=corrections)
             found = effects_of(current, known_only=True)
         times = {recorded.offset: 0 for recorded in commands}
         edits_document(found, times)
@@ -206,7 +206,7 @@ def test_why_reads_the_times_of_all_commands_together(tmp_path: Path) -> None:
 
     def calls(count: int) -> int:
         log = write_log(tmp_path / str(count), commands_of(KINDS["name-place"], count))
-        with Timeline(log, cache=False) as timeline:
+        with LogTimeline(log, cache=False) as timeline:
             known = timeline.knowing()
             _ = known.history
             return calls_of(lambda: known.why("sim-7-a_p0"))
@@ -217,7 +217,7 @@ def test_why_reads_the_times_of_all_commands_together(tmp_path: Path) -> None:
 
 def test_few_compiled_corrections_are_kept(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", commands_of(KINDS["name-place"], 50))
-    with Timeline(log) as timeline:
+    with LogTimeline(log) as timeline:
         for known_at in range(445, 496):
             found = timeline.corrections(Offset(known_at))
             assert len(found.in_force) == known_at - 445

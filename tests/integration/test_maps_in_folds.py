@@ -13,7 +13,7 @@ from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.errors import FoldError
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
 from projections.map.one_floor import view_of_floor
@@ -121,7 +121,7 @@ def test_state_and_pictures_have_the_maps_of_floors(tmp_path: Path) -> None:
         HALL.cells.tolist(),
         upstairs.cells.tolist(),
     )
-    with Timeline(tmp_path / "L", Settings()) as timeline:
+    with LogTimeline(tmp_path / "L", Settings()) as timeline:
         for until in range(19):
             past, folded = timeline.at(until), _view(tmp_path / "L", until)
             assert past.maps_in_force().keys() == folded.maps_in_force().keys()
@@ -162,7 +162,7 @@ def test_a_kept_fold_has_the_map(tmp_path: Path) -> None:
 
 def test_time_travel_has_the_map_of_its_time(tmp_path: Path) -> None:
     log = _write(tmp_path / "L", *DRIVE[:3], HALL, *DRIVE[3:], ROOMS)
-    with Timeline(log, Settings()) as timeline:
+    with LogTimeline(log, Settings()) as timeline:
         for until in range(len(DRIVE) + 3):
             folded, past = _view(log, until), timeline.at(until)
             assert _map_at(past) == _map_at(folded)

@@ -11,7 +11,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import Event, LogReader, cache_folder
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.map.digest import map_digest
 from projections.map.fold import FoldedEvent, fold_events
 from projections.postgres import rebuild, tail
@@ -133,7 +133,7 @@ def passing_over(offset: int) -> Callable[..., Iterator[FoldedEvent]]:
 def test_a_tail_keeps_what_it_folded(log: Path, one_database: Targets, folded: list[int]) -> None:
     report = tail(log, one_database, SETTINGS, once=True)
     assert folds_kept(log) == [report.next_offset]
-    with Timeline(log, SETTINGS) as kept, Timeline(log, SETTINGS, cache=False) as made:
+    with LogTimeline(log, SETTINGS) as kept, LogTimeline(log, SETTINGS, cache=False) as made:
         with patch.object(SemanticMap, "fold", side_effect=AssertionError):
             digests = [map_digest(kept.at(end)) for end in (1, 50, 120, kept.end)]
         assert digests == [map_digest(made.at(end)) for end in (1, 50, 120, made.end)]

@@ -18,7 +18,7 @@ from eventsrc.base.errors import LogError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.map.fold import fold_log
 from projections.store.history_recorder import map_after
 from projections.store.timeline_cache import TimelineCache
@@ -53,7 +53,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def right(log: Path) -> str:
     """The answers of the log, without files."""
-    with Timeline(log, RULES, cache=False) as timeline:
+    with LogTimeline(log, RULES, cache=False) as timeline:
         assert len(timeline.merges()) > 1
     copy = log.with_name("copy")
     copy.symlink_to(log)
@@ -150,9 +150,9 @@ def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: i
     before = [(path, path.stat().st_ino) for path in kept(log)]
     why = os.strerror(number)
     notes: list[str] = []
-    with kept_early(), Timeline(log, RULES, note=notes.append) as timeline:
+    with kept_early(), LogTimeline(log, RULES, note=notes.append) as timeline:
         cache = TimelineCache(timeline.reader, RULES, NO_CORRECTIONS, notes.append)
-        with patch("projections.store.timeline_cache.Part", side_effect=OSError(number, why)):
+        with patch("projections.store.timeline_cache.PartFile", side_effect=OSError(number, why)):
             assert not cache.stripes(timeline.end)
         assert [(path, path.stat().st_ino) for path in kept(log)] == before
         assert notes
@@ -162,7 +162,7 @@ def test_a_part_that_cannot_be_opened_now_stays(log: Path, right: str, number: i
 
 @pytest.mark.slow
 def test_a_log_that_grows_while_it_is_looked_at(log: Path) -> None:
-    with kept_early(), Timeline(log, RULES) as timeline:
+    with kept_early(), LogTimeline(log, RULES) as timeline:
         for first in range(EVENTS, EVENTS + rounds(40, 20), 10):
             view = timeline.at(EVENTS // 2)
             write_log(log, drive(first, first + 10))
@@ -204,14 +204,14 @@ def test_histories_are_few_and_small(log: Path) -> None:
     with kept_early():
         for number in range(MOST_KEPT + 3):
             rules = RULES.with_assignments([f"eps_m={0.5 + number / 10}"])
-            with Timeline(log, rules) as timeline:
+            with LogTimeline(log, rules) as timeline:
                 assert timeline.history.keyframes
     assert len({path.name.split("-")[0].split(".")[0] for path in kept(log)}) == MOST_KEPT
     assert len(kept(log)) == 2 * MOST_KEPT
 
 
 def test_without_a_cache_nothing_is_written(log: Path) -> None:
-    with kept_early(), Timeline(log, RULES, cache=False) as timeline:
+    with kept_early(), LogTimeline(log, RULES, cache=False) as timeline:
         assert timeline.merges()
     assert kept(log) == []
 
@@ -229,7 +229,7 @@ def test_numpy_reads_a_part(log: Path, right: str) -> None:
 @pytest.mark.parametrize("cache", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("change", ["other log", "no log", "no history", "grown"])
 def test_an_open_timeline_whose_log_changes(log: Path, change: str, cache: bool) -> None:
-    with kept_early(), Timeline(log, RULES, cache=cache) as timeline:
+    with kept_early(), LogTimeline(log, RULES, cache=cache) as timeline:
         before = told(timeline, [EVENTS, 100])
         if change == "grown":
             write_log(log, drive(EVENTS, EVENTS + 40))
@@ -240,14 +240,14 @@ def test_an_open_timeline_whose_log_changes(log: Path, change: str, cache: bool)
             if change == "other log":
                 write_log(log, drive(7, EVENTS + 80))
         timeline.refresh()
-        with Timeline(log, RULES, cache=False) if change == "grown" else nullcontext() as fresh:
+        with LogTimeline(log, RULES, cache=False) if change == "grown" else nullcontext() as fresh:
             expected = before if fresh is None else told(fresh, [EVENTS, 100])
         assert told(timeline, [EVENTS, 100]) == expected
 
 
 def test_damage_is_not_repaired_from_another_log(log: Path) -> None:
     answers(log, [])
-    with kept_early(), Timeline(log, RULES) as timeline:
+    with kept_early(), LogTimeline(log, RULES) as timeline:
         shown = timeline.at()  # which reads the keyframes later
         for path in (path for path in kept(log) if path.suffix == ".npz"):
             data = path.read_bytes()

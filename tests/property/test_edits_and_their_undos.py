@@ -14,7 +14,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_transform
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.effect import Change, effect_of
 from projections.edit.make import Stamp
 from projections.fold.corrections import Corrections
@@ -98,7 +98,7 @@ def test_undone_in_any_order_they_leave_nothing(
     given_ids = []
     for number, (function, args) in enumerate(edits):
         with LogReader(log) as reader:
-            current = CurrentMap(reader, _settings)
+            current = MapToEdit(reader, _settings)
             try:
                 command = function(current, Stamp(f"c{number}", "me@here", "why"), *args)
             except MisuseError:

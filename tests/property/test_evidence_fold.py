@@ -14,7 +14,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.object_explanation import explain_object
 from projections.map.digest import map_digest
 from projections.map.export import state_document
@@ -100,7 +100,7 @@ def test_a_timeline_gives_the_fold_of_every_offset(
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
         log = write_log(Path(folder) / "log", documents)
-        with LogReader(log) as reader, Timeline(log, EVIDENCE) as timeline:
+        with LogReader(log) as reader, LogTimeline(log, EVIDENCE) as timeline:
             assert timeline.end == len(documents)
             history = timeline.history
             for end in data.draw(st.lists(st.integers(0, len(documents)), max_size=4)):

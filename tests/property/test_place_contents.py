@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.model import Offset
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.map.view import MapView
 from tests.property.test_floors import buildings
 from tests.support.evidence_drives import drives
@@ -44,6 +44,6 @@ def check_all(settings: Settings, documents: list[dict[str, Any]]) -> None:
         check(folded.view)
     with tempfile.TemporaryDirectory() as folder:
         log = write_log(Path(folder) / "log", documents)
-        with Timeline(log, settings) as timeline:
+        with LogTimeline(log, settings) as timeline:
             for end in {0, len(documents) // 2, len(documents)}:
                 check(timeline.at(Offset(end)))

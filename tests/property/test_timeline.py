@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from eventsrc.log import LogReader
 from projections.fold.settings import Settings
-from projections.history import Expression, Timeline
+from projections.history import Expression, LogTimeline
 from projections.history.bisect import Search
 from projections.history.diff import rows_of
 from projections.history.merges import chains_of
@@ -22,7 +22,7 @@ from projections.map.digest import map_digest
 from projections.map.export import state_document
 from projections.map.fold import fold_log
 from projections.map.view import MapView
-from projections.store.records import Merge
+from projections.store.history_records import Merge
 from tests.support.thorough import examples
 from tests.support.walks import walks, write_log
 
@@ -33,15 +33,15 @@ slow = settings(
 
 
 @contextmanager
-def timeline(documents: list[dict[str, Any]]) -> Iterator[Timeline]:
+def timeline(documents: list[dict[str, Any]]) -> Iterator[LogTimeline]:
     with (
         tempfile.TemporaryDirectory() as folder,
-        Timeline(write_log(Path(folder) / "log", documents), RULES) as opened,
+        LogTimeline(write_log(Path(folder) / "log", documents), RULES) as opened,
     ):
         yield opened
 
 
-def folded(opened: Timeline, end: int) -> MapView:
+def folded(opened: LogTimeline, end: int) -> MapView:
     """The map after ``end`` events, folded from the start."""
     with LogReader(opened.reader.path) as reader:
         return fold_log(reader, RULES, end, keep_embeddings=False)[1]
@@ -104,7 +104,7 @@ EXPRESSIONS = [
 ]
 
 
-def slow_search(opened: Timeline, expression: str, start: int, end: int) -> int | None:
+def slow_search(opened: LogTimeline, expression: str, start: int, end: int) -> int | None:
     """The first offset by whose event a condition becomes true, asking a fold at every offset."""
 
     def holds(events: int) -> bool:
@@ -253,7 +253,7 @@ def test_the_links_of_a_merge_are_true(documents: list[dict[str, Any]]) -> None:
             event(f"{len(merge.absorbed)} absorbed")
 
 
-def assert_chains_join(opened: Timeline, merge: Merge, before: MapView, after: MapView) -> None:
+def assert_chains_join(opened: LogTimeline, merge: Merge, before: MapView, after: MapView) -> None:
     """Every absorbed place hangs by core points, each near the next, on one that is joined."""
     joined = {merge.survivor}
     for chain in chains_of(opened.history, merge):

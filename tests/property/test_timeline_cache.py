@@ -18,7 +18,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.log import LogWriter, parse_fsync
 from eventsrc.record.append import append_payload
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from tests.support.envelopes import envelope, payload
 from tests.support.evidence_drives import drives
 from tests.support.histories import expected, told
@@ -72,7 +72,7 @@ def empty_log() -> Iterator[Path]:
 def check(log: Path, rules: Any, ends: list[int], notes: list[str] | None = None) -> None:
     """A new process's answers, given the files that there are."""
     noted = [] if notes is None else notes
-    with Timeline(log, rules, note=noted.append) as timeline:
+    with LogTimeline(log, rules, note=noted.append) as timeline:
         asked = [min(end, timeline.end) for end in ends]
         assert told(timeline, asked) == expected(timeline, asked)
 

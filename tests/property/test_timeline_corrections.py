@@ -14,7 +14,7 @@ from eventsrc.envelope.commands import Command, NamePlace
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections, compile_corrections
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.diff import rows_of
 from projections.history.rule_folds import Rules
 from projections.history.whatif import command_trials, what_if
@@ -40,15 +40,15 @@ def chosen(corrections: Corrections) -> Settings:
 
 
 @contextmanager
-def timeline(items: Items) -> Iterator[Timeline]:
+def timeline(items: Items) -> Iterator[LogTimeline]:
     with (
         tempfile.TemporaryDirectory() as folder,
-        Timeline(write_mixed_log(Path(folder) / "log", items), chosen) as opened,
+        LogTimeline(write_mixed_log(Path(folder) / "log", items), chosen) as opened,
     ):
         yield opened
 
 
-def folded(opened: Timeline, end: int, known_at: int) -> MapView:
+def folded(opened: LogTimeline, end: int, known_at: int) -> MapView:
     """The map after ``end`` events under the commands before ``known_at``, from the start."""
     with LogReader(opened.reader.path) as reader:
         corrections = read_corrections(reader, known_at)

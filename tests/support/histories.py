@@ -23,7 +23,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.settings import Settings
 from projections.fold.survivors import PlaceSurvivors
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.diff import difference_of, rows_of
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document
@@ -40,7 +40,7 @@ from projections.map.records import (
 )
 from projections.map.view import MapView
 from projections.store.history import History
-from projections.store.records import count_before, last_before
+from projections.store.history_records import count_before, last_before
 from tests.support.memory_history import MemoryHistory, object_of
 
 
@@ -135,13 +135,13 @@ def searches(known: KnownHistory, names: list[str]) -> list[dict[str, Any]]:
     ]
 
 
-def told(timeline: Timeline, ends: Iterable[int]) -> dict[str, Any]:
+def told(timeline: LogTimeline, ends: Iterable[int]) -> dict[str, Any]:
     """All answers of a timeline under all that is known."""
     known = timeline.knowing()
     return {"maps": maps(known, ends), **stories(known)}
 
 
-def expected(timeline: Timeline, ends: Iterable[int]) -> dict[str, Any]:
+def expected(timeline: LogTimeline, ends: Iterable[int]) -> dict[str, Any]:
     """The same from memory."""
     known = KnownInMemory(timeline.knowing())
     return {"maps": maps(known, ends), **stories(known)}
@@ -156,7 +156,7 @@ def answers(log: Path, notes: list[str]) -> str:
     """Some answers as text; the history is kept however short it is."""
     with (
         patch("projections.store.timeline_cache.MIN_EVENTS", 1),
-        Timeline(log, RULES, note=notes.append) as timeline,
+        LogTimeline(log, RULES, note=notes.append) as timeline,
     ):
         history = timeline.history
         merges = [merge_document(history, merge) for merge in timeline.merges()]

@@ -39,7 +39,7 @@ from eventsrc.log import (
     seal,
 )
 from eventsrc.record.append import append_payload
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.fold.settings import Settings
 from tests.support.envelopes import detection, envelope, payload
@@ -210,7 +210,7 @@ def make(
 ) -> Command:
     """The command that a function of `projections.edit.make` makes from a log as it is."""
     with LogReader(log) as reader:
-        current = CurrentMap(reader, lambda c: settings or c.settings or Settings())
+        current = MapToEdit(reader, lambda c: settings or c.settings or Settings())
         return function(current, Stamp(command_id, "me@here", "why"), *args)
 
 

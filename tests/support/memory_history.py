@@ -41,8 +41,7 @@ from projections.fold.deltas import (
 from projections.fold.settings import Settings
 from projections.map.records import Estimate, ObjectRecord, Relocation
 from projections.store.history import NEVER, NO_PLACE, History
-from projections.store.neighbours import Neighbours, Posed
-from projections.store.records import (
+from projections.store.history_records import (
     Cause,
     EdgeChange,
     Merge,
@@ -54,6 +53,7 @@ from projections.store.records import (
     count_before,
     last_before,
 )
+from projections.store.neighbours import Neighbours, Posed
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import cache_folder, cache_sizes, make_cache_folder
-from projections.history import Timeline
+from projections.history import LogTimeline
 from tests.property.test_timeline_cache import kept_early
 from tests.support.envelopes import envelope
 from tests.support.walks import write_log
@@ -36,7 +36,7 @@ def test_every_path_of_a_log_has_its_caches_beside_it(log: Path) -> None:
 def test_a_log_named_by_dots_is_answered_and_kept(log: Path, named: str) -> None:
     if named == ".":
         os.chdir("..")
-    with kept_early(), Timeline(Path(named)) as timeline:
+    with kept_early(), LogTimeline(Path(named)) as timeline:
         assert timeline.at(9).counts()["keyframes"] == 9
     assert {path.suffix for path in log.with_name("log.history").iterdir()} == {".fold", ".npz"}
     assert [folder.resolve() for folder, _ in cache_sizes(Path(named))] == [

@@ -9,7 +9,7 @@ import pytest
 from eventsrc.base.errors import MisuseError
 from projections.adapters.drawing.merge_picture import draw_merge
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.merges import chains_of, merge_reason
 from projections.history.names import keyframe_name
 from tests.support.envelopes import envelope
@@ -22,14 +22,14 @@ ARMS = [(-3, 0), (-2, 0), (-1, 0), (3, 0), (2, 0), (1, 0), (0, 3), (0, 2), (0, 1
 @contextmanager
 def drive(
     folder: Path, spots: list[tuple[float, float]], min_samples: int = 3
-) -> Iterator[Timeline]:
+) -> Iterator[LogTimeline]:
     documents = [envelope(n, float(x), float(y)) for n, (x, y) in enumerate(spots)]
     rules = Settings(eps_m=1.0, min_samples=min_samples)
-    with Timeline(write_log(folder / "log", documents), rules) as opened:
+    with LogTimeline(write_log(folder / "log", documents), rules) as opened:
         yield opened
 
 
-def names(opened: Timeline, keyframes: tuple[int, ...]) -> list[str]:
+def names(opened: LogTimeline, keyframes: tuple[int, ...]) -> list[str]:
     return [keyframe_name(opened.history, k).removeprefix("run-a:") for k in keyframes]
 
 

@@ -9,7 +9,7 @@ import pytest
 from eventsrc.envelope.commands import Command, Join, KeepApart
 from projections.adapters.drawing.merge_picture import draw_merge
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.merges import chains_of, merge_document, merge_reason, refusal_document
 from projections.history.rendering import merge_text, merges_text, refusals_text
 from tests.support.envelopes import detection, envelope
@@ -23,7 +23,7 @@ of 4.5 m, so it founds the second. The last step is a short cut between the two 
 BACK = 10
 """The keyframe of that step."""
 
-Open = Callable[..., Timeline]
+Open = Callable[..., LogTimeline]
 
 
 def u_turn(things: dict[int, str] | None = None) -> list[dict[str, Any]]:
@@ -36,10 +36,10 @@ def u_turn(things: dict[int, str] | None = None) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[Open]:
-    made: list[Timeline] = []
+    made: list[LogTimeline] = []
 
-    def open_with(documents: list[dict[str, Any]], *commands: Command) -> Timeline:
-        made.append(Timeline(write_mixed_log(tmp_path / "log", [*documents, *commands]), RULES))
+    def open_with(documents: list[dict[str, Any]], *commands: Command) -> LogTimeline:
+        made.append(LogTimeline(write_mixed_log(tmp_path / "log", [*documents, *commands]), RULES))
         return made[-1]
 
     yield open_with

@@ -9,7 +9,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogWriter
 from projections.fold.errors import LogPointError
 from projections.fold.settings import Settings
-from projections.history import ExpressionError, NoSuchThing, Timeline
+from projections.history import ExpressionError, LogTimeline, NoSuchThing
 from projections.history.merges import merge_document
 from tests.support.envelopes import detection, envelope
 from tests.support.walks import write_log
@@ -33,12 +33,12 @@ RULES = Settings(eps_m=1.0, min_samples=3)
 
 
 @pytest.fixture
-def corridor(tmp_path: Path) -> Iterator[Timeline]:
-    with Timeline(write_log(tmp_path / "log", CORRIDOR), RULES) as opened:
+def corridor(tmp_path: Path) -> Iterator[LogTimeline]:
+    with LogTimeline(write_log(tmp_path / "log", CORRIDOR), RULES) as opened:
         yield opened
 
 
-def test_a_merge_with_its_chain_objects_and_edges(corridor: Timeline) -> None:
+def test_a_merge_with_its_chain_objects_and_edges(corridor: LogTimeline) -> None:
     (merge,) = corridor.merges()
     (cup,) = corridor.at().objects.values()
     document = merge_document(corridor.history, merge)
@@ -69,18 +69,18 @@ def test_a_merge_with_its_chain_objects_and_edges(corridor: Timeline) -> None:
     ]
 
 
-def test_merges_before_an_offset(corridor: Timeline) -> None:
+def test_merges_before_an_offset(corridor: LogTimeline) -> None:
     assert corridor.merges(8) == []
     assert len(corridor.merges(9)) == 1
 
 
-def test_a_merge_shows_from_the_next_offset_on(corridor: Timeline) -> None:
+def test_a_merge_shows_from_the_next_offset_on(corridor: LogTimeline) -> None:
     assert [p.place_id for p in corridor.at(8).places.values()] == ["run-a_p0", "run-a_p1"]
     assert [p.place_id for p in corridor.at(9).places.values()] == ["run-a_p0"]
     assert corridor.bisect("merged('run-a_p1')").document()["found"]["at"] == 9
 
 
-def test_why_of_a_standing_place(corridor: Timeline) -> None:
+def test_why_of_a_standing_place(corridor: LogTimeline) -> None:
     story = corridor.why("run-a_p0")
     assert [(e.cause.offset, e.what) for e in story.entries] == [(2, "founded"), (8, "absorbed")]
     assert story.summary == "8 keyframes around (3.25, 0.00); 1 object: cup; next to no other place"
@@ -95,21 +95,21 @@ def test_why_of_a_standing_place(corridor: Timeline) -> None:
     )
 
 
-def test_why_of_an_absorbed_place(corridor: Timeline) -> None:
+def test_why_of_an_absorbed_place(corridor: LogTimeline) -> None:
     story = corridor.why("run-a_p1")
     assert story.summary == "absorbed by run-a_p0 at offset 8 (2026-03-24T13:00:09.000Z)"
     assert story.facts["absorbed_by"]["place_id"] == "run-a_p0"
     assert [e.what for e in story.entries] == ["founded", "ended"]
 
 
-def test_why_at_an_earlier_offset(corridor: Timeline) -> None:
+def test_why_at_an_earlier_offset(corridor: LogTimeline) -> None:
     story = corridor.why("run-a_p1", 8)
     assert story.facts["stands"] is True
     assert [e.what for e in story.entries] == ["founded"]
     assert corridor.why("run-a_p1", 2).summary == ("not founded yet; run-a:6 founds it at offset 5")
 
 
-def test_why_of_an_object(corridor: Timeline) -> None:
+def test_why_of_an_object(corridor: LogTimeline) -> None:
     (cup,) = corridor.at().objects.values()
     story = corridor.why(cup.object_id)
     assert story.summary == (
@@ -135,12 +135,12 @@ def test_why_of_an_object(corridor: Timeline) -> None:
     ],
 )
 def test_why_same_of_two_keyframes(
-    corridor: Timeline, first: str, second: str, summary: str
+    corridor: LogTimeline, first: str, second: str, summary: str
 ) -> None:
     assert corridor.why_same(first, second).summary == summary
 
 
-def test_why_same_before_the_keyframes_are_recorded(corridor: Timeline) -> None:
+def test_why_same_before_the_keyframes_are_recorded(corridor: LogTimeline) -> None:
     story = corridor.why_same("run-a:1", "run-a:10", 3)
     assert story.summary == ("not in one place: run-a:1 is in run-a_p0; run-a:10 has not come yet")
     assert story.facts == {"same": False, "since": None, "places": ["run-a_p0", None]}
@@ -154,25 +154,25 @@ def test_why_same_before_the_keyframes_are_recorded(corridor: Timeline) -> None:
         ("obj-0000", "no object 'obj-0000' under these settings; "),
     ],
 )
-def test_an_absent_id_lists_the_near_ones(corridor: Timeline, thing: str, says: str) -> None:
+def test_an_absent_id_lists_the_near_ones(corridor: LogTimeline, thing: str, says: str) -> None:
     with pytest.raises(NoSuchThing) as caught:
         corridor.why(thing)
     assert str(caught.value).startswith(says)
 
 
-def test_a_keyframe_alone_is_refused_with_its_place(corridor: Timeline) -> None:
+def test_a_keyframe_alone_is_refused_with_its_place(corridor: LogTimeline) -> None:
     with pytest.raises(MisuseError, match="run-a:1 is a keyframe, in run-a_p0; give a place"):
         corridor.why("run-a:1")
     with pytest.raises(MisuseError, match="run-a:7 is a keyframe, in no place;"):
         corridor.why("run-a:7")
 
 
-def test_an_absent_keyframe_lists_the_near_ones(corridor: Timeline) -> None:
+def test_an_absent_keyframe_lists_the_near_ones(corridor: LogTimeline) -> None:
     with pytest.raises(NoSuchThing, match="near it: run-a:10, run-a:9"):
         corridor.why_same("run-a:1", "run-a:12")
 
 
-def test_a_condition_on_an_unknown_name_is_an_error_at_its_column(corridor: Timeline) -> None:
+def test_a_condition_on_an_unknown_name_is_an_error_at_its_column(corridor: LogTimeline) -> None:
     with pytest.raises(ExpressionError, match="no place 'run-a_p9'") as caught:
         corridor.bisect("place_count < 3 and merged('run-a_p9')")
     with pytest.raises(ExpressionError, match="no keyframe 'run-a:02' in this log; near it: run-a"):
@@ -180,7 +180,7 @@ def test_a_condition_on_an_unknown_name_is_an_error_at_its_column(corridor: Time
     assert caught.value.column == 28
 
 
-def test_bisect_gives_the_values_before_and_after(corridor: Timeline) -> None:
+def test_bisect_gives_the_values_before_and_after(corridor: LogTimeline) -> None:
     search = corridor.bisect("place_count == 1 and keyframe_count > 5")
     assert search.found is not None
     assert search.found.cause.name == "run-a:9"
@@ -188,25 +188,25 @@ def test_bisect_gives_the_values_before_and_after(corridor: Timeline) -> None:
     assert search.found.after == (("place_count", 1), ("keyframe_count", 9))
 
 
-def test_a_scan_lists_every_turn(corridor: Timeline) -> None:
+def test_a_scan_lists_every_turn(corridor: LogTimeline) -> None:
     search = corridor.bisect("place_count == 1", scan=True)
     assert [(t.cause.offset, t.becomes) for t in search.turns] == [(2, True), (5, False), (8, True)]
     assert search.holds == (False, True)
 
 
-def test_a_condition_that_never_becomes_true(corridor: Timeline) -> None:
+def test_a_condition_that_never_becomes_true(corridor: LogTimeline) -> None:
     assert corridor.bisect("place_count > 9").found is None
     assert corridor.bisect("keyframe_count >= 0").holds == (True, True)
 
 
-def test_a_monotone_condition_is_evaluated_at_few_offsets(corridor: Timeline) -> None:
+def test_a_monotone_condition_is_evaluated_at_few_offsets(corridor: LogTimeline) -> None:
     search = corridor.bisect("keyframe_count >= 6")
     assert search.found is not None
     assert search.found.cause.offset == 5
     assert search.evaluations <= 6
 
 
-def test_the_difference_of_equal_maps(corridor: Timeline) -> None:
+def test_the_difference_of_equal_maps(corridor: LogTimeline) -> None:
     assert corridor.diff(4, 4).same
     diff = corridor.diff(8, 9)
     assert not diff.same
@@ -217,7 +217,7 @@ def test_the_difference_of_equal_maps(corridor: Timeline) -> None:
     assert document["objects"]["changed"][0]["relocated"] is True
 
 
-def test_a_point_beyond_the_log_is_refused(corridor: Timeline) -> None:
+def test_a_point_beyond_the_log_is_refused(corridor: LogTimeline) -> None:
     for ask in (corridor.at, corridor.merges):
         with pytest.raises(LogPointError, match="give 0 to 10"):
             ask(11)
@@ -227,7 +227,7 @@ def test_a_point_beyond_the_log_is_refused(corridor: Timeline) -> None:
 
 def test_refresh_includes_later_events(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", CORRIDOR[:8])
-    with Timeline(log, RULES) as opened:
+    with LogTimeline(log, RULES) as opened:
         assert opened.merges() == []
         with LogWriter(log):
             pass
@@ -238,7 +238,7 @@ def test_refresh_includes_later_events(tmp_path: Path) -> None:
 
 
 def test_an_empty_log_has_an_empty_history(tmp_path: Path) -> None:
-    with Timeline(write_log(tmp_path / "log", []), RULES) as opened:
+    with LogTimeline(write_log(tmp_path / "log", []), RULES) as opened:
         assert opened.at().counts()["events"] == 0
         assert opened.merges() == []
         with pytest.raises(NoSuchThing, match="there is no place at all"):

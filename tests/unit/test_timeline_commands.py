@@ -23,7 +23,7 @@ from eventsrc.envelope.commands import (
 )
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
 from projections.fold.settings import Settings
-from projections.history import NoSuchThing, Timeline
+from projections.history import LogTimeline, NoSuchThing
 from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.history.rendering import (
     difference_text,
@@ -66,16 +66,16 @@ KITCHEN = NamePlace(command_id="c3", place=SECOND, name="kitchen", **SAID)
 ONE_CUP = SameObject(command_id="c4", det_ids=(DetId("the-cup"), DetId("cup-again")), **SAID)
 BY = "(ann@lab: a door)"
 
-Open = Callable[..., Timeline]
+Open = Callable[..., LogTimeline]
 
 
 @pytest.fixture
 def corridor(tmp_path: Path) -> Iterator[Open]:
-    opened: list[Timeline] = []
+    opened: list[LogTimeline] = []
 
-    def open_with(*commands: Command) -> Timeline:
+    def open_with(*commands: Command) -> LogTimeline:
         log = write_mixed_log(tmp_path / "log", [*CORRIDOR, *commands])
-        opened.append(Timeline(log, RULES))
+        opened.append(LogTimeline(log, RULES))
         return opened[-1]
 
     yield open_with
@@ -169,7 +169,7 @@ def test_a_later_command_on_the_same_two_counts(corridor: Open) -> None:
     assert f"joined run-a:2 and run-a:11 by join c6 {BY}" in texts
 
 
-def texts_of(timeline: Timeline, place: str) -> list[str]:
+def texts_of(timeline: LogTimeline, place: str) -> list[str]:
     """What `why` says of the commands about a place, less who gave them."""
     entries = [e for e in timeline.why(place).entries if e.what in ("keep-apart", "join")]
     return [e.text.removesuffix(f" {BY}") for e in entries]
@@ -199,7 +199,7 @@ def test_why_says_that_two_keyframes_in_one_cell_are_not_kept_apart(tmp_path: Pa
     apart = KeepApart(command_id="c5", places=pair, **SAID)
     log = write_mixed_log(tmp_path / "close", [*(envelope(k, 0.1 * k) for k in range(4)), apart])
     undivided = "without effect here as no command divides a cell of core points"
-    with Timeline(log, RULES) as timeline:
+    with LogTimeline(log, RULES) as timeline:
         assert len(timeline.at(5).places) == 1
         assert texts_of(timeline, "run-a_p0") == [
             f"run-a:1 and run-a:2 kept apart, {undivided}, by keep-apart c5"
@@ -343,7 +343,7 @@ def test_all_keyframes_of_a_place_moved(corridor: Open) -> None:
 def test_the_log_s_settings_are_used_from_where_they_are_known(tmp_path: Path) -> None:
     settings = UseSettings(command_id="c1", settings={"eps_m": 1.0, "min_samples": 9}, **SAID)
     log = write_mixed_log(tmp_path / "log", [*CORRIDOR, settings])
-    with Timeline(log) as timeline:
+    with LogTimeline(log) as timeline:
         assert timeline.at(12).settings == Settings()
         assert timeline.at(12, known_at=13).settings == Settings(eps_m=1.0, min_samples=9)
         assert timeline.at(13).places == {}

@@ -19,7 +19,7 @@ from projections.history.merges import chains_of, merge_reason
 from projections.history.names import keyframe_name, place_title
 from projections.map.view import MapView
 from projections.store.history import History
-from projections.store.records import Merge
+from projections.store.history_records import Merge
 
 from .base_layers import draw_drives, draw_regions
 from .canvas import HALO, Bounds, Canvas, check_suffix

@@ -11,7 +11,7 @@ from eventsrc.base.text import counted
 from projections.adapters import palette
 from projections.fold.deltas import PlacesMerged
 from projections.map.view import MapView
-from projections.store.records import Merge
+from projections.store.history_records import Merge
 
 from .base_layers import (
     draw_drives,

@@ -12,7 +12,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
 from projections.edit import make
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.edit.record import record_command
 from projections.fold.corrections import Corrections
@@ -38,7 +38,7 @@ class _Calibrator:
         self._progress = progress
         self.calibrations: list[Calibration] = []
 
-    def __call__(self, current: CurrentMap, stamp: Stamp) -> Command:
+    def __call__(self, current: MapToEdit, stamp: Stamp) -> Command:
         found = calibrate(
             current.reader, current.settings, current.corrections, current.end, self._progress
         )

@@ -16,7 +16,7 @@ from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.log import LogReader
 from projections.edit import make
 from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.effect import effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
@@ -234,7 +234,7 @@ def _use_settings(
     if file is None and not chosen.assignments:
         raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
 
-    def command(current: CurrentMap, stamp: Stamp) -> Command:
+    def command(current: MapToEdit, stamp: Stamp) -> Command:
         return make.use_settings(
             current, stamp, settings_from(file, chosen.assignments, current.corrections)
         )
@@ -272,7 +272,7 @@ def edits(
     before the command. `mapfold edit` keeps the effect of its command beside the log.
     """
     with LogReader(source.log) as reader:
-        current = CurrentMap(reader, source.settings, note=say)
+        current = MapToEdit(reader, source.settings, note=say)
         found = effects_of(current, known_only=not effects)
         times = {event.offset: event.logged_ns for event in current.command_events()}
     if json_:

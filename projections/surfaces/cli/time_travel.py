@@ -12,7 +12,7 @@ import typer
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import Offset
-from projections.history import Explanation, Expression, ExpressionError, KnownHistory, Timeline
+from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
 from projections.history.condition_functions import functions_help
 from projections.history.merges import merge_document, object_merge_document, refusal_document
 from projections.history.rendering import (
@@ -24,7 +24,7 @@ from projections.history.rendering import (
     refusals_text,
     search_text,
 )
-from projections.store.records import Merge
+from projections.store.history_records import Merge
 
 from .folded_log import CachedLog, KnownAtOption, W, known_point, point
 from .options import JsonOption, check_picture
@@ -44,12 +44,14 @@ class PastLog(CachedLog):
     """The log whose past is asked."""
 
     @contextlib.contextmanager
-    def timeline(self) -> Iterator[Timeline]:
+    def timeline(self) -> Iterator[LogTimeline]:
         """Its timeline under the settings of the command line or the log, with a progress bar."""
         settings, cache = self.checked(), not self.no_cache
         with (
             Bar() as bar,
-            Timeline(self.log, settings, progress=bar.show_fold, note=say, cache=cache) as timeline,
+            LogTimeline(
+                self.log, settings, progress=bar.show_fold, note=say, cache=cache
+            ) as timeline,
         ):
             yield timeline
 

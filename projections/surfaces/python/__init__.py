@@ -10,7 +10,7 @@ from projections.localize.relocalize import Answer, Question
 
 from .folding import fold, open_log
 from .map import Map, relocalize
-from .time_travel import Timeline
+from .past_maps import Timeline
 
 __all__ = [
     "Answer",

@@ -18,7 +18,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset, describe_error
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
-from projections.edit.current import CurrentMap
+from projections.edit.current import MapToEdit
 from projections.edit.effect import cache_effect, effects_of
 from projections.edit.listing import edits_document, edits_text
 from projections.edit.make import Stamp
@@ -127,7 +127,7 @@ def corrections_answer(opened: Opened, through: int, go_on: Callable[[], None]) 
     """The commands among the first ``through`` events: author, reason, effect, and whether it is
     undone. Effects are given only where they are known already."""
     with PrefixReader(opened.log, Offset(through), go_on) as reader:
-        current = CurrentMap(reader, opened.settings)
+        current = MapToEdit(reader, opened.settings)
         found = effects_of(current, known_only=True)
         times = {event.offset: event.logged_ns for event in current.command_events()}
     go_on()
@@ -177,7 +177,7 @@ class Editor:
     def _checked(self, make_: MakeCommand) -> MakeCommand:
         """``make_``, refusing a log other than the one that the page shows."""
 
-        def checked(current: CurrentMap, stamp: Stamp) -> Command:
+        def checked(current: MapToEdit, stamp: Stamp) -> Command:
             if current.reader.log_id != self._log_id:
                 raise LogError(
                     f"there is another log at {self._opened.log} now; start mapfold ui again"

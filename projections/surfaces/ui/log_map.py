@@ -22,7 +22,7 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.errors import FoldError
 from projections.fold.settings import Settings
-from projections.history import Progress, Timeline
+from projections.history import LogTimeline, Progress
 from projections.history.timeline import SettingsChoice
 from projections.localize.evaluate.truth import Truth
 
@@ -156,7 +156,7 @@ class LogMap:
             return opened.settings(corrections).with_assignments(sets, "set")
 
         self.reader = PrefixReader(opened.log)
-        self.timeline = Timeline(
+        self.timeline = LogTimeline(
             opened.log,
             settings,
             progress=progress,

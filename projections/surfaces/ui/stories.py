@@ -31,7 +31,7 @@ from projections.history.rendering import (
     refusals_text,
 )
 from projections.store.history import History
-from projections.store.records import Merge, ObjectMerge, RefusedMerge
+from projections.store.history_records import Merge, ObjectMerge, RefusedMerge
 
 from .log_map import LogMap
 from .requests import AskedPoint, text_of

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogWriter, parse_fsync
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.diff import difference_of
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document
@@ -36,7 +36,7 @@ MORE = 1_000
 def case(log: Path, name: str, asks: int) -> None:
     """One process's answers, timed."""
     started = time.process_time()
-    with Timeline(log, RULES, note=print, cache=name != "memory") as timeline:
+    with LogTimeline(log, RULES, note=print, cache=name != "memory") as timeline:
         known = timeline.knowing()
         taken, known = timed(lambda: MemoryHistory(known) if name == "memory" else _ready(known))
         spent = time.process_time() - started

@@ -23,7 +23,7 @@ import numpy as np
 
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from projections.fold.settings import Settings
-from projections.history import Timeline
+from projections.history import LogTimeline
 from projections.history.whatif import what_if
 from projections.map.fold import fold_log
 
@@ -100,13 +100,13 @@ def bench(log: Path, asks: int) -> None:
     one_fold, _ = timed(lambda: plain_fold(log))
     fold_cpu = cpu_seconds() - used
     say("one plain fold", f"{one_fold:.2f} s, {fold_cpu:.2f} s of CPU")
-    with Timeline(log, RULES) as timeline:
+    with LogTimeline(log, RULES) as timeline:
         say("events", f"{timeline.end:,}")
         bench_timeline(timeline, one_fold, asks)
     bench_whatif(log, one_fold, fold_cpu)
 
 
-def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
+def bench_timeline(timeline: LogTimeline, one_fold: float, asks: int) -> None:
     first, _ = timed(lambda: timeline.at(timeline.end))
     say("first at(end) of a process", f"{first:.2f} s")
     folding, history = timed(lambda: timeline.history)
@@ -136,7 +136,7 @@ def bench_timeline(timeline: Timeline, one_fold: float, asks: int) -> None:
     say("diff of the middle and the end", f"{seconds:.2f} s")
 
 
-def bench_at(timeline: Timeline, asks: int, what: str) -> None:
+def bench_at(timeline: LogTimeline, asks: int, what: str) -> None:
     chance = random.Random(2)
     walls, cpus = [], []
     for _ in range(asks):

@@ -12,8 +12,8 @@ from typing import Any
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.edit.current import CurrentMap
-from projections.history import Timeline
+from projections.edit.current import MapToEdit
+from projections.history import LogTimeline
 from projections.history.rule_folds import Rules, fold_all
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
@@ -48,7 +48,7 @@ class TimelineWays:
         """By W a seed and the stories told with it when the log ended there."""
 
     def __enter__(self) -> "TimelineWays":
-        self._live: Timeline | None = None
+        self._live: LogTimeline | None = None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -58,7 +58,7 @@ class TimelineWays:
     def ask(self, end: int) -> None:
         """Ask about the log, which has ``end`` events now."""
         if self._live is None:
-            self._live = Timeline(self._log, self._settings, cache=False)
+            self._live = LogTimeline(self._log, self._settings, cache=False)
         self._live.refresh()
         later = [self._rng.choice([*self._known])] if self._known else []
         drawn = [(self._rng.randint(0, end), self._rng.randint(0, end)) for _ in range(2)]
@@ -84,7 +84,7 @@ class TimelineWays:
         live = self._live
         self._compare("grown timeline", lambda: whole(live.at(end, known_at=known_at)), point)
         for way, cache in (("kept timeline", True), ("new timeline", False)):
-            with Timeline(self._log, self._settings, cache=cache) as timeline:
+            with LogTimeline(self._log, self._settings, cache=cache) as timeline:
                 asked = partial(timeline.at, end, known_at=known_at)
                 self._compare(way, lambda: whole(asked()), point)  # noqa: B023  # called at once
         with LogReader(self._log) as reader:
@@ -98,7 +98,7 @@ class TimelineWays:
                 ask = partial(map_after, reader, settings, end, cache=cache, **given)
                 self._compare(way, lambda: whole(ask()), point)  # noqa: B023  # called at once
             if end == known_at:
-                edited = CurrentMap(reader, self._settings, until=end)
+                edited = MapToEdit(reader, self._settings, until=end)
                 self._compare("edit", lambda: whole(edited.view), point)
             rules = [Rules(settings, corrections)]
             self._compare(
@@ -125,7 +125,7 @@ class TimelineWays:
         for at in {end, self._rng.choice([*self._told, end])}:
             seed, expected = self._told.get(at, (self._rng.randrange(10**9), None))
             for way, cache in (("new", False), ("kept", True)):
-                with Timeline(self._log, self._settings, cache=cache) as timeline:
+                with LogTimeline(self._log, self._settings, cache=cache) as timeline:
                     found = self._stories(timeline, at, seed)
                 if expected is None:
                     expected = found
@@ -133,13 +133,13 @@ class TimelineWays:
                 self._tally.compare(f"stories, {way}", found, expected, at)
             self._tally.compare("stories, grown", self._stories(self._live, at, seed), expected, at)
 
-    def _stories(self, timeline: Timeline, at: int, seed: int) -> Any:
+    def _stories(self, timeline: LogTimeline, at: int, seed: int) -> Any:
         known = outcome(lambda: timeline.knowing(Offset(at)))
         return known if isinstance(known, tuple) else stories(known, at, random.Random(seed))
 
     def _interrupt(self, points: list[tuple[int, int]], expected: dict[Any, Any]) -> None:
         """Interrupt a timeline at random calls; what it says afterwards is right."""
-        with Timeline(self._log, self._settings, cache=self._rng.random() < 0.5) as timeline:
+        with LogTimeline(self._log, self._settings, cache=self._rng.random() < 0.5) as timeline:
             for end, known_at in points:
                 asked = partial(timeline.at, Offset(end), known_at=Offset(known_at))
                 ask = partial(outcome, lambda: whole(asked()))  # noqa: B023  # called at once
@@ -155,11 +155,11 @@ class TimelineWays:
         asked = [self._rng.choice(ends) for _ in range(2 * _THREADS)]
         given = self._settings.otherwise if self._rng.random() < 0.5 else None
         with (
-            api.Timeline(self._log, given, cache=self._rng.random() < 0.5) as timeline,
+            api.LogTimeline(self._log, given, cache=self._rng.random() < 0.5) as timeline,
             ThreadPoolExecutor(_THREADS) as pool,
         ):
             digests = [*pool.map(lambda w: outcome(lambda: timeline.at(w).digest), asked)]
-        with api.Timeline(self._log, given, cache=False) as timeline:
+        with api.LogTimeline(self._log, given, cache=False) as timeline:
             alone = {w: outcome(lambda: timeline.at(w).digest) for w in {*asked}}  # noqa: B023
         self._tally.compare("threads", digests, [alone[end] for end in asked], asked)
 

@@ -56,7 +56,7 @@ class Timeline:
         self._lock = threading.RLock()
         self._log = Path(log)
         self._chosen = settings_from(settings)
-        self._timeline = history.Timeline(self._log, self._settings, cache=cache)
+        self._timeline = history.LogTimeline(self._log, self._settings, cache=cache)
 
     def __enter__(self) -> "Timeline":
         return self
