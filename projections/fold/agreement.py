@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import State
-from .exact_functions import log
+from .exact import log
 from .sights import Sight
 from .spots import LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 

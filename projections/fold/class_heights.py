@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from . import State
-from .exact_functions import log
+from .exact import log
 
 _UNIT = 1 << 16
 _UNKNOWN = 3.0

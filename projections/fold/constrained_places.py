@@ -39,8 +39,7 @@ from .core_index import CoreIndex
 from .corrections import Keyframe
 from .deltas import Delta, KeyframeOrdinal, KeyframePlaced, MergeRefused, PlaceOrdinal, PlacesMerged
 from .pair_groups import PairGroups
-from .place_anchors import Apart, Inside, PlaceAnchors
-from .place_members import NOISE, PosedKeyframe
+from .place_members import NOISE, Apart, Inside, PlaceAnchors, PosedKeyframe
 from .places import Part, Places
 
 Rank: TypeAlias = tuple[int, int]

@@ -14,13 +14,12 @@ from eventsrc.envelope.model import DetId
 
 from .agreement import Agreement, Slopes
 from .deltas import ObjectOrdinal, Pose, RunOrdinal
-from .exact_functions import exp
-from .label_counts import LABEL_WEIGHT, LabelCounts
+from .exact import exp
 from .looks import LookRatios, Looks, LookScale
 from .pair_groups import PairGroups
 from .sights import Sight, Sighting
 from .thing_index import ThingIndex
-from .things import Thing
+from .things import LABEL_WEIGHT, LabelCounts, Thing
 
 Match: TypeAlias = tuple[float, ObjectOrdinal, float]
 """The evidence for an Object, its ordinal, and the cosine of the best pair of looks."""

@@ -7,7 +7,7 @@ The rules, for the observations of one picture:
 2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
     is missing costs an eighth), and half of that of its label and the labels seen so far
-    (`label_counts`). Below −5 the sight alone rules a candidate out.
+    (`LabelCounts`). Below −5 the sight alone rules a candidate out.
 3.  Each observation goes to one Object, and each Object gets one observation of a picture: two
     things in one picture are not one. Of all such choices that with the largest sum of evidence is
     taken, a pair's being above 0 (`assign`). What is left founds Objects. Where other Objects,
@@ -17,17 +17,17 @@ The rules, for the observations of one picture:
     observations.
 5.  Two Objects are merged when better views show that they are one (`evidence_merging`).
 
-Under ``same-object`` and ``different-objects`` the rules of `constrained_objects` hold besides:
+Under ``same-object`` and ``different-objects`` the rules of `objects` hold besides:
 Objects that are kept apart are no candidates for each other's observations, those that are one are
 merged at once, also within one picture.
 
 Everything is bit-exact: integers, and float64 by operations that IEEE 754 defines to the last bit,
-in one order; transcendental functions are those of `projections.fold.exact_functions`.
+in one order; transcendental functions are those of `projections.fold.exact`.
 """
 
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from eventsrc.envelope.model import DetId, Offset
 
@@ -42,29 +42,37 @@ from .deltas import (
     ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
+    ObservationOrdinal,
     Pose,
     RunOrdinal,
 )
 from .evidence import EvidenceConstants
 from .evidence_matching import Matching
-from .evidence_merging import Merging
+from .evidence_merging import Merging, turned_looks
 from .exact import MAX_IN_A_SUM, Q40
-from .label_counts import LabelCounts
 from .looks import LookRatios, LookScale, looks_of
 from .objects import object_id
 from .pair_groups import PairGroups
-from .relocations import Moved
 from .settings import Camera
 from .sights import PoseError, Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
-from .things import Thing
-from .turned_looks import turned_looks
+from .things import LabelCounts, Thing
 
 ObjectDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
 )
 _SURE = 0.85
+
+
+class MovedObject(NamedTuple):
+    """The Object ``old`` stands where ``new`` was found, by ``observation``; ``look`` is the
+    log-likelihood ratio of their looks."""
+
+    old: ObjectOrdinal
+    new: ObjectOrdinal
+    observation: ObservationOrdinal
+    look: float
 
 
 class EvidenceObjects:
@@ -205,7 +213,7 @@ class EvidenceObjects:
             for look, other in zip(looks, things, strict=True)
         ]
 
-    def relocate(self, offset: Offset, moved: Moved) -> list[ObjectDelta]:
+    def relocate(self, offset: Offset, moved: MovedObject) -> list[ObjectDelta]:
         """Merge an Object with the one found at its new position, and estimate it from the later
         observations only."""
         thing, later = self._index.thing(moved.old), self._index.thing(moved.new)

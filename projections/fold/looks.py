@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from . import State
 from .evidence import EvidenceConstants
-from .exact import UNIT
-from .exact_functions import exp, log
+from .exact import UNIT, exp, log
 
 Floats = NDArray[np.float64]
 Looks = NDArray[np.float32]

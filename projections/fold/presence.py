@@ -40,7 +40,7 @@ from .deltas import (
     Pose,
     RunOrdinal,
 )
-from .exact_functions import cos_sin
+from .exact import cos_sin
 from .settings import Camera
 from .sights import half_field
 

@@ -45,8 +45,7 @@ from .deltas import (
 from .driven_cells import DrivenCells, WayAt
 from .exact import distance_um
 from .pair_groups import ApartPairs, PairGroups
-from .place_anchors import Apart, PlaceAnchors
-from .place_members import PlaceMembers, PosedKeyframe
+from .place_members import Apart, PlaceAnchors, PlaceMembers, PosedKeyframe
 
 _NO_GROUPS: PairGroups[Keyframe] = PairGroups((), ApartPairs())
 

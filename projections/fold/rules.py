@@ -2,13 +2,12 @@
 
 from eventsrc.envelope.model import DetId
 
-from .constrained_objects import ConstrainedObjects
 from .constrained_places import ConstrainedPlaces
 from .core_index import CoreIndex
 from .corrections import Keyframe
 from .evidence_fusion import EvidenceFusion
 from .exact import metres_to_um
-from .objects import Objects
+from .objects import ConstrainedObjects, Objects
 from .pair_groups import PairGroups
 from .places import Places
 from .rooms import Rooms

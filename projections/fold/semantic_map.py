@@ -26,11 +26,8 @@ from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
-from .adjacency import Adjacency
-from .constrained_objects import ConstrainedObjects
 from .constrained_places import ConstrainedPlaces
 from .corrections import NO_CORRECTIONS, Corrections, Keyframe
-from .current_map import CurrentMap
 from .deltas import (
     Delta,
     EventSkipped,
@@ -50,22 +47,20 @@ from .deltas import (
     RunSeen,
     SkipKind,
 )
-from .edited_events import EventEdits
-from .embedding_space import Reembedded, Space
-from .envelope_evidence import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
+from .edited_events import EventEdits, Reembedded, Space
 from .evidence_fusion import EvidenceFusion
 from .exact import Units, unit_vectors
-from .floors import Floors
+from .floors import CurrentMap, Floors
 from .folded_ids import FoldedIds, content_digest
-from .located_in import LocatedIn
-from .objects import FusibleObservation, Objects
+from .objects import ConstrainedObjects, FusibleObservation, Objects
 from .pair_groups import PairGroups
 from .place_members import PosedKeyframe
-from .place_names import PlaceNames
 from .places import Places
+from .relations import Adjacency, LocatedIn, PlaceNames
 from .rooms import Rooms
 from .rules import objects_by, places_by
 from .settings import Settings
+from .sights import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
 
 Reducer: TypeAlias = (
     FoldedIds

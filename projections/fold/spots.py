@@ -30,7 +30,7 @@ import math
 from typing import NamedTuple
 
 from .class_heights import HeightPrior
-from .exact_functions import log
+from .exact import log
 from .sights import Sight
 
 SPOT_M = 0.35

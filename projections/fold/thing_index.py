@@ -16,7 +16,7 @@ from . import State, part, prefixed
 from .class_heights import ClassHeights
 from .deltas import ObjectEstimated, ObjectOrdinal
 from .evidence import EvidenceConstants
-from .exact_functions import exp
+from .exact import exp
 from .looks import Floats
 from .spots import PART_SIZE, Estimate, Part, Solver, Spot, Spots
 from .things import ROW, Thing

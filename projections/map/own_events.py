@@ -37,7 +37,7 @@ from projections.fold.corrections import (
     RecordedCommand,
     compile_corrections,
 )
-from projections.fold.embedding_space import Reembedded
+from projections.fold.edited_events import Reembedded
 from projections.fold.errors import FoldError, SettingsError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings

@@ -17,8 +17,8 @@ from eventsrc.base.crc import crc32
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from projections.fold import deltas
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.current_map import map_in_force
 from projections.fold.deltas import Delta, ObjectOrdinal, PlaceOrdinal, SkipKind
+from projections.fold.floors import map_in_force
 from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
 from projections.fold.survivors import ObjectSurvivors, PlaceSurvivors

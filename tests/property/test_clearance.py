@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.fold.clearance import (
+from projections.fold.occupancy import (
     MIN_WIDTH_M,
     NOWHERE,
     PASSAGE,

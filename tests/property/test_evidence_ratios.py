@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from projections.fold.agreement import log_of, logs
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects
-from projections.fold.exact_functions import cos_sin
-from projections.fold.label_counts import LabelCounts
+from projections.fold.exact import cos_sin
 from projections.fold.looks import LookRatios
 from projections.fold.spots import Spots
-from projections.fold.things import Thing
+from projections.fold.things import LabelCounts, Thing
 from tests.support.evidence_pictures import a_room, fold_one, pictures_of
 from tests.support.thorough import examples
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.exact_functions import atan, cos_sin, exp, log
+from projections.fold.exact import atan, cos_sin, exp, log
 
 _ANGLES = st.floats(-1e6, 1e6)
 _KNOWN = [

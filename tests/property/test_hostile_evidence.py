@@ -13,8 +13,8 @@ from eventsrc.envelope.commands import SameObject
 from eventsrc.envelope.ingest import Rejected, ingest
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import NO_CORRECTIONS, RecordedCommand, compile_corrections
-from projections.fold.envelope_evidence import MOST_OF_A_PICTURE
 from projections.fold.settings import Settings
+from projections.fold.sights import MOST_OF_A_PICTURE
 from projections.fold.spots import Spots
 from projections.fold.things import Thing
 from projections.map.digest import map_digest

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.adjacency import Adjacency
 from projections.fold.deltas import Delta
+from projections.fold.relations import Adjacency
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from tests.property.test_fold_recounts import SETTINGS, runs

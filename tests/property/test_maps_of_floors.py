@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold import current_map
+from projections.fold import floors
 from projections.fold.settings import Settings
 from projections.localize.relocalize import CandidatePlace, MapCandidates, Match
 from projections.localize.relocalize.ground import WallMap
@@ -120,12 +120,12 @@ def test_kept_folds_have_the_maps_of_all_floors(seed: int) -> None:
 def test_walls_are_worked_out_when_a_pose_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     built = []
 
-    class Counted(current_map.OccupancyGrid):
+    class Counted(floors.OccupancyGrid):
         def __init__(self, source: OccupancyMap) -> None:
             built.append(source)
             super().__init__(source)
 
-    monkeypatch.setattr(current_map, "OccupancyGrid", Counted)
+    monkeypatch.setattr(floors, "OccupancyGrid", Counted)
     rng = random.Random(1)
     maps = [_map(rng, None) for _ in range(20)] + [_map(rng, "1") for _ in range(20)]
     folded = _fold([*maps, envelope(0, None, None)])

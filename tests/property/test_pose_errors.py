@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from projections.fold.deltas import EventSkipped, Pose
 from projections.fold.edited_events import _turned_covariance
-from projections.fold.envelope_evidence import pose_error_of
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Settings
-from projections.fold.sights import PoseError, Sights
+from projections.fold.sights import PoseError, Sights, pose_error_of
 from projections.map.digest import map_digest
 from tests.support.envelopes import detection, envelope
 from tests.support.evidence_pictures import CAMERA, DIM, FOCAL, a_sighting

@@ -29,7 +29,7 @@ from projections.fold.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.fold.exact_functions import cos_sin
+from projections.fold.exact import cos_sin
 from projections.fold.presence import Presence
 from projections.fold.settings import Camera
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceOrdinal
-from projections.fold.located_in import LocatedIn
+from projections.fold.relations import LocatedIn
 
 STEPS = st.lists(
     st.tuples(

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold import adjacency as _sorted_keys
-from projections.fold.adjacency import SortedKeys
+from projections.fold import relations
+from projections.fold.relations import SortedKeys
 
 
 def _check(order: list[int]) -> None:
@@ -19,18 +19,17 @@ def _check(order: list[int]) -> None:
         after = known[at] % 1000 if at < len(known) else None
         assert keys.add(key, key % 1000) == (before, after)
         known.insert(at, key)
-    columns = keys.columns()
-    assert [list(column) for column in columns] == [known, [key % 1000 for key in known]]
-    again = SortedKeys.of(*columns)
+    items = [*keys.items()]
+    assert items == [(key, key % 1000) for key in known]
+    again = SortedKeys(*zip(*items, strict=True)) if items else SortedKeys()
     assert again.add(10**6, 7) == ((known[-1] % 1000 if known else None), None)
 
 
 @given(order=st.lists(st.integers(-(10**5), 10**5), unique=True, max_size=60))
 def test_keys_added_in_any_order(order: list[int]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_sorted_keys, "_BLOCK", 4)
-        if order:
-            _check(order)
+        patch.setattr(relations, "_BLOCK", 4)
+        _check(order)
 
 
 @pytest.mark.parametrize("seed", [None, 1])

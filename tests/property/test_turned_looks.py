@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
+from projections.fold.evidence_merging import turned_looks
 from projections.fold.looks import LookRatios, LookScale, looks_of
 from projections.fold.spots import Spots
 from projections.fold.things import Thing
-from projections.fold.turned_looks import turned_looks
 from tests.support.thorough import examples
 
 DIM = 48

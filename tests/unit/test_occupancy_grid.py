@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold.clearance import NOWHERE
-from projections.fold.occupancy import MAX_BLOCKS, OccupancyGrid
+from projections.fold.occupancy import MAX_BLOCKS, NOWHERE, OccupancyGrid
 
 M = 1_000_000
 

@@ -2,6 +2,7 @@
 
 import math
 import random
+import re
 from collections.abc import Mapping
 
 import pytest
@@ -9,9 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.adapters.sim.house import FURNITURE, MODELS
-from projections.fold import place_type_table
-from projections.fold.place_type_table import NAMES, SHARES, SYNONYMS, TABLE, TYPES
-from projections.fold.place_types import UNSURE, known_class, place_type, type_of_name
+from projections.fold.place_types import (
+    _ROOMS,
+    NAMES,
+    SHARES,
+    SYNONYMS,
+    TABLE,
+    TYPES,
+    UNSURE,
+    known_class,
+    place_type,
+    type_of_name,
+)
 
 
 def type_of(counts: Mapping[str, float], name: str | None = None) -> str | None:
@@ -104,8 +114,8 @@ def test_a_name_that_says_a_type_decides(name: str, kind: str | None) -> None:
 def test_the_table_is_whole() -> None:
     assert len(TABLE) > 100
     assert all(len(shares) == len(TYPES) and {*shares} <= {*SHARES} for shares in TABLE.values())
-    for usual in place_type_table._USUAL.values():
-        named = [name for classes in usual.values() for name in classes.split(", ")]
+    for room in _ROOMS.strip().split("\n\n"):
+        named = re.split(r", |\n\d+ % ", " ".join(room.split("\n  ")).partition("\n")[2])
         assert len(named) == len(set(named)), "a class has one grade"
     assert all(len({*shares}) > 1 for shares in TABLE.values()), "an uninformative row"
     assert {*SYNONYMS.values()} <= TABLE.keys()

@@ -19,8 +19,8 @@ from projections.fold.deltas import (
     Pose,
     RunOrdinal,
 )
+from projections.fold.evidence_fusion import Moved, Relocations
 from projections.fold.presence import Presence
-from projections.fold.relocations import Moved, Relocations
 from projections.fold.settings import Camera
 
 

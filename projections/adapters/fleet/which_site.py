@@ -16,7 +16,7 @@ from typing import Any, Final
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import MapfoldError
 from eventsrc.log.reader import segments_of
-from projections.fold.exact_functions import exp
+from projections.fold.exact import exp
 from projections.fold.settings import Camera
 from projections.localize.relocalize import Answer, Question, rank
 from projections.postgres.connection import Targets

@@ -7,7 +7,7 @@ differ from those of another day, since leaving out a visit is not the same as n
 so only the difference from those maps is the correction.
 
 Machines agree on the correction. What `known` is computed from is exact, and the line is fitted
-with exactly rounded sums and `projections.fold.exact_functions`. `confidence` and the error of the
+with exactly rounded sums and `projections.fold.exact`. `confidence` and the error of the
 pose come from numpy and libm, which differ in the last bits; that is why logits are rounded to
 multiples of 2⁻¹⁰ before the fit and constants to three decimals after it. What can still differ: a
 last bit that moves an error across 1.5 m, or that decides between two poses of equal weight,
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from projections.fold.exact_functions import exp, log
+from projections.fold.exact import exp, log
 from projections.fold.settings import LocalizerConstants
 from projections.localize.evaluate.own_questions import OwnAnswer, ask_own_questions
 from projections.localize.relocalize.certainty import probability

@@ -18,9 +18,9 @@ from eventsrc.envelope.model import FIRST_OFFSET, Envelope, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.deltas import Delta, KeyframeAdded, KeyframeOrdinal
-from projections.fold.envelope_evidence import camera_of
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Camera, LocalizerConstants, Settings
+from projections.fold.sights import camera_of
 from projections.map.fold import fold_parsed, read_ahead
 from projections.map.own_events import new_map
 from projections.map.parsing import parsed_stretches

@@ -20,7 +20,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from eventsrc.log.reader import OnGap
-from projections.fold.embedding_space import Reembedded
+from projections.fold.edited_events import Reembedded
 from projections.fold.exact import quantise, to_float32
 from projections.fold.settings import Settings
 from projections.localize import relocalize

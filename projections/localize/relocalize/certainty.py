@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 
 from eventsrc.base.text import counted
-from projections.fold.exact_functions import exp
+from projections.fold.exact import exp
 from projections.fold.settings import LocalizerConstants
 
 from .camera import Floats
