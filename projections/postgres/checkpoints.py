@@ -9,12 +9,11 @@ import psycopg
 from psycopg import sql
 
 from eventsrc.base.advised import advised
-from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
+from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
 from projections.fold.errors import CheckpointMoved, DatabaseError, ProjectionBusy
 
 from .connection import Connection, describe_connection
-from .inputs import MapInputs
 from .sink import SINKS, Checkpoint, SinkName
 from .statements import statements
 
@@ -110,31 +109,8 @@ def rows_exist(connection: Connection, sink: SinkName) -> bool:
     return row is not None and bool(row[0])
 
 
-def at_offset(
-    log_id: str,
-    inputs: MapInputs,
-    next_offset: Offset,
-    last_event: str,
-    digest: str | None = None,
-    maps: str | None = None,
-) -> Checkpoint:
-    """The checkpoint of a map of ``inputs`` with ``next_offset`` events."""
-    return Checkpoint(
-        log_id,
-        inputs.fingerprint,
-        inputs.settings.model_dump_json(),
-        next_offset,
-        last_event,
-        digest,
-        inputs.known_at,
-        inputs.observed,
-        maps,
-    )
-
-
-def create(connection: Connection, sink: SinkName, log_id: str, inputs: MapInputs) -> None:
+def create(connection: Connection, sink: SinkName, first: Checkpoint) -> None:
     """Insert a checkpoint at offset 0, if there is none."""
-    first = at_offset(log_id, inputs, FIRST_OFFSET, "")
     connection.execute(statements("checkpoint")["create_first"], {"sink": sink, **asdict(first)})
 
 

@@ -8,7 +8,7 @@ from typing import Final, Self, TypeAlias
 import msgspec
 
 from eventsrc.envelope.commands import NamePlace, Reembed
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader
 from projections.fold.corrections import (
@@ -20,6 +20,8 @@ from projections.fold.corrections import (
 from projections.fold.pair_groups import ApartPairs
 from projections.fold.settings import Settings
 from projections.map.own_events import read_command, read_commands
+
+from .sink import Checkpoint
 
 SettingsOf: TypeAlias = Callable[[Corrections], Settings]
 """The settings that a map is made with under a log's corrections, which may name some."""
@@ -61,6 +63,27 @@ class MapInputs:
             known_at,
             map_fingerprint(settings, corrections),
             map_fingerprint(settings.model_copy(update=_PAGE_FUSION), of_observations),
+        )
+
+    def checkpoint(
+        self,
+        log_id: str,
+        next_offset: Offset = FIRST_OFFSET,
+        last_event: str = "",
+        digest: str | None = None,
+        maps: str | None = None,
+    ) -> Checkpoint:
+        """The checkpoint of a map of these inputs with ``next_offset`` events."""
+        return Checkpoint(
+            log_id,
+            self.fingerprint,
+            self.settings.model_dump_json(),
+            next_offset,
+            last_event,
+            digest,
+            self.known_at,
+            self.observed,
+            maps,
         )
 
     @property

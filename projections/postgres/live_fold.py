@@ -1,7 +1,6 @@
 """A fold of a growing log, with its view and the changes of each batch of events."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from typing import Self
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from eventsrc.envelope.model import Offset
 from eventsrc.log import Event, LogReader
@@ -14,8 +13,7 @@ from projections.map.fold import fold_events, fold_parsed
 from projections.map.own_events import with_vectors
 from projections.map.parsing import READ_AHEAD, ParsedEvent
 from projections.map.view import MapView
-from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
-from projections.store.timeline_cache import TimelineCache
+from projections.store.column_rows import TableWriter
 
 
 class LiveFold:
@@ -32,10 +30,10 @@ class LiveFold:
         *,
         corrections: Corrections = NO_CORRECTIONS,
         reader: LogReader | None = None,
-        recorder: HistoryRecorder | None = None,
+        writer: TableWriter | None = None,
     ) -> None:
         """``start`` is a fold that was kept and its view; by default nothing is folded yet.
-        ``recorder`` keeps the deltas of events that are fed, none skipped, when `keep` is called.
+        ``writer`` is given the deltas of events that are fed, none skipped, from its end on.
         ``reader`` reads the log that is folded, which may have vectors of the map's space beside
         those in envelopes. Raises FoldError, LogDamaged."""
         self.map, self.view = start or (
@@ -45,31 +43,7 @@ class LiveFold:
         if reader is not None:
             with_vectors(self.map, reader)
         self.tracker = ChangeTracker(self.view)
-        self._recorder = recorder
-        self._writer = None if recorder is None else recorder.writer()
-        if recorder is not None and self.map.next_offset > recorder.end:  # kept under other names
-            self._writer = None
-
-    @classmethod
-    def resumed(
-        cls,
-        reader: LogReader,
-        settings: Settings,
-        corrections: Corrections,
-        limit: Offset,
-        note: Callable[[str], None],
-    ) -> Self:
-        """A fold from the latest one on that was kept, of at most ``limit`` events."""
-        cache = TimelineCache(reader, settings, corrections, note)
-        recorder = HistoryRecorder(reader, settings, corrections, cache, None)
-        start = resumed_under_other_names(reader, settings, corrections, limit, note)
-        return cls(settings, start, corrections=corrections, reader=reader, recorder=recorder)
-
-    def keep(self) -> None:
-        """Keep the history that was folded, to go on from the next time."""
-        if self._recorder is not None and self._writer is not None:
-            self._recorder.keep(self._writer, self.map)
-            self._writer = None
+        self.writer = writer
 
     def feed(self, events: Sequence[Event]) -> Iterator[FoldError | None]:
         """Fold events in order, a step for each: None, or why it failed.
@@ -85,8 +59,8 @@ class LiveFold:
                 for folded in fold_events(events[start:], self.map, ahead=READ_AHEAD):
                     event = next(waiting)
                     self.tracker.apply_event(event.offset, folded.deltas, event.logged_ns)
-                    if self._writer is not None and event.offset >= self._writer.end:
-                        self._writer.add(event.offset, folded.deltas)
+                    if self.writer is not None and event.offset >= self.writer.end:
+                        self.writer.add(event.offset, folded.deltas)
                     start += 1
                     yield None
             except FoldError as error:
@@ -104,14 +78,14 @@ class LiveFold:
         """Apply the names of ``corrections``; the event at ``offset`` changed nothing else in them.
         The event must have been fed or skipped. Raises ValueError."""
         self._check_whole()
-        self._writer = None  # what follows is of other corrections
+        self.writer = None  # what follows is of other corrections
         self.tracker.apply_names(self.map.use_names(offset, corrections))
         self.view.corrections = corrections
 
     def skip(self, offset: Offset) -> None:
         """Pass over an event that is left out."""
         self._check_whole()
-        self._writer = None
+        self.writer = None
         self.map.skip(offset)
         self.view.advance(Offset(offset + 1))
 

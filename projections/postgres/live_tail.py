@@ -33,6 +33,8 @@ from eventsrc.log import Event, LogReader, event_hash, follow
 from projections.fold.errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.map.own_events import read_command
+from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
+from projections.store.timeline_cache import TimelineCache
 
 from . import checkpoints
 from .batch_writer import AWAY, Backoff, LostCommits, Writer
@@ -42,7 +44,7 @@ from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .live_fold import LiveFold, batches
 from .loader import LoaderName
 from .map_table import maps_key
-from .origin import origin_fault, refuse_mismatch, refuse_other_events, replay_advice, rows_dropped
+from .origin import is_under_other_corrections, replay_advice, rows_dropped
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
 from .sink import Checkpoint, SinkName
 from .stores import DatabaseSink, Only, Store, open_stores
@@ -123,14 +125,10 @@ def _run_pass(
             plan.targets.restart_embedded()
         with LogReader(plan.log) as reader:
             inputs = LogInputs.read(reader, plan.settings)
-            opened = open_stores(
-                plan.targets,
-                inputs.latest.settings,
-                only=only,
-                application="mapfold tail",
-                loader=loader,
-            )
-            with opened as stores:
+            settings = inputs.latest.settings
+            with open_stores(
+                plan.targets, settings, only=only, application="mapfold tail", loader=loader
+            ) as stores:
                 run = TailPass(plan, stores, report, inputs, inputs.latest)
                 run.run(reader)
     except AWAY as error:
@@ -146,7 +144,7 @@ class TailPass:
     """From the checkpoints to the end of the log, or for as long as it grows.
 
     Call `run`. ``current`` are the inputs of the map. ``parked`` has all dead letters by offset,
-    ``letters`` those that are to be written with the next batch.
+    ``letters`` those that are to be written with the next batch. ``recorder`` keeps the history.
     """
 
     plan: TailPlan
@@ -158,6 +156,7 @@ class TailPass:
     parked: dict[Offset, DeadLetter] = field(default_factory=dict)
     letters: list[DeadLetter] = field(default_factory=list)
     began: bool = False
+    recorder: HistoryRecorder | None = None
 
     def run(self, reader: LogReader) -> None:
         """Follow the log, and refold when commands make it necessary.
@@ -243,9 +242,7 @@ class TailPass:
         ``folded`` is the fold that the databases were made with just now.
         """
         plan = self.plan
-        fold = folded or LiveFold.resumed(
-            reader, self.current.settings, self.current.corrections, self._fold_limit(), plan.note
-        )
+        fold = folded or self._resumed(reader)
         start = fold.map.next_offset
         writers = self._writers()
         plan.on_fold(start)
@@ -262,8 +259,23 @@ class TailPass:
                 writer.beat()
             if plan.once and plan.stop.is_set():
                 break
-        fold.keep()
+        self._keep(fold)
         return True
+
+    def _resumed(self, reader: LogReader) -> LiveFold:
+        """The fold to go on with, from the latest one that was kept below the checkpoints."""
+        of = reader, self.current.settings, self.current.corrections
+        self.recorder = HistoryRecorder(*of, TimelineCache(*of, self.plan.note), None)
+        found = resumed_under_other_names(*of, self._fold_limit(), self.plan.note)
+        is_kept = found is None or found[0].next_offset <= self.recorder.end  # under these names
+        writer = self.recorder.writer() if is_kept else None
+        return LiveFold(of[1], found, corrections=of[2], reader=reader, writer=writer)
+
+    def _keep(self, fold: LiveFold) -> None:
+        """Keep the history that was folded, to go on from the next time."""
+        if self.recorder is not None and fold.writer is not None:
+            self.recorder.keep(fold.writer, fold.map)
+            fold.writer = None
 
     def _knows(self, batch: Sequence[Event]) -> bool:
         """Record the commands of a batch; False when they change more than names."""
@@ -316,10 +328,12 @@ class TailPass:
         """Whether a sink was made under other corrections."""
         connection, latest = store.connection, self.inputs.latest
         made = sink.ensure(connection)
-        checkpoints.create(connection, sink.name, reader.log_id, latest)
+        checkpoints.create(connection, sink.name, latest.checkpoint(reader.log_id))
         found = checkpoints.load(connection, sink.name)
         assert found is not None  # noqa: S101 - created in this transaction
-        has_fault = self._refuse_mismatch(found, sink.name, store.place, reader)
+        has_fault = is_under_other_corrections(
+            found, sink.name, store.place, self.plan.log, reader, self.inputs
+        )
         if made and found.next_offset:
             raise rows_dropped(found, sink.name, store.place, self.plan.log, latest)
         # Now, as `status` reports a sink as followed while its lock is held.
@@ -328,18 +342,6 @@ class TailPass:
         letters = checkpoints.parked(connection, sink.name)
         self.parked.update((letter.offset, letter) for letter in letters)
         return has_fault
-
-    def _refuse_mismatch(
-        self, found: Checkpoint, sink: SinkName, where: str, reader: LogReader
-    ) -> bool:
-        """Raise ProjectionMismatch for another log or settings; True for other corrections."""
-        log, inputs = self.plan.log, self.inputs.at(found.known_to)
-        if origin_fault(found, reader.log_id, inputs) != "corrections":
-            refuse_mismatch(found, sink, where, log, reader, inputs)
-            return False
-        advice = replay_advice(log, self.inputs.latest)
-        refuse_other_events(found, sink, where, log, reader, advice)
-        return True
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:
         """Fold a batch; returns its last event, None for an empty one."""
@@ -371,8 +373,8 @@ class TailPass:
     def _write(self, fold: LiveFold, writers: list[Writer], log_id: str, last: Event) -> None:
         """Write a batch to the sinks that do not have it yet."""
         self._use_names(fold, last.offset)
-        after = checkpoints.at_offset(
-            log_id, self.current, fold.map.next_offset, event_hash(last), maps=maps_key(fold.view)
+        after = self.current.checkpoint(
+            log_id, fold.map.next_offset, event_hash(last), maps=maps_key(fold.view)
         )
         changes = fold.tracker.drain()
         written = max(writer.write(changes, fold.view, self.letters, after) for writer in writers)
@@ -394,5 +396,5 @@ class TailPass:
         known = self.inputs.at(known_at)
         if self.current.differs_only_in_names(known):
             self.current = known
-            fold.keep()
+            self._keep(fold)
             fold.use_names(offset, known.corrections)

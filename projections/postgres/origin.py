@@ -15,7 +15,7 @@ from eventsrc.log import LogReader, event_hash
 from projections.fold.errors import ProjectionMismatch, ProjectionMissing
 from projections.fold.settings import Settings, settings_by_name
 
-from .inputs import MapInputs
+from .inputs import LogInputs, MapInputs
 from .sink import SINKS, Checkpoint, SinkName
 
 _SETTINGS_OPTIONS: Final = ("--settings", "--preset", "--set")
@@ -129,6 +129,19 @@ def refuse_mismatch(
     advice = replay_advice(log, inputs)
     refuse_other_origin(found, sink, where, reader.log_id, inputs, advice)
     refuse_other_events(found, sink, where, log, reader, advice)
+
+
+def is_under_other_corrections(
+    found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, known: LogInputs
+) -> bool:
+    """Whether ``found`` was made from this log, as it is, under other corrections than its commands
+    give. Raises ProjectionMismatch for another log or other settings."""
+    inputs = known.at(found.known_to)
+    if origin_fault(found, reader.log_id, inputs) != "corrections":
+        refuse_mismatch(found, sink, where, log, reader, inputs)
+        return False
+    refuse_other_events(found, sink, where, log, reader, replay_advice(log, known.latest))
+    return True
 
 
 def refuse_other_events(

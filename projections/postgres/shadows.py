@@ -300,13 +300,8 @@ def swap_in_new_map(
         lock_readers(writers)
         if while_swapping is not None:
             committing.enter_context(while_swapping)
-        checkpoint = checkpoints.at_offset(
-            log_id,
-            folded.inputs,
-            fold.map.next_offset,
-            event_hash(folded.last),
-            digest,
-            maps_key(fold.view),
+        checkpoint = folded.inputs.checkpoint(
+            log_id, fold.map.next_offset, event_hash(folded.last), digest, maps_key(fold.view)
         )
         for writer in writers:
             writer.store.run(

@@ -207,7 +207,7 @@ def test_parked_events_are_tried_again(
 
     monkeypatch.setattr(sys.modules["projections.postgres.rebuild"], "read_envelope", lenient)
     monkeypatch.setattr(
-        "projections.map.fold.read_envelopes",
+        "projections.map.parsing.read_envelopes",
         lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
     )
     reports = retry(log, one_database, SETTINGS)
