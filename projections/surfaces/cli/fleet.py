@@ -11,7 +11,8 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
-from projections.adapters.fleet.engines import Ended, usable_cores
+from eventsrc.base.worker_process import usable_processors
+from projections.adapters.fleet.engines import Ended
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
 
@@ -264,7 +265,12 @@ def relocalize(
     sites = sites_of(place)
     with stores.opened(sites) as databases:
         answer = ask_sites(
-            sites, databases, question, top=top, camera=asked_by, jobs=jobs or 2 * usable_cores()
+            sites,
+            databases,
+            question,
+            top=top,
+            camera=asked_by,
+            jobs=jobs or 2 * usable_processors(),
         )
     best = answer.which.best
     if as_json:

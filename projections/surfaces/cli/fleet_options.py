@@ -11,8 +11,9 @@ import typer
 
 from eventsrc.base.errors import LogError, MisuseError
 from eventsrc.base.text import counted
+from eventsrc.base.worker_process import usable_processors
 from eventsrc.log import LogReader
-from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Task, usable_cores
+from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Task
 from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import Site, find_sites
 from projections.postgres.connection import Targets
@@ -24,7 +25,7 @@ def open_engine(engine: str, jobs: int | None, tasks: int) -> Engine:
     """``local``, with ``jobs`` processes, or ``dask://HOST:PORT``. Raises MisuseError for anything
     else."""
     if engine == "local":
-        return LocalPool(min(jobs or usable_cores(), max(1, tasks)))
+        return LocalPool(min(jobs or usable_processors(), max(1, tasks)))
     scheme, _, address = engine.partition("://")
     if scheme != "dask" or not address:
         raise MisuseError(f"--engine {engine}: there are local and dask://HOST:PORT")
