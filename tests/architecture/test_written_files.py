@@ -12,7 +12,7 @@ OWN_WAY = {
     "eventsrc/log/durable_files.py": "copies of a log's own files",
     "eventsrc/record/importers/bag_files.py": "a bag, unpacked into a temporary folder",
     "projections/adapters/rerun/recording.py": "into a pipe",
-    "projections/localize/evaluate/picture.py": "into memory",
+    "projections/localize/evaluate/evaluation.py": "into memory",
     "projections/adapters/drawing/canvas.py": "into memory",
     "projections/adapters/drawing/merge_picture.py": "by Canvas",
     "projections/adapters/drawing/picture.py": "by Canvas",

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from projections.localize import relocalize
-from projections.localize.evaluate.questions import Question, spread
+from projections.localize.evaluate.questions import ScoredQuestion, spread
 from projections.localize.evaluate.trials import Trial
 from projections.localize.relocalize import Answer, PoseHypothesis
 from scripts.programs.bench.truth.localising import (
@@ -22,8 +22,8 @@ from tests.programs.truth_cases import trial_generator
 HALVES = SimpleNamespace(DEVELOP=["w1", "w2", "w3"], VALIDATE=["v1", "v2"])
 
 
-def _question(keyframe: int) -> Question:
-    return Question(("q", keyframe), relocalize.Question(()), 0.0, 0.0, 0.0, None, ())
+def _question(keyframe: int) -> ScoredQuestion:
+    return ScoredQuestion(("q", keyframe), relocalize.Question(()), 0.0, 0.0, 0.0, None, ())
 
 
 def _trial(
@@ -114,7 +114,8 @@ def test_the_worst_beside_the_plain_baseline_stands_last_below_the_means() -> No
 
 def test_as_many_questions_of_another_building_are_spread_evenly() -> None:
     of_ten = [
-        Question(("q", n), relocalize.Question(()), 0.0, 0.0, 0.0, None, ()) for n in range(10)
+        ScoredQuestion(("q", n), relocalize.Question(()), 0.0, 0.0, 0.0, None, ())
+        for n in range(10)
     ]
     assert [q.key[1] for q in spread(of_ten, 4)] == [0, 2, 5, 7]
     assert spread(of_ten, 20) == of_ten

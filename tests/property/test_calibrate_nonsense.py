@@ -12,8 +12,8 @@ from projections.fold.deltas import Pose
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise
 from projections.fold.settings import Camera
+from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import _bounded, read
-from projections.localize.calibrate.shrinking import Reading
 from projections.localize.calibrate.sightings import Row, sightings_of
 from tests.support.thorough import examples
 

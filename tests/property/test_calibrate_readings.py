@@ -8,8 +8,8 @@ import pytest
 
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Camera
+from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import Round, read
-from projections.localize.calibrate.shrinking import Reading
 from projections.localize.calibrate.sightings import sightings_of
 from tests.support.known_worlds import CAMERA, Known, rows_of
 from tests.support.thorough import mostly_slow, rounds

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.model import RunId
 from projections.fold.deltas import ObservationOrdinal
-from projections.localize.evaluate.baselines import NEAREST, best_cosine, plain_position
+from projections.localize.evaluate.trials import NEAREST, best_cosine, plain_position
 from projections.localize.relocalize import Match
 
 Spot = tuple[float, float] | None

@@ -20,8 +20,7 @@ from projections.localize.calibrate.localiser import (
     logit,
 )
 from projections.localize.calibrate.report import localiser_document, localiser_text
-from projections.localize.evaluate.own_questions import OwnAnswer
-from projections.localize.evaluate.own_scores import own_scores
+from projections.localize.evaluate.own_questions import OwnAnswer, own_scores
 from projections.localize.relocalize import Answer
 from projections.localize.relocalize.certainty import probability
 

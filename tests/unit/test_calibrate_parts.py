@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from projections.fold.deltas import Pose
 from projections.fold.exact import metres_to_um, quantise
 from projections.fold.settings import Camera
-from projections.localize.calibrate import looks, shrinking, things
+from projections.localize.calibrate import likenesses, qualified_things, readings
 from projections.localize.calibrate.sightings import Row, Sightings, sightings_of
 
 CAMERA = Camera(hfov_deg=90.0, width_px=800.0, height_px=600.0)
@@ -36,8 +36,8 @@ def _looking_at(
     return sightings_of(rows)
 
 
-def _qualified(seen: Sightings) -> list[things.Thing]:
-    return things.qualified(seen, 0.05, 0.12, 0.08)
+def _qualified(seen: Sightings) -> list[qualified_things.QualifiedThing]:
+    return qualified_things.qualified(seen, 0.05, 0.12, 0.08)
 
 
 coordinates = st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
@@ -105,7 +105,7 @@ def test_pairs_in_pictures_are_all_pairs(pictures: list[int]) -> None:
         for i, j in itertools.combinations(range(len(pictures)), 2)
         if pictures[i] == pictures[j] and pictures[i:j].count(pictures[i]) < 24
     }
-    first, second = looks._pairs_in_pictures(picture)
+    first, second = likenesses._pairs_in_pictures(picture)
     pairs = list(zip(first.tolist(), second.tolist(), strict=True))
     assert len(pairs) == len(set(pairs))
     assert {(min(p), max(p)) for p in pairs} == expected
@@ -158,7 +158,7 @@ def test_every_envelope_may_have_a_camera_of_its_own() -> None:
 def test_a_spread_lies_between_what_was_seen_and_the_prior(
     seen: float, prior: float, count: int
 ) -> None:
-    value = shrinking.spread("x", seen, prior, count).value
+    value = readings.spread("x", seen, prior, count).value
     assert isinstance(value, float)
     low, high = sorted((max(seen, 0.001), max(prior, 0.001)))
     assert low * (1 - 1e-3) - 1e-4 <= value <= high * (1 + 1e-3) + 1e-4
@@ -167,9 +167,9 @@ def test_a_spread_lies_between_what_was_seen_and_the_prior(
 
 def test_nothing_seen_and_nonsense_seen_are_the_prior() -> None:
     for seen, count in ((5.0, 0), (math.nan, 10), (math.inf, 10), (0.0, 10), (-1.0, 10)):
-        assert shrinking.spread("x", seen, 2.0, count) == shrinking.unread("x", 2.0)
-    assert shrinking.level("x", math.nan, 0.3, 7) == shrinking.unread("x", 0.3)
-    assert shrinking.level("x", -0.3, 0.3, 100).value == 0.0
+        assert readings.spread("x", seen, 2.0, count) == readings.unread("x", 2.0)
+    assert readings.level("x", math.nan, 0.3, 7) == readings.unread("x", 0.3)
+    assert readings.level("x", -0.3, 0.3, 100).value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -177,5 +177,5 @@ def test_nothing_seen_and_nonsense_seen_are_the_prior() -> None:
     [(0.0, 0.0), (1.23456, 1.235), (0.123456, 0.1235), (0.0012345, 0.0012), (12345.6, 12346.0)],
 )
 def test_numbers_are_rounded_to_four_digits(value: float, expected: float) -> None:
-    assert shrinking.rounded(value) == expected
-    assert shrinking.rounded(-value) == -expected
+    assert readings.rounded(value) == expected
+    assert readings.rounded(-value) == -expected

@@ -6,13 +6,13 @@ from itertools import pairwise
 from typing import Any
 
 from eventsrc.base.text import counted, table, visible
-from projections.localize.evaluate.own_scores import own_scores
+from projections.localize.evaluate.own_questions import own_scores
 from projections.localize.relocalize import UNKNOWN_BELOW
 
+from .likenesses import FEWEST_DIFFERENT
 from .localiser import CROPS, OwnScores
-from .looks import FEWEST_DIFFERENT
+from .readings import Reading
 from .rounds import Calibration
-from .shrinking import Reading
 
 _MOST_SIZES = 8
 _RESTS_ON = {

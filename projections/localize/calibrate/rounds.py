@@ -26,12 +26,11 @@ from projections.map.own_events import new_map
 from projections.map.parsing import parsed_stretches
 from projections.map.view import MapView
 
-from .geometry import camera_faults, errors, ranges, sizes
+from .likenesses import different, in_pictures, of_things, same, scale
 from .localiser import NOT_ASKED, OwnScores, read_localiser
-from .looks import different, in_pictures, of_things, same, scale
-from .shrinking import Reading, unread
+from .qualified_things import qualified
+from .readings import Reading, camera_faults, errors, ranges, sizes, unread
 from .sightings import Row, Sightings, sightings_of
-from .things import qualified
 
 ROUNDS = 2
 

@@ -1,5 +1,5 @@
 """Questions from a map's own keyframes, asked as if the visit with the keyframe were not in the
-map.
+map; and their scores, which need no truth.
 
 Each question has crops of a keyframe of the map. The *visit*, the observations of its run within
 `VISIT` keyframes of it, is taken out of the map. Likenesses within a run are higher than between
@@ -12,9 +12,10 @@ Objects of the same class beside them are taken out as well: the fold may have s
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import RunId
@@ -25,10 +26,17 @@ from projections.localize.relocalize import Answer, ExactIndex, Match, QuestionC
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 
-from .baselines import best_cosine, plain_position
 from .parallel import call_all
 from .questions import DEFAULT_SEED, draw_key, spread
-from .trials import RIGHT_WITHIN_M
+from .scores import (
+    auroc,
+    calibration_floor,
+    expected_calibration_error,
+    percentiles,
+    reliability,
+    share,
+)
+from .trials import RIGHT_WITHIN_M, best_cosine, plain_position
 
 VISIT = 20
 """Keyframes of a run are of one visit if their keyframe_ids differ by no more than this."""
@@ -207,3 +215,43 @@ def _error(keyframe: KeyframeRecord, at: tuple[float, float] | None) -> float | 
     if at is None or keyframe.pose is None:
         return None
     return math.hypot(at[0] - keyframe.pose.x_m, at[1] - keyframe.pose.y_m)
+
+
+Number = Callable[[OwnAnswer], float]
+
+
+def own_scores(
+    answers: Sequence[OwnAnswer],
+    known_of: Number = lambda each: each.answer.known,
+    confidence_of: Number = lambda each: each.answer.confidence,
+    unknown_below: float = 0.5,
+) -> dict[str, Any]:
+    """Scores in the shape of ``evaluate --self --json``, for one number of crops.
+
+    Errors are of known questions, those with the visit taken out of which something was seen at
+    another time. ``taken_out_called_known`` is the share of those with the things shown taken out.
+    """
+    known = [each for each in answers if each.known]
+    gone = [each for each in answers if each.taken_out]
+    unknown = [each for each in answers if not each.known]
+    in_map, sure = [known_of(each) for each in answers], [confidence_of(each) for each in answers]
+    is_known, is_right = [each.known for each in answers], [each.correct for each in answers]
+    return {
+        "questions": len(answers),
+        "known": len(known),
+        "pose_error_m": percentiles(each.error_m for each in known),
+        "within_1_5_m": share(each.correct for each in known),
+        "known_called_unknown": share(known_of(each) < unknown_below for each in known),
+        "taken_out_called_known": share(known_of(each) >= unknown_below for each in gone),
+        "auroc": auroc([known_of(e) for e in known], [known_of(e) for e in unknown]),
+        "known_ece": expected_calibration_error(in_map, is_known),
+        "known_ece_floor": calibration_floor(in_map),
+        "ece": expected_calibration_error(sure, is_right),
+        "ece_floor": calibration_floor(sure),
+        "known_reliability": reliability(in_map, is_known),
+        "reliability": reliability(sure, is_right),
+        "plain": {"pose_error_m": percentiles(each.plain_error_m for each in known)},
+        "best_cosine": {
+            "auroc": auroc([e.best_cosine for e in known], [e.best_cosine for e in unknown])
+        },
+    }

@@ -40,7 +40,7 @@ _NEAR_BY = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class ScoredQuestion:
     """A question with its true pose, room and instances; pose, room and key are those of the last
     view."""
 
@@ -97,7 +97,7 @@ def _in_space(keyframe: Accepted, model: str, later: Reembedded | None) -> Accep
 
 def make_questions(
     keyframes: Iterable[Accepted], truth: Truth, crops: int, seed: int = DEFAULT_SEED
-) -> list[Question]:
+) -> list[ScoredQuestion]:
     """One question of ``crops`` crops from each keyframe that has truth and as many embeddings."""
     found = []
     for keyframe in keyframes:
@@ -109,13 +109,13 @@ def make_questions(
 
 def make_view_questions(
     keyframes: Iterable[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
-) -> list[Question]:
+) -> list[ScoredQuestion]:
     """One question from each keyframe that has truth and an embedding: it and the keyframes before
     it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each.
 
     None from one before which there are too few within 4 · ``views`` keyframes of its run.
     """
-    found: list[Question] = []
+    found: list[ScoredQuestion] = []
     recent: deque[tuple[int, Accepted, list[int]]] = deque(maxlen=views)
     for number, keyframe in enumerate(keyframes):
         if recent and recent[-1][1].envelope.run_id != keyframe.envelope.run_id:
@@ -164,7 +164,7 @@ def draw_key(seed: int, det_id: str) -> bytes:
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 
-def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> Question:
+def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> ScoredQuestion:
     views = []
     before = drawn[0][0]
     for keyframe, indices in drawn:
@@ -172,7 +172,7 @@ def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> 
         views.append(QuestionView(*_moved(_pose(before), _pose(keyframe)), crops))
         before = keyframe
     key = _key(before)
-    return Question(
+    return ScoredQuestion(
         key,
         relocalize.Question(tuple(views)),
         *_pose(before),

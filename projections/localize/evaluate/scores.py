@@ -26,7 +26,7 @@ BINS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class ClusterScores:
     """Scores of a clustering; each is between 0 and 1, ``adjusted_rand`` may be below 0."""
 
     homogeneity: float
@@ -35,7 +35,7 @@ class Agreement:
     adjusted_rand: float
 
 
-def agreement(classes: Sequence[Hashable], clusters: Sequence[Hashable]) -> Agreement:
+def agreement(classes: Sequence[Hashable], clusters: Sequence[Hashable]) -> ClusterScores:
     """Compare ``clusters`` with the true ``classes``; for no things at all everything is 1."""
     both = Counter(zip(classes, clusters, strict=True))
     by_class, by_cluster = Counter(classes), Counter(clusters)
@@ -46,7 +46,7 @@ def agreement(classes: Sequence[Hashable], clusters: Sequence[Hashable]) -> Agre
     completeness = min(1.0, max(0.0, mutual / h_cluster)) if h_cluster else 1.0
     together = homogeneity + completeness
     v = 2.0 * homogeneity * completeness / together if together else 0.0
-    return Agreement(
+    return ClusterScores(
         homogeneity, completeness, v, _adjusted_rand(both, by_class, by_cluster, total)
     )
 
@@ -203,3 +203,15 @@ def percentile(values: Sequence[float], share: float) -> float | None:
     low = int(at)
     high = min(low + 1, len(ordered) - 1)
     return ordered[low] + (at - low) * (ordered[high] - ordered[low])
+
+
+def percentiles(values: Iterable[float | None]) -> dict[str, float | None]:
+    """The median and the ninetieth percentile of the values that are there."""
+    present = [value for value in values if value is not None]
+    return {"p50": percentile(present, 0.5), "p90": percentile(present, 0.9)}
+
+
+def share(holds: Iterable[bool]) -> float | None:
+    """The share that holds; None of none."""
+    every = list(holds)
+    return sum(every) / len(every) if every else None

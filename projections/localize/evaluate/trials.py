@@ -1,4 +1,9 @@
-"""Trials: each question asked of the map, and its answer compared with the truth."""
+"""Trials: each question asked of the map, and its answer compared with the truth.
+
+Beside it are two baselines. *Plain*: the ten observations most similar to each crop; the answer is
+the median of their robots' positions, in x and y each. *Best cosine*: the greatest cosine of a crop
+and an observation, as a score of whether the thing is in the map.
+"""
 
 import math
 import time
@@ -13,14 +18,30 @@ from eventsrc.envelope.ingest import Accepted
 from eventsrc.log.seek import Note
 from projections.fold.settings import Camera
 from projections.localize import relocalize
-from projections.localize.relocalize import Answer, ExactIndex, Method, rank
+from projections.localize.relocalize import Answer, ExactIndex, Match, Method, rank
 from projections.map.view import MapView
 
-from .baselines import best_cosine, plain_position
 from .parallel import call_all
-from .questions import Question
+from .questions import ScoredQuestion
 from .scores import instances_of
 from .truth import Key, Truth
+
+NEAREST = 10
+
+
+def plain_position(matches: Sequence[Sequence[Match]]) -> tuple[float, float] | None:
+    """The plain position in metres; None if none of the nearest observations has a pose."""
+    poses = [m.pose[:2] for row in matches for m in row[:NEAREST] if m.pose is not None]
+    if not poses:
+        return None
+    x, y = np.median(np.array(poses), axis=0)
+    return float(x), float(y)
+
+
+def best_cosine(matches: Sequence[Sequence[Match]]) -> float:
+    """The greatest cosine of all crops; -1 if the map has no observation."""
+    return max((row[0].similarity for row in matches if row), default=-1.0)
+
 
 RIGHT_WITHIN_M = 1.5
 
@@ -70,10 +91,10 @@ class Trial:
     whether some place contains the true room: without one no place can be the right answer.
     ``room_of_pose`` is the room of the mapped keyframe nearest to the pose, ``room_at_pose`` the
     room there by the `RoomIndex`, None without one. ``plain_error_m`` and ``best_cosine`` are those
-    of `baselines`; ``plain_place_error_m`` is the plain method's, a place's centroid.
+    of the baselines; ``plain_place_error_m`` is the plain method's, a place's centroid.
     """
 
-    question: Question
+    question: ScoredQuestion
     answer: Answer
     known: bool
     pose_error_m: float | None
@@ -162,7 +183,7 @@ class TrialRunner:
         self._rooms_in_map = {room for rooms in self._rooms.values() for room in rooms}
 
     def run(
-        self, questions: Iterable[Question], workers: int = 0, note: Note | None = None
+        self, questions: Iterable[ScoredQuestion], workers: int = 0, note: Note | None = None
     ) -> list[Trial]:
         """One trial for each question. ``workers`` and ``note``: see `call_all`."""
         asked = list(questions)
@@ -172,7 +193,7 @@ class TrialRunner:
         answers = call_all(calls, workers, "asking", "questions", note)
         return [self._scored(*each) for each in zip(asked, answers, strict=True)]
 
-    def _scored(self, question: Question, asked: Asked) -> Trial:
+    def _scored(self, question: ScoredQuestion, asked: Asked) -> Trial:
         answer = asked.answer
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
@@ -209,7 +230,7 @@ class TrialRunner:
         return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
 
 
-def _distance(position: tuple[float, float] | None, question: Question) -> float | None:
+def _distance(position: tuple[float, float] | None, question: ScoredQuestion) -> float | None:
     """The distance in metres from the question's true position."""
     if position is None:
         return None

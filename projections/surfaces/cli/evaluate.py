@@ -10,7 +10,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
 from projections.localize.evaluate import evaluate as score
 from projections.localize.evaluate import read_truth
-from projections.localize.evaluate.picture import draw_failures
+from projections.localize.evaluate.evaluation import draw_failures
 from projections.localize.evaluate.questions import DEFAULT_SEED
 from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS

@@ -9,9 +9,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from projections.adapters.fleet.which_site import which_site
-from projections.localize.evaluate.baselines import best_cosine
 from projections.localize.evaluate.questions import (
-    Question,
+    ScoredQuestion,
     make_questions,
     make_view_questions,
     spread,
@@ -22,6 +21,7 @@ from projections.localize.evaluate.scores import (
     expected_calibration_error,
     instances_of,
 )
+from projections.localize.evaluate.trials import best_cosine
 from projections.localize.relocalize import Answer, ExactIndex, rank
 from scripts.programs.bench.truth.localising import later_runs, make_map
 from scripts.programs.bench.truth.worlds import Case, load_generator, make_case, pairs
@@ -77,7 +77,7 @@ def _ask(half: str, questions: int) -> Iterator[Asked]:
                 )
 
 
-def _questions(case: Case, number: int) -> Iterator[tuple[str, Question]]:
+def _questions(case: Case, number: int) -> Iterator[tuple[str, ScoredQuestion]]:
     runs = later_runs(case)
     for kind, made in (
         (KINDS[0], make_questions(runs, case.truth, 1)),

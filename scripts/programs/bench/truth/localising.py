@@ -15,7 +15,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.ingest import Accepted
 from projections.fold.settings import Settings
 from projections.localize.evaluate.questions import (
-    Question,
+    ScoredQuestion,
     make_questions,
     make_view_questions,
     spread,
@@ -124,7 +124,7 @@ def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
 
 def asked(
     case: Case, stranger: Case, every: int, crops: Sequence[int] = CROPS
-) -> dict[str, tuple[list[Question], ...]]:
+) -> dict[str, tuple[list[ScoredQuestion], ...]]:
     """By kind, of as many crops or views: every n-th question of the case's later runs, and as many
     of the stranger's."""
     found = {}

@@ -3,15 +3,17 @@
 Accuracy and errors are over *known* questions (some true instance of theirs is in the map), errors
 over those that have a pose. ``auroc`` is that of `known` between known and unknown questions.
 Calibration counts all questions: an answer is right when the question is known and the pose is
-within 1.5 m of the truth. ``plain`` and ``best_cosine`` are simple baselines (`baselines`).
+within 1.5 m of the truth. ``plain`` and ``best_cosine`` are simple baselines (`trials`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+from eventsrc.base.output_files import write_files
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from projections.fold.corrections import Corrections
@@ -22,8 +24,7 @@ from projections.map.own_events import read_corrections
 from projections.map.parsed_log import default_workers
 from projections.map.view import MapView
 
-from .own_questions import ask_own_questions
-from .own_scores import own_scores
+from .own_questions import ask_own_questions, own_scores
 from .questions import (
     DEFAULT_SEED,
     check_truth,
@@ -38,8 +39,10 @@ from .scores import (
     expected_calibration_error,
     object_scores,
     percentile,
+    percentiles,
     place_scores,
     reliability,
+    share,
 )
 from .trials import RIGHT_WITHIN_M, RoomIndex, Trial, TrialRunner
 from .truth import Truth
@@ -134,22 +137,20 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
     return {
         "questions": len(trials),
         "known": len(known),
-        "top1_room": _share(roomed, lambda t: t.question.room in t.rooms_of_places[:1]),
-        "top3_room": _share(roomed, lambda t: t.question.room in t.rooms_of_places[:3]),
-        "top1_contains_room": _share(roomed, lambda t: any(t.contains[:1])),
-        "top3_contains_room": _share(roomed, lambda t: any(t.contains[:3])),
-        "pose_room": _share(roomed, lambda t: t.question.room == t.room_of_pose),
-        "room_at_pose": _share(roomed, lambda t: t.question.room == t.room_at_pose),
-        "room_ceiling": _share(roomed, lambda t: t.room_has_place),
-        "nearest_place": _share(
-            [t for t in known if t.nearest_place is not None], lambda t: bool(t.nearest_place)
-        ),
-        "pose_error_m": _percentiles([t.pose_error_m for t in known]),
-        "yaw_error_rad": _percentiles([t.yaw_error_rad for t in known]),
-        "centroid_error_m": _percentiles([t.centroid_error_m for t in known]),
-        "within_1_5_m": _share(known, lambda t: t.correct),
-        "known_called_unknown": _share(known, lambda t: t.answer.unknown),
-        "unknown_called_unknown": _share(unknown, lambda t: t.answer.unknown),
+        "top1_room": share(t.question.room in t.rooms_of_places[:1] for t in roomed),
+        "top3_room": share(t.question.room in t.rooms_of_places[:3] for t in roomed),
+        "top1_contains_room": share(any(t.contains[:1]) for t in roomed),
+        "top3_contains_room": share(any(t.contains[:3]) for t in roomed),
+        "pose_room": share(t.question.room == t.room_of_pose for t in roomed),
+        "room_at_pose": share(t.question.room == t.room_at_pose for t in roomed),
+        "room_ceiling": share(t.room_has_place for t in roomed),
+        "nearest_place": share(t.nearest_place for t in known if t.nearest_place is not None),
+        "pose_error_m": percentiles(t.pose_error_m for t in known),
+        "yaw_error_rad": percentiles(t.yaw_error_rad for t in known),
+        "centroid_error_m": percentiles(t.centroid_error_m for t in known),
+        "within_1_5_m": share(t.correct for t in known),
+        "known_called_unknown": share(t.answer.unknown for t in known),
+        "unknown_called_unknown": share(t.answer.unknown for t in unknown),
         "auroc": auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
         "ece": expected_calibration_error(confidence, correct),
         "ece_floor": calibration_floor(confidence),
@@ -157,8 +158,8 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "known_ece_floor": calibration_floor(in_map),
         "reliability": reliability(confidence, correct),
         "plain": {
-            "pose_error_m": _percentiles([t.plain_error_m for t in known]),
-            "within_1_5_m": _share(known, _plain_is_near),
+            "pose_error_m": percentiles(t.plain_error_m for t in known),
+            "within_1_5_m": share(_plain_is_near(t) for t in known),
         },
         "best_cosine": {
             "auroc": auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown])
@@ -171,15 +172,47 @@ def _plain_is_near(trial: Trial) -> bool:
     return trial.plain_error_m is not None and trial.plain_error_m <= RIGHT_WITHIN_M
 
 
-def _share(trials: Sequence[Trial], holds: Callable[[Trial], bool]) -> float | None:
-    return sum(holds(t) for t in trials) / len(trials) if trials else None
-
-
-def _percentiles(values: Sequence[float | None]) -> dict[str, float | None]:
-    present = [value for value in values if value is not None]
-    return {"p50": percentile(present, 0.5), "p90": percentile(present, 0.9)}
-
-
 def _latency(trials: Sequence[Trial]) -> dict[str, float | None]:
     milliseconds = [t.seconds * 1000.0 for t in trials]
     return {"p50": percentile(milliseconds, 0.5), "p99": percentile(milliseconds, 0.99)}
+
+
+_GOOD, _BAD, _UNKNOWN, _DRIVE = "#2a7f62", "#c0392b", "#8e8e8e", "#d9d9d9"
+
+
+def draw_failures(view: MapView, trials: Sequence[Trial], out: Path) -> None:
+    """Draw each question's true position, and a line to a wrong answer, to ``out`` (.png, .svg or
+    .pdf). Raises MisuseError where no file can be made there, MapfoldError where writing it
+    fails."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    drive = [k.pose for k in view.keyframes if k.pose is not None]
+    axes.scatter([p.x_um / 1e6 for p in drive], [p.y_um / 1e6 for p in drive], 6, _DRIVE)
+    for trial in trials:
+        if trial.known:
+            _draw(axes, trial)
+    known = [t for t in trials if t.known]
+    axes.set_title(
+        f"{sum(t.correct for t in known)} of {len(known)} poses within 1.5 m", loc="left"
+    )
+    axes.set_xlabel(
+        "green: within 1.5 m   red: not, with a line to the answer   grey: answered 'unknown'"
+    )
+    axes.set_aspect("equal")
+    picture = BytesIO()
+    figure.savefig(picture, format=out.suffix[1:])
+    write_files({out: picture.getvalue()})
+
+
+def _draw(axes: object, trial: Trial) -> None:
+    question, pose = trial.question, trial.answer.pose
+    colour = _GOOD if trial.correct else _UNKNOWN if trial.answer.unknown else _BAD
+    if pose is not None and not trial.correct:
+        axes.plot(  # type: ignore[attr-defined]
+            [question.x, pose.x], [question.y, pose.y], color=colour, linewidth=0.7, alpha=0.6
+        )
+    axes.scatter([question.x], [question.y], 12, colour)  # type: ignore[attr-defined]

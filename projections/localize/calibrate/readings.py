@@ -1,17 +1,74 @@
-"""Estimate ranges, errors of bearings and poses, and sizes of classes from triangulated things."""
+"""Constants read off a map, each drawn towards its prior when few observations back it: ranges,
+errors of bearings and poses, and sizes of classes, from triangulated things.
+"""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from projections.fold.evidence import EvidenceConstants
 
-from .halves import inflation
-from .shrinking import PRIOR_COUNT, Reading, rounded, spread, unread
+from .qualified_things import QualifiedThing, inflation
 from .sightings import Flags, Floats, Sightings
-from .things import Thing
+
+PRIOR_COUNT = 100
+"""The number of observations that a prior weighs as much as: a reading of n has the weight n/(n +
+100)."""
+_DIGITS = 4
+_LEAST = 0.001
+"""The least errors and spreads: no map is better than a millimetre or a milliradian."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A constant estimated from a map.
+
+    ``value`` is the estimate to use, ``seen`` that of the map alone (None without evidence),
+    ``prior`` the usual value, ``count`` the number of observations or pairs behind it.
+    """
+
+    name: str
+    value: float | str | None
+    seen: float | str | None
+    prior: float | str | None
+    count: int
+
+
+def spread(name: str, seen: float, prior: float, count: int) -> Reading:
+    """A reading of a quantity that is above 0: its logarithm is drawn towards the prior's."""
+    if not count or not (math.isfinite(seen) and seen > 0.0):
+        return unread(name, prior)
+    share = count / (count + PRIOR_COUNT)
+    value = math.exp(share * math.log(seen) + (1.0 - share) * math.log(prior))
+    return Reading(name, max(rounded(value), _LEAST), rounded(seen), prior, count)
+
+
+def level(name: str, seen: float, prior: float, count: int) -> Reading:
+    """A reading of a quantity that may be negative."""
+    if not count or not math.isfinite(seen):
+        return unread(name, prior)
+    share = count / (count + PRIOR_COUNT)
+    value = share * seen + (1.0 - share) * prior
+    return Reading(name, rounded(value), rounded(seen), prior, count)
+
+
+def unread(name: str, prior: float | str | None) -> Reading:
+    """The reading of a constant without evidence: the prior."""
+    return Reading(name, prior, None, prior, 0)
+
+
+def rounded(value: float) -> float:
+    """Four significant digits, at most four decimals: machines whose logarithms differ in the last
+    bit agree."""
+    if value == 0.0:
+        return 0.0
+    decimals = _DIGITS - 1 - math.floor(math.log10(abs(value)))
+    return round(value, max(0, min(decimals, _DIGITS))) + 0.0
+
 
 LEAST_OF_A_CLASS = 4
 _MAD = 1.4826
@@ -38,7 +95,7 @@ class Errors(NamedTuple):
     pose: float
 
 
-def ranges(things: Sequence[Thing], prior: EvidenceConstants) -> tuple[Reading, Reading]:
+def ranges(things: Sequence[QualifiedThing], prior: EvidenceConstants) -> tuple[Reading, Reading]:
     """Median and spread of the distances."""
     if not things:
         return unread("range_m", prior.range_m), unread("range_spread", prior.range_spread)
@@ -51,7 +108,7 @@ def ranges(things: Sequence[Thing], prior: EvidenceConstants) -> tuple[Reading, 
 
 
 def errors(
-    things: Sequence[Thing], seen: Sightings, prior: EvidenceConstants
+    things: Sequence[QualifiedThing], seen: Sightings, prior: EvidenceConstants
 ) -> tuple[Reading, Reading, Reading]:
     """Errors of bearings, of cut ones, and of poses.
 
@@ -93,7 +150,7 @@ def errors(
 
 
 def sizes(
-    things: Sequence[Thing], seen: Sightings, prior: EvidenceConstants
+    things: Sequence[QualifiedThing], seen: Sightings, prior: EvidenceConstants
 ) -> tuple[dict[str, Reading], Reading]:
     """The median height of each class's boxes, in metres, and the spread about it."""
     by_class: dict[str, list[tuple[float, int]]] = {}
@@ -124,7 +181,7 @@ def sizes(
     return found, spread("size_spread", (about / freedom) ** 0.5, prior.size_spread, boxes)
 
 
-def camera_faults(things: Sequence[Thing], seen: Sightings) -> list[Reading]:
+def camera_faults(things: Sequence[QualifiedThing], seen: Sightings) -> list[Reading]:
     """Faults of the camera seen in bearings: the share by which they grow too fast from the middle
     of the picture to its side, and the angle by which all are off. Only significant ones."""
     if not things:

@@ -13,10 +13,9 @@ import numpy as np
 
 from projections.fold.evidence import EvidenceConstants
 
-from .geometry import robust_spread
-from .shrinking import PRIOR_COUNT, Reading, level, rounded, spread, unread
+from .qualified_things import QualifiedThing
+from .readings import PRIOR_COUNT, Reading, level, robust_spread, rounded, spread, unread
 from .sightings import Flags, Floats, Ints, Sightings
-from .things import Thing
 
 KAPPAS = (2.0, 1.0, 4.0)
 """The values that are tried; of equally good ones the first, which is the prior."""
@@ -28,7 +27,7 @@ _MOST_OF_A_THING = 300
 _ROUNDS = 15
 
 
-class Pairs(NamedTuple):
+class LookPairs(NamedTuple):
     """Pairs of observations: the likeness of each, and what they have in common."""
 
     likeness: Floats
@@ -86,7 +85,7 @@ def different(
     )
 
 
-def of_things(seen: Sightings, things: Sequence[Thing], scaled_by: float) -> Pairs:
+def of_things(seen: Sightings, things: Sequence[QualifiedThing], scaled_by: float) -> LookPairs:
     """Pairs of observations of one thing; the pairs of a thing weigh as much as its
     observations."""
     first, second, weight = [], [], []
@@ -99,10 +98,10 @@ def of_things(seen: Sightings, things: Sequence[Thing], scaled_by: float) -> Pai
         weight.append(np.full(len(a), len(thing.rows) / len(a)))
     if not first:
         none = np.zeros(0)
-        return Pairs(none, none, none, none.astype(np.bool_), none)
+        return LookPairs(none, none, none, none.astype(np.bool_), none)
     one, other = np.concatenate(first), np.concatenate(second)
     cosines = seen.cosines(one, other)
-    return Pairs(
+    return LookPairs(
         (cosines - scaled_by) / (1.0 - scaled_by),
         np.cos(seen.sight[one] - seen.sight[other]),
         np.cos(seen.heading[one] - seen.heading[other]),
@@ -111,7 +110,7 @@ def of_things(seen: Sightings, things: Sequence[Thing], scaled_by: float) -> Pai
     )
 
 
-def same(pairs: Pairs, prior: EvidenceConstants) -> dict[str, Reading]:
+def same(pairs: LookPairs, prior: EvidenceConstants) -> dict[str, Reading]:
     """The constants of the likeness of one thing from another side and in another run.
 
     The prior is added as pairs with the expected likeness, over all changes of side, half of them
@@ -156,7 +155,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(
-    pairs: Pairs, change: Floats, kappa: float, prior: EvidenceConstants, prior_count: int = 0
+    pairs: LookPairs, change: Floats, kappa: float, prior: EvidenceConstants, prior_count: int = 0
 ) -> _Fit:
     """Robust least squares of likeness = back + side · exp(κ (change − 1)) − shift · other_run."""
     prior_count = prior_count or PRIOR_COUNT
