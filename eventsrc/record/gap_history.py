@@ -241,29 +241,30 @@ def fold_ledger(events: Iterable[Event], ledger: GapLedger[RunId], now_ns: int) 
     """Add ``events`` to ``ledger``, which is also returned."""
     for event in events:
         if event.key == LOSS_KEY:
-            _add_loss(ledger, event.payload, now_ns)
-        elif event.is_envelope:
-            identity = _identity(event)
+            # that of a later version is None; its gap still shows in the keyframe ids
+            loss = loss_of(event)
+            gap = None if loss is None else gap_of(loss)
+            if gap is not None:
+                ledger.add_reported(gap, now_ns)
+        elif event.is_envelope and has_keyframe_id(event.version):
+            identity = keyframe_of(event.payload)
             if identity is not None:
                 ledger.record(*identity, now_ns)
     return ledger
 
 
-def _add_loss(ledger: GapLedger[RunId], payload: bytes, now_ns: int) -> None:
+def loss_of(event: Event) -> Loss | None:
+    """The content of a loss event; None if it cannot be read, which `log verify` says."""
     try:
-        loss = Loss.model_validate_json(payload)
+        return Loss.model_validate_json(event.payload)
     except ValidationError:
-        return  # of a later version; its gap still shows in the keyframe ids
-    gap = gap_of(loss)
-    if gap is not None:
-        ledger.add_reported(gap, now_ns)
-
-
-def _identity(event: Event) -> tuple[RunId, KeyframeId] | None:
-    if not has_keyframe_id(event.version):
         return None
+
+
+def keyframe_of(payload: bytes) -> tuple[RunId, KeyframeId] | None:
+    """Run and keyframe of an envelope's JSON; None if it has none that a fold could read."""
     try:
-        found = _Identity.model_validate_json(event.payload)
+        found = _Identity.model_validate_json(payload)
     except ValidationError:
-        return None  # an envelope the fold cannot read either; `log verify` names it
+        return None
     return found.run_id, found.keyframe_id

@@ -12,14 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.gaps import gap_of
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
-from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss
-from eventsrc.log import Event, LogReader
+from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
+from eventsrc.log import LogReader
 from eventsrc.log import mcap_records as _mcap
 from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath, carries_envelopes
@@ -28,7 +26,7 @@ from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile
 from eventsrc.log.segment import formats_of
 
-from .gap_history import ledger_of
+from .gap_history import ledger_of, loss_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,18 +212,13 @@ def _count_lost(reader: LogReader, note: Callable[[str], None] | None = None) ->
 
     Gaps of keyframes are counted from the gap ledger, because late keyframes may have filled them.
     """
-    losses = [loss for event in reader.read(keys={LOSS_KEY}) if (loss := _loss(event)) is not None]
+    losses = [
+        loss for event in reader.read(keys={LOSS_KEY}) if (loss := loss_of(event)) is not None
+    ]
     others = [loss.count for loss in losses if gap_of(loss) is None]
     if len(others) == len(losses):
         return sum(others)
     return sum(others) + ledger_of(reader, note=note).missing_reported()
-
-
-def _loss(event: Event) -> Loss | None:
-    try:
-        return Loss.model_validate_json(event.payload)
-    except ValidationError:  # `log verify` names it
-        return None
 
 
 def _robot_channels(channels: dict[int, Channel]) -> set[int]:

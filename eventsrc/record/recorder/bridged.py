@@ -22,13 +22,14 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import msgspec
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged
-from eventsrc.envelope.model import ENVELOPE_VERSION, Offset, RunId
-from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY, Loss
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
 from eventsrc.record.append import append_payload, map_event
+from eventsrc.record.gap_history import keyframe_of, loss_of
 from eventsrc.record.transport.session import Received
 from eventsrc.ros.derivation import (
     CDR,
@@ -257,30 +258,21 @@ def _missing(reader: LogReader, start: Offset, types: MessageTypes) -> list[Deri
         """Yield the events, and remove those that the log has from ``made`` and ``maps``."""
         nonlocal has_losses
         for event in reader.read(start):
-            has_losses = has_losses or _is_rot(event)
+            if event.key == LOSS_KEY and (loss := loss_of(event)) is not None:
+                # if a message of ROS was lost, the keyframes after it would get other numbers
+                has_losses = has_losses or loss.cause == "rot"
             if event.key == MAP_KEY and maps:
                 maps.popleft()
             elif event.is_envelope:
-                made.pop(identity_of(event.payload), None)
+                made.pop(keyframe_of(event.payload), None)
             yield event
 
     for _, derived in derive(watched(), types):
         if derived.key == MAP_KEY:
             maps.append(derived)
         else:
-            made[identity_of(derived.payload)] = derived
+            made[keyframe_of(derived.payload)] = derived
     return [] if has_losses else [*maps, *made.values()]
-
-
-def _is_rot(event: Event) -> bool:
-    """Whether an event replaces a lost one. If that was a message of ROS, the keyframes after it
-    would get other numbers."""
-    if event.key != LOSS_KEY:
-        return False
-    try:
-        return Loss.model_validate_json(event.payload).cause == "rot"
-    except ValidationError:
-        return False
 
 
 class DerivedFrom(NamedTuple):
@@ -317,17 +309,3 @@ def recording_of(event: Event) -> RosRecording:
         raise LogDamaged(
             f"the event on {ROS_KEY} at offset {event.offset} cannot be read: {reason}"
         ) from None
-
-
-class _Identity(BaseModel):
-    run_id: RunId
-    keyframe_id: int
-
-
-def identity_of(payload: bytes) -> tuple[str, int] | None:
-    """Run and keyframe of an envelope's JSON; None if it has none."""
-    try:
-        found = _Identity.model_validate_json(payload)
-    except ValidationError:
-        return None
-    return found.run_id, found.keyframe_id
