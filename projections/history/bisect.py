@@ -77,7 +77,8 @@ def _sorted(offsets: Iterable[int]) -> "array[int]":
 
 
 class HistoryFacts:
-    """`Facts` of the map after ``end`` events, read from a history; ``end`` may be assigned."""
+    """The values of the functions of conditions for the map after ``end`` events, read from a
+    history; ``end`` may be assigned. Arguments are ids; a keyframe is ``run_id:keyframe_id``."""
 
     def __init__(self, history: History, index: CountIndex, end: Offset) -> None:
         self._history = history
@@ -114,6 +115,10 @@ class HistoryFacts:
         if ordinal is None:
             return None
         return id_of_place(self._history, self._history.place_at(ordinal, self.end))
+
+    def same_place(self, a: str, b: str) -> bool:
+        place = self.place_of(a)
+        return place is not None and place == self.place_of(b)
 
     def located_in(self, object_id: str) -> str | None:
         ordinal = self._history.object_ordinals.get(object_id)
@@ -152,6 +157,9 @@ class HistoryFacts:
         if ordinal is None or not self._history.places[ordinal].stands(self.end):
             return None
         return self._history.places[ordinal].name(self.end)
+
+    def named(self, name: str) -> bool:
+        return self.place_called(name) is not None
 
     def place_called(self, name: str) -> str | None:
         for place in self._index.places_called.get(name, ()):

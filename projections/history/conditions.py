@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 from eventsrc.base.errors import MisuseError
 
-from .condition_functions import FUNCTIONS, Direction, Facts, Function, Names, Type, Value
+from .condition_functions import FUNCTIONS, Direction, Function, Names, Type, Value
 
 MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
@@ -43,6 +43,12 @@ _TOKEN = re.compile(
     r"\s*(?:(?P<number>-?\d+)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),])"
     r"""|(?P<text>'(?:[^'\\]|\\['"\\])*'|"(?:[^"\\]|\\['"\\])*"))"""
 )
+_WRONG_SIGNS = {
+    **{quote: f"this text is not closed; it needs another {quote}" for quote in "'\""},
+    "=": "'=' is not a comparison; write '=='",
+    **{sign: f"{sign!r} is not an operator here; write and, or, not, !=" for sign in "&|!"},
+    ".": "'.' has no meaning here; numbers are whole",
+}
 _OPERATOR_WORDS = ("and", "or", "not")
 _COMPARISONS: dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]] = {
     ast.Lt: ("<", operator.lt),
@@ -90,7 +96,7 @@ class _Call:
         arguments = ", ".join(repr(mention.text) for mention in self.mentions)
         return f"{self.function.name}({arguments})" if arguments else self.function.name
 
-    def value(self, facts: Facts) -> Value:
+    def value(self, facts: object) -> Value:
         return self.function.answer(facts, *(mention.text for mention in self.mentions))
 
 
@@ -100,7 +106,7 @@ class _Term:
 
     column: int
     type: Type
-    value: Callable[[Facts], Value]
+    value: Callable[[object], Value]
     direction: Direction = Direction.STEADY
     calls: tuple[_Call, ...] = ()
 
@@ -152,11 +158,11 @@ class Expression:
     def __str__(self) -> str:
         return self.source
 
-    def holds(self, facts: Facts) -> bool:
+    def holds(self, facts: object) -> bool:
         """Whether it is true of this map."""
         return bool(self._term.value(facts))
 
-    def readings(self, facts: Facts) -> tuple[tuple[str, Value], ...]:
+    def readings(self, facts: object) -> tuple[tuple[str, Value], ...]:
         """Every function call as written, with its value."""
         return tuple({str(call): call.value(facts) for call in self._term.calls}.items())
 
@@ -203,7 +209,8 @@ class _Parser:
             match = _TOKEN.match(self._source, index)
             if match is None:
                 start = index + len(self._source[index:]) - len(self._source[index:].lstrip())
-                reason = _token_error(self._source[start])
+                char = self._source[start]
+                reason = _WRONG_SIGNS.get(char, f"{char!r} has no meaning here")
                 raise ExpressionError(self._source, start + 1, reason)
             kind: Any = match.lastgroup
             text = match[kind]
@@ -391,17 +398,3 @@ def _no_function(name: str) -> str:
     if near:
         return f"no function {name!r}; did you mean {near[0]!r}?"
     return f"no function {name!r}; there are {', '.join(sorted(FUNCTIONS))}"
-
-
-def _token_error(char: str) -> str:
-    match char:
-        case "'" | '"':
-            return f"this text is not closed; it needs another {char}"
-        case "=":
-            return "'=' is not a comparison; write '=='"
-        case "&" | "|" | "!":
-            return f"{char!r} is not an operator here; write and, or, not, !="
-        case ".":
-            return "'.' has no meaning here; numbers are whole"
-        case _:
-            return f"{char!r} has no meaning here"

@@ -5,7 +5,7 @@ of a place and the observations of an Object, most of the data, are made on firs
 before the view is changed.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise, repeat
 from typing import cast
@@ -39,15 +39,14 @@ from .history import History
 from .lazy_rows import Chunks
 from .moment import Moment
 from .object_states import ObjectStates
-from .recorded_vectors import RecordedVectors
 from .timeline_cache import TimelineCache
 
 
 class StoredView(MapView):
     """The map after ``end`` events of a history of tables; the caller may change it.
 
-    Its digest is kept in ``cache``, if there is one. Its observations have embeddings only in
-    ``recorded``, as which `vectors` gives them.
+    Its digest is kept in ``cache``, if there is one. Its `vectors` are those that ``recorded``
+    gives; its observations have no embeddings.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class StoredView(MapView):
         history: History,
         end: Offset,
         cache: TimelineCache | None = None,
-        recorded: RecordedVectors | None = None,
+        recorded: Callable[[NDArray[np.int64]], NDArray[np.int32]] | None = None,
     ) -> None:
         super().__init__(
             history.settings,
@@ -132,7 +131,7 @@ class StoredView(MapView):
         """The unit vectors of some of `embedded`. Raises LogError, FoldError."""
         if self._recorded is None:
             return super().vectors(observations)
-        return self._recorded.of(observations)
+        return self._recorded(observations)
 
     def floor_of(self, place: PlaceOrdinal) -> str | None:
         """The name of the floor that a place is on; None if the log has none."""

@@ -39,7 +39,7 @@ def mapfold(tmp_path: Path) -> Commands:
     return Commands.in_folder(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["folding", "map", "past_maps", "mapfold"])
+@pytest.mark.parametrize("name", ["map", "past_maps", "mapfold"])
 def test_examples_of_docstrings_give_what_they_show(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

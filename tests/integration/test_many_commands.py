@@ -23,8 +23,7 @@ from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
 from projections.edit.current import MapToEdit
-from projections.edit.effect import effect_keys, effects_of
-from projections.edit.listing import edits_document, edits_text
+from projections.edit.effect import edits_document, edits_text, effect_keys, effects_of
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings

@@ -29,6 +29,10 @@ class FakeFacts:
     def place_of(self, keyframe: str) -> str | None:
         return self.places.get(keyframe)
 
+    def same_place(self, a: str, b: str) -> bool:
+        place = self.place_of(a)
+        return place is not None and place == self.place_of(b)
+
     def located_in(self, object_id: str) -> str | None:
         return "a_p0" if object_id == "obj-1" else None
 

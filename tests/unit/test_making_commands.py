@@ -31,7 +31,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose, read_trajectory
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
-from projections.edit.listing import what
+from projections.edit.effect import what
 from projections.fold.settings import Camera, Settings
 from tests.support.logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 

@@ -17,8 +17,7 @@ from eventsrc.log import LogReader
 from projections.edit import make
 from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
 from projections.edit.current import MapToEdit
-from projections.edit.effect import effects_of
-from projections.edit.listing import edits_document, edits_text
+from projections.edit.effect import edits_document, edits_text, effects_of
 from projections.edit.make import Stamp
 
 from .edit_command import EditOptions, NewCommand

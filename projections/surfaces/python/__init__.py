@@ -8,8 +8,7 @@ from eventsrc.log import Event, LogReader
 from projections.fold.settings import Settings
 from projections.localize.relocalize import Answer, Question
 
-from .folding import fold, open_log
-from .map import Map, relocalize
+from .map import Map, fold, open_log, relocalize
 from .past_maps import Timeline
 
 __all__ = [

@@ -13,8 +13,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.history.merges import merge_document
 
-from .folding import SettingsLike, settings_from
-from .map import Map
+from .map import Map, SettingsLike, settings_from
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 

@@ -19,8 +19,7 @@ from eventsrc.envelope.model import Offset, describe_error
 from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import MapToEdit
-from projections.edit.effect import cache_effect, effects_of
-from projections.edit.listing import edits_document, edits_text
+from projections.edit.effect import cache_effect, edits_document, edits_text, effects_of
 from projections.edit.make import Stamp
 from projections.edit.record import (
     Made,
