@@ -1,13 +1,20 @@
-r"""Text for people: numbers with a noun, rows under a header, text from outside made safe to print.
+r"""Text for people: numbers with a noun, rows under a header, advised command lines, and text from
+outside made safe to print.
 
 Escape sequences, which begin with a C0 or C1 control, can move a terminal's cursor, set its title
 or type answers; bidirectional overrides and isolates show a name in another order than it has; a
 line break in a name forges a line. mapfold prints none of these except its own line ends, so they
 are shown as escapes: ``\x1b``, ``\u202e``, ``\n``.
+
+Messages advise command lines, made by `advised` so that they can be pasted into a shell. The code
+that raises an error does not have the options of the running command. So the program sets one
+function that adds them (`complete_by`). In programs other than ``mapfold`` nothing is added, and
+LOG stands for the log.
 """
 
 import re
-from collections.abc import Collection, Iterable, Sequence
+import shlex
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final
 
 
@@ -78,3 +85,32 @@ def _escaped(match: re.Match[str]) -> str:
 
 def _escaped_in_json(match: re.Match[str]) -> str:
     return f"\\u{ord(match[0]):04x}"
+
+
+Complete = Callable[[Sequence[str], Collection[str]], Sequence[str]]
+"""Receives the words of a command line and the options not to be added; returns the words to
+append."""
+
+
+class _Completion:
+    """The function that completes command lines; None adds nothing."""
+
+    by: Complete | None = None
+
+
+def complete_by(complete: Complete | None) -> None:
+    """Set the function by which `advised` completes command lines; None adds nothing."""
+    _Completion.by = complete
+
+
+def advised(*words: object, without: Collection[str] = ()) -> str:
+    """``mapfold WORDS…``, quoted for a shell, with those options of the running command that this
+    one takes too (log, settings, databases), except the options ``without``."""
+    given = [str(word) for word in words]
+    added = () if _Completion.by is None else _Completion.by(given, without)
+    return command_line(*given, *added)
+
+
+def command_line(*words: object) -> str:
+    """``mapfold WORDS…``, quoted for a shell, with nothing added."""
+    return shlex.join(["mapfold", *map(str, words)])

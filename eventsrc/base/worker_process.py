@@ -145,13 +145,6 @@ def unnamed_memory(size: int) -> Iterator[int]:
         yield file.fileno()
 
 
-def usable_processors() -> int:
-    """The processors that this process may run on, which may be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 class Called(NamedTuple, Generic[T]):
     """The outcome of a call, by its number from 0: its result, or the error that it raised, which
     is a ProcessGone where each of its processes died. ``attempts`` counts these."""

@@ -1,7 +1,7 @@
 """Occupancy maps from nav_msgs/OccupancyGrid messages, as JSON or in CDR.
 
-CDR is read by `eventsrc.envelope.cdr_grids`. The JSON has the fields of the ROS message: ``info``
-with
+CDR is how bridges send the message and bags hold it; docs/decisions/map-messages.md says why this
+one has a reader of its own. The JSON has the fields of the ROS message: ``info`` with
 ``resolution``, ``width``, ``height`` and ``origin`` (``position`` and the quaternion
 ``orientation``), and ``data``, row by row from the origin: -1 for unknown, else 0 to 100.
 ``header`` is optional, and so is ``floor``, which ROS does not have: the floor that the map shows,
@@ -10,15 +10,70 @@ as in envelopes.
 
 import math
 import re
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.base.text import visible
 
-from .cdr_grids import decode_cdr_grid, is_cdr
+from .cdr import CdrFault, CdrFields, is_cdr
 from .occupancy_map import UNKNOWN, InvalidMap, OccupancyMap, check_size
+
+__all__ = ["GRID_SCHEMA", "CdrGrid", "decode_cdr_grid", "is_cdr"]
+
+GRID_SCHEMA: Final = "nav_msgs/msg/OccupancyGrid"
+"""The name of its schema in an MCAP file."""
+
+
+class CdrGrid(NamedTuple):
+    """The fields that a map is made of. ``resolution`` is in metres; ``data`` is row by row from
+    the origin: -1 for unknown, else 0 to 100."""
+
+    resolution: float
+    width: int
+    height: int
+    position: tuple[float, float]
+    orientation: tuple[float, float, float, float]
+    data: NDArray[np.int8]
+
+
+def decode_cdr_grid(payload: bytes) -> CdrGrid:
+    """The grid of a payload that `is_cdr`. Raises InvalidMap, which names the field."""
+    try:
+        return _decode(CdrFields(payload))
+    except CdrFault as fault:
+        raise InvalidMap(f"{_NOT_ONE}: {fault}") from None
+
+
+def _decode(fields: CdrFields) -> CdrGrid:
+    fields.numbers("iI", "header.stamp")
+    fields.text("header.frame_id")
+    fields.numbers("iI", "info.map_load_time")
+    (resolution,) = fields.numbers("f", "info.resolution")
+    width, height = fields.numbers("II", "info.width and info.height")
+    x, y, _ = fields.numbers("ddd", "info.origin.position")
+    qx, qy, qz, qw = fields.numbers("dddd", "info.origin.orientation")
+    check_size(width, height)
+    (count,) = fields.numbers("I", "the length of data")
+    if count != width * height:
+        raise InvalidMap(
+            f"data: {count:,} values, where {width:,} × {height:,} cells take {width * height:,}"
+        )
+    data = np.frombuffer(fields.last(count, "data"), np.int8)
+    wrong = np.flatnonzero((data < -1) | (data > 100))
+    if len(wrong):
+        raise InvalidMap(
+            f"data: value {data[wrong[0]]} at index {wrong[0]:,}; -1 is unknown, else 0 to 100"
+        )
+    # The shortest decimal that names the float32, such as the 0.05 of a map server's settings.
+    shortest = float(str(np.float32(resolution)))
+    return CdrGrid(shortest, width, height, (x, y), (qx, qy, qz, qw), data)
+
+
+_NOT_ONE: Final = "neither JSON nor nav_msgs/OccupancyGrid in CDR"
+
 
 _MARKS = (b'"info"', b'"resolution"', b'"data"')
 _MOST_BYTES_A_CELL = 8

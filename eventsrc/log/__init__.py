@@ -7,17 +7,18 @@ names is.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .cache_folders import (
+from .active_segment import SegmentFault
+from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
+from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
+from .log_identity import (
     cache_folder,
     cache_sizes,
     delete_left_over_files,
     make_cache_folder,
+    same_but_sealed,
+    segment_signatures,
     write_cache_file,
 )
-from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
-from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
-from .file_fault import FileFault
-from .log_identity import same_but_sealed, segment_signatures
 from .reader import LogReader
 from .segment import Unreadable
 
@@ -33,7 +34,6 @@ __all__ = [
     "GROUP_COMMIT",
     "NEVER",
     "Event",
-    "FileFault",
     "Finding",
     "FsyncPolicy",
     "LogReader",
@@ -42,6 +42,7 @@ __all__ = [
     "NewEvent",
     "RecoveryReport",
     "Sealing",
+    "SegmentFault",
     "SegmentRecovery",
     "Unreadable",
     "VerbatimEvent",

@@ -14,32 +14,122 @@ Events in a file that somebody has deleted, renamed, replaced or cut short must 
 recorded. So each commit checks before its write and again after its sync that the file under the
 segment's name is the open one and as long as what was written to it. If not, a new file begins at
 the first offset of the group, and recording goes on there; no offset is used twice. The old file is
-reported as a `FileFault`.
+reported as a `SegmentFault`. Bytes overwritten in place are not noticed; the checksums find them on
+reading.
 """
 
 import errno
 import os
 import secrets
+import stat
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from eventsrc.base.clock import Clock, system_clock
 from eventsrc.base.errors import LogError
+from eventsrc.base.machine import Clock, system_clock
 from eventsrc.envelope.model import Offset
 
 from .durable_files import FsyncPolicy, replace_durably, sync_file, write_all
 from .event import NewEvent
-from .file_fault import (
-    FileFault,
-    Identity,
-    Problem,
-    find_problem,
-    identity_of,
-    is_readable_segment,
-    quarantine,
+from .format import (
+    ACTIVE,
+    BEGUN,
+    DAMAGED,
+    IMPORTED,
+    MARK_SEED,
+    NEW,
+    file_head,
+    free_name,
+    head_metadata,
+    segment_path,
 )
-from .format import ACTIVE, BEGUN, IMPORTED, MARK_SEED, NEW, file_head, head_metadata, segment_path
 from .group import Group, GroupBuilder
+
+
+class Identity(NamedTuple):
+    """Identifies a file or folder."""
+
+    device: int
+    inode: int
+
+
+class Problem(NamedTuple):
+    """The fault of a file; ``whole`` if everything written to it is still in its place and
+    other bytes follow."""
+
+    text: str
+    whole: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentFault:
+    """The file at ``path``, which its writer gave up to go on in a new one.
+
+    Offsets ``base`` to before ``following`` had been recorded in it; the new file begins at
+    ``following``. ``lost`` if they can no longer be relied on.
+    """
+
+    path: Path
+    base: Offset
+    following: Offset
+    found: str
+    lost: bool
+
+    @property
+    def lost_events(self) -> int:
+        """How many recorded events are lost at most; some may still be readable."""
+        return self.following - self.base if self.lost else 0
+
+    def __str__(self) -> str:
+        if not self.lost_events:
+            return f"{self.path} {self.found}; no recorded event of it is lost"
+        return (
+            f"{self.path} {self.found}: offsets {self.base} to {self.following - 1}, which had "
+            "been recorded in it, are lost"
+        )
+
+
+def identity_of(path: Path) -> Identity:
+    """Device and inode of a file or folder. Raises OSError."""
+    status = path.stat()
+    return Identity(status.st_dev, status.st_ino)
+
+
+def find_problem(fd: int, path: Path, size: int) -> Problem | None:
+    """The problem of the open file ``fd``, which should be at ``path`` and ``size`` bytes long;
+    None if there is none. Raises OSError."""
+    ours = os.fstat(fd)
+    try:
+        named = identity_of(path)
+    except FileNotFoundError:
+        if ours.st_nlink == 0:
+            return Problem("was deleted")
+        return Problem("was renamed or moved away (put it back when the recording has ended)")
+    if named != Identity(ours.st_dev, ours.st_ino):
+        return Problem("was replaced by another file")
+    if ours.st_size < size:
+        return Problem(f"was cut short to {ours.st_size:,} of {size:,} bytes")
+    if ours.st_size > size:
+        more = ours.st_size - size
+        return Problem(f"has {more:,} bytes at its end that another program wrote", whole=True)
+    return None
+
+
+def quarantine(path: Path) -> None:
+    """Rename the file at ``path``, if there is one, to ``….damaged``, as recovery does."""
+    if path.exists():
+        path.rename(free_name(path, DAMAGED))
+
+
+def is_readable_segment(path: Path, head_size: int) -> bool:
+    """Whether the file at ``path`` is long enough to hold readable events."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return False
+    return stat.S_ISREG(status.st_mode) and status.st_size > head_size
 
 
 class ActiveSegment:
@@ -55,7 +145,7 @@ class ActiveSegment:
         log_id: str,
         base: Offset,
         policy: FsyncPolicy,
-        on_fault: Callable[[FileFault], None] = lambda _: None,
+        on_fault: Callable[[SegmentFault], None] = lambda _: None,
         while_syncing: Callable[[Callable[[], None]], None] = lambda sync: sync(),
         clock: Clock = system_clock,
         *,
@@ -190,7 +280,7 @@ class ActiveSegment:
     def _begin_new_file(self, first: Offset, problem: Problem) -> None:
         """Go on in a new file whose first offset is ``first``. Raises LogError if that cannot be
         made."""
-        fault = FileFault(self.path, self.base, first, problem.text, not problem.whole)
+        fault = SegmentFault(self.path, self.base, first, problem.text, not problem.whole)
         try:
             if self._folder != identity_of(self._log):
                 raise self.disable(

@@ -15,7 +15,7 @@ from typing import BinaryIO, Final, NamedTuple, Protocol, cast
 import zstandard
 from lz4.frame import LZ4FrameDecompressor, LZ4FrameFile
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 
 from . import mcap_records as _mcap

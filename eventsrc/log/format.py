@@ -26,8 +26,8 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.base.text import advised
 from eventsrc.envelope.commands import COMMAND
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.readers import EnvelopeModel

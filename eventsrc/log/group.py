@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap

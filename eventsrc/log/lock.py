@@ -18,8 +18,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from eventsrc.base.clock import Clock
 from eventsrc.base.errors import LogBusy, LogError
+from eventsrc.base.machine import Clock
 
 from .format import LOCK
 

@@ -1,4 +1,4 @@
-"""Check that the segments of a log belong together, and whether they are still the same.
+"""Which log segments are of, whether they are still the same, and where what is folded is kept.
 
 Log id: a segment copied from another log has a valid name and valid checksums. A reader stops at it
 and a writer does not start. Recovery keeps those of one log, chosen by `own_log_id`, and sets the
@@ -8,17 +8,22 @@ Signatures: what is folded from a log (its gap ledger, snapshots of the map) is 
 signatures of the segments it was folded from, and used only while these are the same. A growing
 segment may be sealed and new ones may be added behind; any other change means that events were lost
 (deletion, recovery, a power cut before a sync, a log put back from a copy and recorded on).
+
+Caches: the folder ``<log>.history`` beside a log is not part of it and safe to delete at any time.
+It holds the log's data, so its permissions are at most those of the log.
 """
 
 import contextlib
 import os
+import threading
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.machine import system_clock
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from .format import BEGUN, HEAD_BYTES, SegmentPath, WrongPlace, head_of, list_growing, read_head
@@ -122,3 +127,63 @@ def _signature(segment: SegmentPath) -> str:
             end = os.pread(file.fileno(), _FOOTER_BYTES, max(0, size - _FOOTER_BYTES))
             about += f"{_SEALED}{size} {end.hex()}"
     return f"{about}{_BEGUN}{head[BEGUN]}" if BEGUN in head else about
+
+
+_OWNER: Final = 0o700
+_OTHERS: Final = 0o077
+_UNFINISHED: Final = ".new"
+_LEFT_OVER_S: Final = 3_600.0
+
+
+def cache_folder(log: Path) -> Path:
+    """The path of the folder, which may not exist. For a log given as ``.`` or ``..`` it is
+    beside the folder that these name."""
+    named = log.resolve() if log.name in ("", "..") else log
+    return named.parent / f"{named.name}.history"
+
+
+def make_cache_folder(log: Path) -> Path:
+    """Create `cache_folder` if it does not exist, with no more permissions for group and others
+    than the log has; return its path. Raises OSError."""
+    folder = cache_folder(log)
+    folder.mkdir(mode=_OWNER | (log.stat().st_mode & _OTHERS), exist_ok=True)
+    return folder
+
+
+def write_cache_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file under another name and rename it, so that other threads and processes see all
+    of it or nothing. Raises OSError and what ``write`` raises; then nothing is left behind."""
+    beside = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}{_UNFINISHED}")
+    try:
+        beside.unlink(missing_ok=True)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        with os.fdopen(os.open(beside, flags, 0o644), "wb") as file:
+            write(file)
+        beside.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)
+        raise
+
+
+def delete_left_over_files(folder: Path) -> None:
+    """Delete what killed processes have left of `write_cache_file`. Raises OSError."""
+    for path in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another process did
+            age_s = system_clock() / 1e9 - path.lstat().st_mtime
+            if path.name.endswith(_UNFINISHED) and age_s > _LEFT_OVER_S:
+                path.unlink()
+
+
+def cache_sizes(log: Path) -> list[tuple[Path, int]]:
+    """The folder with the total size of its files in bytes, if it exists and can be read."""
+    folder = cache_folder(log)
+    with contextlib.suppress(OSError):
+        return [(folder, sum(map(_size, folder.iterdir())))]
+    return []
+
+
+def _size(path: Path) -> int:
+    with contextlib.suppress(FileNotFoundError):  # another process replaced it
+        return path.lstat().st_size
+    return 0

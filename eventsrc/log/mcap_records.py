@@ -40,7 +40,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
 MAGIC = b"\x89MCAP0\r\n"

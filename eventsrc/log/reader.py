@@ -15,18 +15,17 @@ from collections.abc import Callable, Collection, Generator, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
 from eventsrc.base.progress import report_progress
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
-from .active_file import ActiveFile
 from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from .log_identity import mixed_logs_message
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of
 from .sealed_segment import SealedFile
-from .segment import Unreadable, chunk_events
+from .segment import ActiveFile, Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
 _NO_END = Offset(sys.maxsize)

@@ -17,13 +17,12 @@ from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 
 from . import mcap_records as _mcap
-from .active_file import ActiveFile
 from .format import NO_SCHEMA, SegmentPath, is_verbatim, key_channel, schema_of
 from .mcap_records import Channel, Schema
 from .scan import read_body
 from .seal import SegmentPlan, seal
 from .sealed_segment import SealedFile
-from .segment import ChunkRef, Scan
+from .segment import ActiveFile, ChunkRef, Scan
 
 
 class EventTimes(NamedTuple):

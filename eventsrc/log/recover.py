@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from eventsrc.base.advised import advised
-from eventsrc.base.clock import system_clock
 from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.machine import system_clock
 from eventsrc.base.progress import reported
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .active_segment import ActiveSegment
@@ -42,8 +42,7 @@ from .mcap_records import MESSAGE_HEAD
 from .reader import segments_left
 from .rebuild_segment import adjacent_times, rebuild_segment, slice_scan
 from .rename_segments import Moved, quarantine, rename_segments
-from .scan import scan_active
-from .scan_sealed import scan_sealed
+from .scan import scan_active, scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of, write_sealed_end
 from .sealed_segment import check_sealed

@@ -24,9 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, NotALog
-from eventsrc.base.text import visible
+from eventsrc.base.text import advised, visible
 from eventsrc.envelope.model import Offset
 
 from .durable_files import sync_directory
@@ -48,8 +47,7 @@ from .format import (
     segment_path,
 )
 from .log_identity import CarriedId, own_log_id
-from .scan import scan_active
-from .scan_sealed import scan_sealed
+from .scan import scan_active, scan_sealed
 from .sealed_segment import check_sealed
 from .segment import Scan
 

@@ -20,12 +20,11 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, NotALog
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
-from .active_file import ActiveFile
 from .durable_files import sync_directory, sync_file, unlink_quietly, write_all
 from .format import (
     ACTIVE,
@@ -44,7 +43,7 @@ from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from .sealed_end import SealedEnd, note_sealed, sealed_end_of
 from .sealed_segment import SealedFile
-from .segment import Scan
+from .segment import ActiveFile, Scan
 
 
 @dataclass(slots=True)

@@ -25,8 +25,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
-from eventsrc.base.crc import crc32
 from eventsrc.base.errors import LogDamaged
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap

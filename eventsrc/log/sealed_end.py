@@ -16,8 +16,8 @@ import stat
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap

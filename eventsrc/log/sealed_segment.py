@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from eventsrc.base.advised import advised
-from eventsrc.base.crc import crc32
 from eventsrc.base.errors import LogDamaged
+from eventsrc.base.machine import crc32
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap

@@ -29,16 +29,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, MapfoldError
+from eventsrc.base.text import advised
 from eventsrc.base.worker_process import ProcessGone, WorkerProcess
 from eventsrc.envelope.model import Offset
 
-from .active_file import ActiveFile
 from .durable_files import replace_durably, sync_directory, unlink_quietly
 from .format import ACTIVE, SEALED, SEALING, head_of, origin_notes, segment_path
 from .seal import SegmentPlan, seal, write_sealed
 from .sealed_end import SealedEnd, note_sealed
+from .segment import ActiveFile
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection

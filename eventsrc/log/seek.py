@@ -24,9 +24,8 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel, ValidationError
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, whole_number
+from eventsrc.base.text import advised, counted, whole_number
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 
 from .event import Event

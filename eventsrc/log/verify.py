@@ -8,10 +8,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, LogError, NotALog
 from eventsrc.base.progress import report_progress
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .format import (
@@ -29,8 +28,7 @@ from .format import (
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
 from .reader import segments_left
-from .scan import scan_active, scanned_events
-from .scan_sealed import scan_sealed
+from .scan import scan_active, scan_sealed, scanned_events
 from .seal import NO_PREVIOUS, REPLACES
 from .sealed_end import InvalidSealedEnd, SealedEnd, read_sealed_end, sealed_end
 from .sealed_segment import check_sealed

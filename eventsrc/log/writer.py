@@ -17,17 +17,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from eventsrc.base.advised import advised
-from eventsrc.base.clock import Clock, system_clock
 from eventsrc.base.errors import LogError, MapfoldError, NotALog
-from eventsrc.base.text import visible
+from eventsrc.base.machine import Clock, system_clock
+from eventsrc.base.text import advised, visible
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import is_system_key
 
-from .active_segment import ActiveSegment
+from .active_segment import ActiveSegment, SegmentFault
 from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
 from .event import MessageFormat, NewEvent
-from .file_fault import FileFault
 from .format import LOCK, leftovers, list_segments
 from .lock import WriterLock
 from .mcap_records import MAX_EVENT_BYTES
@@ -92,7 +90,7 @@ class LogWriter:
         self._work: Callable[[], bool] | None = None
         self._work_thread: ThreadPoolExecutor | None = None
         self._closed = False
-        self._faults: list[FileFault] = []
+        self._faults: list[SegmentFault] = []
         try:
             self._open()
         except OSError as error:
@@ -153,7 +151,7 @@ class LogWriter:
             synced.set()
             working.result()
 
-    def _note_fault(self, fault: FileFault) -> None:
+    def _note_fault(self, fault: SegmentFault) -> None:
         if not fault.lost and fault.following > fault.base:
             self._sealer.submit(fault.base, fault.following)
         self._faults.append(fault)
@@ -169,7 +167,7 @@ class LogWriter:
         return self._active.committed
 
     @property
-    def faults(self) -> Sequence[FileFault]:
+    def faults(self) -> Sequence[SegmentFault]:
         """The files given up so far. A file is in the list before `durable_offset` passes the first
         event written behind it."""
         return self._faults

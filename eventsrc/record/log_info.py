@@ -12,19 +12,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged
+from eventsrc.base.text import advised
 from eventsrc.envelope.gaps import gap_of
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogReader
 from eventsrc.log import mcap_records as _mcap
-from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath, carries_envelopes
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile
-from eventsrc.log.segment import formats_of
+from eventsrc.log.segment import ActiveFile, formats_of
 
 from .gap_history import ledger_of, loss_of
 

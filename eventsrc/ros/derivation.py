@@ -35,8 +35,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
-from eventsrc.envelope.cdr_grids import GRID_SCHEMA
-from eventsrc.envelope.grid_messages import read_grid_message
+from eventsrc.envelope.grid_messages import GRID_SCHEMA, read_grid_message
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import MAP_KEY
 

@@ -4,9 +4,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import visible
+from eventsrc.base.text import advised, visible
 from eventsrc.envelope.commands import (
     Command,
     DifferentObjects,

@@ -4,8 +4,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader

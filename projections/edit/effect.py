@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.progress import working
-from eventsrc.base.text import counted, table, visible
+from eventsrc.base.text import advised, counted, table, visible
 from eventsrc.envelope.commands import (
     Command,
     CorrectPoses,

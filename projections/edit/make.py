@@ -12,9 +12,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ValidationError
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.commands import (
     Anchor,
     Command,

@@ -14,9 +14,8 @@ from math import sqrt
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogBusy, LogError, MapfoldError, TransportError
-from eventsrc.base.text import visible
+from eventsrc.base.text import advised, visible
 from eventsrc.envelope.commands import (
     Anchor,
     Command,

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.commands import (
     Anchor,
     Command,

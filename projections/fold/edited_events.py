@@ -15,8 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from eventsrc.base.advised import command_line
-from eventsrc.base.text import visible
+from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, Offset, RunId
 

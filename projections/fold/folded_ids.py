@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import (
     Detection,

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
-from eventsrc.base.garbage import gc_paused
-from eventsrc.base.worker_process import ProcessGone, Report, call_in_processes, usable_processors
+from eventsrc.base.machine import gc_paused, usable_processors
+from eventsrc.base.worker_process import ProcessGone, Report, call_in_processes
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint

@@ -4,8 +4,7 @@ the space that the settings name."""
 from collections.abc import Mapping
 from typing import Final
 
-from eventsrc.base.advised import advised
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from projections.fold.settings import Settings
 
 from .view import MapView

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap

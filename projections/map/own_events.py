@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.base.advised import advised
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
+from eventsrc.base.text import advised
 from eventsrc.envelope.commands import (
     InvalidCommand,
     Reembed,

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from projections.fold import deltas
 from projections.fold.corrections import NO_CORRECTIONS, Corrections

@@ -8,7 +8,7 @@ from typing import Final
 import psycopg
 from psycopg import sql
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
 from projections.fold.errors import CheckpointMoved, DatabaseError, ProjectionBusy

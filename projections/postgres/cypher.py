@@ -27,7 +27,7 @@ from typing import Final
 import psycopg
 from psycopg import sql
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import ExtensionMissing
 
 from .connection import Connection, connect, describe_connection, extension_version

@@ -26,7 +26,7 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import EmbeddedServerError
 
 from .server_user import (

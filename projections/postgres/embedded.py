@@ -23,7 +23,7 @@ from urllib.parse import quote
 import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import EmbeddedServerError
 
 from .data_folder import LOG_NAME, SUPERUSER, Cluster

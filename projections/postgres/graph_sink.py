@@ -15,7 +15,7 @@ from typing import Final
 
 from psycopg import sql
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import DatabaseError, ProjectionMismatch
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView

@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from eventsrc.envelope.grey_images import BadImage, decode_grey_png, encode_png
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 from pydantic import ValidationError
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader, event_hash
 from projections.fold.errors import ProjectionMismatch, ProjectionMissing

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import FIRST_OFFSET, Offset

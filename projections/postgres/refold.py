@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Final, Self
 
-from eventsrc.base.advised import advised
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.errors import DatabaseError, ImpossibleCommand

@@ -23,8 +23,7 @@ import psycopg
 from psycopg import sql
 from psycopg.rows import TupleRow
 
-from eventsrc.base.advised import advised
-from eventsrc.base.text import counted
+from eventsrc.base.text import advised, counted
 from projections.fold.errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView

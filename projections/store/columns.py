@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import inspect
 from numpy.typing import NDArray
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 from projections.fold import deltas
 

@@ -17,9 +17,8 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.base.crc import crc32
 from eventsrc.base.errors import LogError
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import crc32, gc_paused
 from eventsrc.envelope.commands import NamePlace
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset

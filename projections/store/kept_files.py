@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 from projections.fold import State
 

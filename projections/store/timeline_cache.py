@@ -25,8 +25,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
-from eventsrc.base.clock import system_clock
 from eventsrc.base.errors import LogError
+from eventsrc.base.machine import system_clock
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import (
     LogReader,

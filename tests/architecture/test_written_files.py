@@ -1,4 +1,4 @@
-"""Files for users are written by `eventsrc.base.output_files` alone."""
+"""Files for users are written by `eventsrc.base.user_files` alone."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 OWN_WAY = {
     "eventsrc/envelope/grey_images.py": "into memory",
-    "eventsrc/log/cache_folders.py": "caches, renamed when they are whole",
+    "eventsrc/log/log_identity.py": "caches, renamed when they are whole",
     "eventsrc/log/durable_files.py": "copies of a log's own files",
     "eventsrc/record/importers/bag_files.py": "a bag, unpacked into a temporary folder",
     "projections/adapters/rerun/recording.py": "into a pipe",

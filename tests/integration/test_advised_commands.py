@@ -13,7 +13,7 @@ import pytest
 import typer
 from psycopg.conninfo import conninfo_to_dict
 
-from eventsrc.base.advised import advised, complete_by
+from eventsrc.base.text import advised, complete_by
 from eventsrc.log import LogWriter
 from projections.postgres.connection import Targets, check_url, url_without_secrets
 from projections.surfaces.cli import COMMANDS, command_line

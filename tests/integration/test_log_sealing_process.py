@@ -11,10 +11,10 @@ import pytest
 from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.model import Offset
 from eventsrc.log import ALWAYS, LogWriter, sealer, verify_log
-from eventsrc.log.active_file import ActiveFile
 from eventsrc.log.mcap_records import MARK_BYTES
 from eventsrc.log.seal import NO_PREVIOUS, SegmentPlan, seal, write_sealed
 from eventsrc.log.sealer import ProcessGone, SealingProcess
+from eventsrc.log.segment import ActiveFile
 from tests.support import prefork
 from tests.support.fixtures_log import KEY, read_log
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.base.clock import system_clock
 from eventsrc.base.errors import LogDamaged, LogError, MisuseError
+from eventsrc.base.machine import system_clock
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, Loss, RejectedPayload
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.append import append_payload

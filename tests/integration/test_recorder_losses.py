@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from eventsrc.base.clock import system_clock
+from eventsrc.base.machine import system_clock
 from eventsrc.envelope.gaps import DEFAULT_SETTLE_NS, Gap
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import FsyncPolicy, LogReader, LogWriter

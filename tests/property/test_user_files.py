@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from eventsrc.adapters.detector.vision_models import read_preparation
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.base.label_files import read_label_file
-from eventsrc.base.user_files import MAX_DEPTH, FileFault, parse_json, read_file
+from eventsrc.base.user_files import MAX_DEPTH, FileFault, parse_json, read_file, read_label_file
 from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.record.importers.map_yaml import read_map_yaml
 from projections.adapters.fleet.sites import find_sites

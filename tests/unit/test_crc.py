@@ -7,7 +7,7 @@ import zlib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.base.crc import crc32
+from eventsrc.base.machine import crc32
 
 
 @given(st.binary(max_size=40_000), st.integers(0, 2**32 - 1))
@@ -27,7 +27,7 @@ def test_pieces_give_the_crc_of_the_whole(pieces: list[bytes]) -> None:
 def test_zlib_computes_it_where_isal_is_not_installed() -> None:
     code = (
         "import sys, zlib; sys.modules['isal'] = None\n"
-        "from eventsrc.base.crc import crc32\n"
+        "from eventsrc.base.machine import crc32\n"
         "sys.exit(0 if crc32 is zlib.crc32 else 1)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

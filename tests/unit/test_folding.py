@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import Event
 from projections.fold.deltas import KeyframeAdded

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.commands import CorrectedPose, CorrectPoses, encode_command
 from eventsrc.envelope.model import KeyframeId, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.label_files import read_label_file
+from eventsrc.base.user_files import read_label_file
 from projections.surfaces.cli.bag_text import labels_by_number
 
 

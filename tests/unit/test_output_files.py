@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.base.output_files import write_files, written_whole
+from eventsrc.base.user_files import write_files, written_whole
 
 LIMITED = """
 import resource, sys
 from pathlib import Path
 from eventsrc.base.errors import MapfoldError
-from eventsrc.base.output_files import write_files
+from eventsrc.base.user_files import write_files
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 folder = Path(sys.argv[1])
@@ -27,7 +27,7 @@ except MapfoldError as error:
 KILLED = """
 import os, sys
 from pathlib import Path
-from eventsrc.base.output_files import written_whole
+from eventsrc.base.user_files import written_whole
 
 with written_whole(Path(sys.argv[1])) as file:
     file.write(b"half of it")

@@ -125,7 +125,7 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
 _IN_A_FILE = """
 import os, signal, sys
 from pathlib import Path
-from eventsrc.base.output_files import written_whole
+from eventsrc.base.user_files import written_whole
 from projections.surfaces.cli.program import run_app
 
 def command():

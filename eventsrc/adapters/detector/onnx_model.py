@@ -10,8 +10,8 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.base.advised import command_line
 from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.base.text import command_line
 
 Device: TypeAlias = Literal["cpu", "cuda"]
 Array: TypeAlias = NDArray[np.floating[Any]]

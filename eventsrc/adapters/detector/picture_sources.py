@@ -25,8 +25,8 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from eventsrc.base.clock import Clock, system_clock
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.machine import Clock, system_clock
 from eventsrc.base.text import visible
 from eventsrc.base.user_files import FileFault, open_file
 from eventsrc.envelope.cdr import CdrFault, CdrFields, is_cdr

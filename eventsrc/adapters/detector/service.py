@@ -12,8 +12,8 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, TransportError
-from eventsrc.base.output_files import written_whole
 from eventsrc.base.text import counted
+from eventsrc.base.user_files import written_whole
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.label_files import read_label_file
 from eventsrc.base.text import visible
-from eventsrc.base.user_files import FileFault, read_file
+from eventsrc.base.user_files import FileFault, read_file, read_label_file
 from eventsrc.envelope.model import MAX_DIMENSION, Text
 
 from .heads import HEADS, Boxes, HeadError, suppress

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.adapters.detector.vision import encode_jpeg
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.output_files import write_files, written_whole
 from eventsrc.base.progress import reported
+from eventsrc.base.text import advised
+from eventsrc.base.user_files import write_files, written_whole
 from eventsrc.envelope.model import RunId
 from eventsrc.record.transport.session import Session
 

@@ -20,10 +20,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError, TransportError
-from eventsrc.base.output_files import write_files
 from eventsrc.base.progress import reported
+from eventsrc.base.text import advised
+from eventsrc.base.user_files import write_files
 from eventsrc.envelope.model import KeyframeId, RunId, default_det_id
 from eventsrc.record.transport.session import Publisher, Session
 

@@ -10,7 +10,7 @@ from typing import BinaryIO, Final
 from pydantic_core import from_json
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.envelope.cdr_grids import GRID_SCHEMA
+from eventsrc.envelope.grid_messages import GRID_SCHEMA
 from eventsrc.envelope.model import RunId
 from eventsrc.envelope.system_events import Excerpt
 from eventsrc.log import LogReader, MessageFormat, VerbatimEvent

@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import zenoh
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import TransportError
+from eventsrc.base.text import advised
 
 from .config import DEFAULT_ENDPOINT
 

@@ -19,7 +19,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.output_files import write_files
+from eventsrc.base.user_files import write_files
 from projections.map.view import MapView
 
 from .labels import Extent

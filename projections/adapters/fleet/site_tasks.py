@@ -11,8 +11,8 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal, TypeAlias
 
-from eventsrc.base.advised import complete_by
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.text import complete_by
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, Verification, verify_log
 from eventsrc.record.log_info import LogInfo, log_info

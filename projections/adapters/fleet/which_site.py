@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.text import advised
 from eventsrc.log.reader import segments_of
 from projections.fold.exact import exp
 from projections.fold.settings import Camera

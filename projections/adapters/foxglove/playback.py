@@ -27,7 +27,7 @@ from foxglove.websocket import (
     WebSocketServer,
 )
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections

@@ -8,7 +8,7 @@ from typing import Any
 from foxglove import Context, open_mcap
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.base.output_files import OutputFile, written_whole
+from eventsrc.base.user_files import OutputFile, written_whole
 from projections.fold.deltas import KeyframeAdded, MapGiven
 from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold

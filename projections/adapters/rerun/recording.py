@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from rerun import blueprint
 
 from eventsrc.base.errors import MapfoldError
-from eventsrc.base.output_files import OutputFile, written_whole
 from eventsrc.base.text import visible
+from eventsrc.base.user_files import OutputFile, written_whole
 from eventsrc.log import Event
 from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold

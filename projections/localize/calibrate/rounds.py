@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Envelope, Offset
 from eventsrc.log import LogReader

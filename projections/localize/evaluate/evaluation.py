@@ -13,7 +13,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from eventsrc.base.output_files import write_files
+from eventsrc.base.user_files import write_files
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from projections.fold.corrections import Corrections

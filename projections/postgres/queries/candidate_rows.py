@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, Self, TypeAlias
 
 from pydantic import ValidationError
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.fold.errors import (

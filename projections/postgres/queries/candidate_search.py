@@ -19,7 +19,7 @@ import psycopg
 from pgvector.psycopg import register_vector
 from psycopg import sql
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import (
     DatabaseError,
     ExtensionMissing,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import psycopg
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import ProjectionMissing, QuestionError
 from projections.map.view import MapView
 from projections.postgres.connection import Connection, database_errors, describe_connection

@@ -6,7 +6,7 @@ A `MapSource` has the data they need: `LiveMap` in the graph's database, `Folded
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.errors import QuestionError
 from projections.fold.place_types import type_of_name

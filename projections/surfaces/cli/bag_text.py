@@ -10,8 +10,8 @@ from typing import Annotated, Final
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.label_files import read_label_file
 from eventsrc.base.text import counted, visible
+from eventsrc.base.user_files import read_label_file
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts

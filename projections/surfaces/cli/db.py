@@ -6,8 +6,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from eventsrc.base.advised import advised
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.record.log_info import LogInfo, log_info
 from projections.postgres import rebuild
 from projections.postgres.check import CheckReport

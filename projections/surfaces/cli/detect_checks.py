@@ -14,8 +14,8 @@ from typing import Final
 from eventsrc.adapters.detector.keyframes import AFTER_S, GateLimits
 from eventsrc.adapters.detector.onnx_model import Device
 from eventsrc.adapters.detector.picture_sources import Timing
-from eventsrc.base.clock import system_clock
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.machine import system_clock
 from eventsrc.base.text import visible
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, RunId
 from eventsrc.record.transport.session import check_keys

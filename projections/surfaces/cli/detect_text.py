@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from eventsrc.adapters.detector.picture_sources import LivePictures
 from eventsrc.adapters.detector.poses import NEAR_S
 from eventsrc.adapters.detector.service import DetectionRun, Report
-from eventsrc.base.advised import advised
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 
 from .terminal import people, say_metrics
 

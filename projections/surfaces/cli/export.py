@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.output_files import write_files
 from eventsrc.base.text import counted
+from eventsrc.base.user_files import write_files
 from eventsrc.record.transport.config import is_loopback
 from projections.fold.corrections import map_fingerprint
 from projections.map.one_floor import view_of_floor

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.machine import usable_processors
 from eventsrc.base.text import counted, visible
-from eventsrc.base.worker_process import usable_processors
 from projections.adapters.fleet.engines import Ended
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from eventsrc.base.errors import LogError, MisuseError
+from eventsrc.base.machine import usable_processors
 from eventsrc.base.text import counted
-from eventsrc.base.worker_process import usable_processors
 from eventsrc.log import LogReader
 from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Task
 from projections.adapters.fleet.site_databases import site_databases

@@ -13,8 +13,8 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import advised
 from eventsrc.base.user_files import FileFault
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader

@@ -7,9 +7,8 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogDamaged, MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter

@@ -10,7 +10,7 @@ from typing import Any, Final
 import typer
 from typer.core import TyperCommand
 
-from eventsrc.base.advised import complete_by
+from eventsrc.base.text import complete_by
 
 _CARRIED: Final = (
     "--settings",

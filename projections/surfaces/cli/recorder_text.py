@@ -12,9 +12,8 @@ from typing import Any, Self
 from rich.live import Live
 from rich.text import Text
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import LogError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogWriter
 from eventsrc.record.recorder.recorder import Recorder

@@ -15,8 +15,7 @@ from eventsrc.adapters.detector.picture import PictureError, Pixels
 from eventsrc.adapters.detector.vision import check_installed, decode
 from eventsrc.adapters.detector.vision_models import Encoder, read_preparation
 from eventsrc.adapters.reembedding import DEFAULT_BATCH, DEFAULT_TOPIC, Reembedding, Vector, reembed
-from eventsrc.base.advised import advised
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.base.user_files import open_file
 from eventsrc.envelope.system_events import MAX_REEMBEDDED
 

@@ -5,9 +5,8 @@ from typing import Annotated, Final
 
 import typer
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.record.robot.spool import Refused, Spool
 
 from .detect_checks import spool_path

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
 from projections.history.condition_functions import functions_help

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from eventsrc.adapters.sim import SimulatedRun
-from eventsrc.base.output_files import write_files
+from eventsrc.base.user_files import write_files
 from eventsrc.envelope.model import RunId
 from projections.adapters.drawing import LostRobot, Spot
 from projections.localize.relocalize import Answer, rank, read_question

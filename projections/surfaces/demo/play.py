@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from eventsrc.adapters.sim import DEFAULT_SEED, occupancy_map, simulate_run
-from eventsrc.base.advised import command_line
-from eventsrc.base.output_files import write_files
+from eventsrc.base.text import command_line
+from eventsrc.base.user_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections.adapters.drawing import draw_map, floor_of

@@ -17,8 +17,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from eventsrc.adapters.sim import SimulatedRun
-from eventsrc.base.advised import advised
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
 from eventsrc.log import LogReader
 from eventsrc.record.log_info import log_info

@@ -13,7 +13,7 @@ from typing import Final, Self, TypeVar
 
 from psycopg_pool import ConnectionPool, PoolTimeout
 
-from eventsrc.base.advised import advised
+from eventsrc.base.text import advised
 from projections.fold.errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.postgres import checkpoints

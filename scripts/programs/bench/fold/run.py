@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.core_index import CoreIndex

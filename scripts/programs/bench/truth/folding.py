@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 
-from eventsrc.base.garbage import gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import Delta
