@@ -15,7 +15,7 @@ without a traceback, and exits with ``exit_code``.
         └── SpoolError              1  a robot's spool cannot be used
             └── SpoolFull           1  it has no room for another envelope
 
-``projections.fold.errors`` adds the branch for databases and folds.
+``projections.fold.map_errors`` adds the branch for databases and folds.
 """
 
 

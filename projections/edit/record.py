@@ -36,7 +36,7 @@ from eventsrc.record.recorder.edits import NewerCommand, NoAnswer, send_command
 from eventsrc.record.transport.session import Session
 from projections.fold.corrections import Keyframe, RecordedCommand, check_settings
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.map.own_events import read_commands
 from projections.map.view import MapView
 

@@ -56,7 +56,7 @@ class CellLink(NamedTuple):
     neighbour: int
 
 
-class Refusal(NamedTuple):
+class RefusedLink(NamedTuple):
     """A link that was not followed, and the anchors on its two sides that are kept apart."""
 
     link: CellLink
@@ -74,7 +74,7 @@ class ConstrainedPlaces(Places):
         # while the places are the same.
         self._refused_links: set[tuple[int, int]] = set()
         # Of the event that is being folded:
-        self._refusals: list[Refusal] = []
+        self._refusals: list[RefusedLink] = []
         self._undecided: list[int] = []  # anchors that are not core and could join a place
 
     def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
@@ -198,7 +198,7 @@ class ConstrainedPlaces(Places):
                 if apart is None:
                     forest.unite(one, other)
                 else:
-                    self._refusals.append(Refusal(link, apart))
+                    self._refusals.append(RefusedLink(link, apart))
         return self._parts_of(forest, ranks, links, fresh)
 
     def _fresh_cells(self, fresh: list[int]) -> dict[int, Rank]:

@@ -20,8 +20,8 @@ from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, Offset, RunId
 
 from .corrections import Corrections, logged_pose
-from .errors import ImpossibleCommand
 from .exact import Units, cos_sin, unit_vectors
+from .map_errors import ImpossibleCommand
 from .pose_corrections import Pose
 from .settings import Settings
 from .sights import small_angle

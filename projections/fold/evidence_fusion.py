@@ -45,7 +45,7 @@ from .evidence_objects import EvidenceObjects, MovedObject, ObjectDelta
 from .exact import log
 from .pair_groups import PairGroups
 from .presence import Presence
-from .settings import Camera
+from .settings import CameraConstants
 from .sights import PoseError, Sighting
 
 _LEAST_NEW, _LEAST_RIVAL = 3, 2
@@ -232,7 +232,7 @@ class EvidenceFusion:
         run: RunOrdinal,
         timestamp: float,
         pose: Pose,
-        camera: Camera,
+        camera: CameraConstants,
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
     ) -> list[FusionDelta]:

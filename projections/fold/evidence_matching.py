@@ -19,7 +19,7 @@ from .looks import LookRatios, Looks, LookScale
 from .pair_groups import PairGroups
 from .sights import Sight, Sighting
 from .thing_index import ThingIndex
-from .things import LABEL_WEIGHT, LabelCounts, Thing
+from .things import LABEL_WEIGHT, FusedThing, LabelCounts
 
 Match: TypeAlias = tuple[float, ObjectOrdinal, float]
 """The evidence for an Object, its ordinal, and the cosine of the best pair of looks."""
@@ -244,7 +244,7 @@ class Matching:
     def _is_apart(
         self,
         groups: PairGroups[DetId],
-        thing: Thing,
+        thing: FusedThing,
         sighting: Sighting,
         object_of: Mapping[int, ObjectOrdinal],
     ) -> bool:

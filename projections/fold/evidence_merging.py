@@ -30,7 +30,7 @@ from .looks import LookRatios, LookScale
 from .pair_groups import PairGroups
 from .spots import COMMON_M2
 from .thing_index import ThingIndex
-from .things import INVERSE, LABEL_WEIGHT, RUN, SIDE_COS, SIDE_SIN, LabelCounts, Thing
+from .things import INVERSE, LABEL_WEIGHT, RUN, SIDE_COS, SIDE_SIN, FusedThing, LabelCounts
 
 _LOG_AREA = log(9.0) - 1.8378770664093453
 """log(9 m² / 2π)."""
@@ -49,7 +49,7 @@ class _Candidate(NamedTuple):
     estimates, and their squared distance in m²."""
 
     ordinal: ObjectOrdinal
-    thing: Thing
+    thing: FusedThing
     both: int
     geometry: float
     far2: float
@@ -107,7 +107,7 @@ class Merging:
                 best = value, partner, evidence
         return None if best is None else best[1:]
 
-    def _around(self, thing: Thing) -> list[ObjectOrdinal]:
+    def _around(self, thing: FusedThing) -> list[ObjectOrdinal]:
         """A superset of the Objects within reach that could pass the test of χ²."""
         x, y, xx, _, yy, *_ = thing.where()
         listed = self._index.listed(x, y)
@@ -119,7 +119,7 @@ class Merging:
         around: list[ObjectOrdinal] = listed[near].tolist()
         return around
 
-    def _looks(self, one: Thing, others: list[Thing]) -> list[float]:
+    def _looks(self, one: FusedThing, others: list[FusedThing]) -> list[float]:
         """The log-likelihood ratio that a thing and each of several others are one, by looks (the
         mean over pairs of exemplars) and labels. The others' exemplars are columns of one
         matrix."""
@@ -149,7 +149,7 @@ class Merging:
             first += count
         return values
 
-    def _by_labels(self, one: Thing, other: Thing) -> float:
+    def _by_labels(self, one: FusedThing, other: FusedThing) -> float:
         """The part of the labels in `_looks`."""
         labels = 0.0
         for label, count in other.classes.items():
@@ -157,7 +157,7 @@ class Merging:
         return LABEL_WEIGHT * labels / other.count
 
 
-def _geometry(thing: Thing, other: Thing) -> tuple[float, float]:
+def _geometry(thing: FusedThing, other: FusedThing) -> tuple[float, float]:
     """The log-likelihood ratio of two estimates being of one thing, and their squared distance in
     m²."""
     x, y, xx, xy, yy, *_ = thing.where()
@@ -178,7 +178,7 @@ _UNIT = 1 << 20
 
 
 def turned_looks(
-    one: Thing, others: Sequence[Thing], look_ratios: LookRatios, scale: LookScale
+    one: FusedThing, others: Sequence[FusedThing], look_ratios: LookRatios, scale: LookScale
 ) -> list[float]:
     """The logarithm of the ratio for a thing and each of several others of its class: their
     exemplars are columns of one matrix."""

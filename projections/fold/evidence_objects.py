@@ -53,11 +53,11 @@ from .exact import MAX_IN_A_SUM, Q40
 from .looks import LookRatios, LookScale, looks_of
 from .objects import object_id
 from .pair_groups import PairGroups
-from .settings import Camera
+from .settings import CameraConstants
 from .sights import PoseError, Sighting, Sights
 from .spots import Spots
 from .thing_index import ThingIndex
-from .things import LabelCounts, Thing
+from .things import FusedThing, LabelCounts
 
 ObjectDelta: TypeAlias = (
     ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
@@ -106,7 +106,7 @@ class EvidenceObjects:
         run: RunOrdinal,
         timestamp: float,
         pose: Pose,
-        camera: Camera,
+        camera: CameraConstants,
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
     ) -> list[ObjectDelta]:
@@ -271,7 +271,7 @@ class EvidenceObjects:
     ) -> tuple[ObjectOrdinal, ObjectFound]:
         """Found an Object."""
         label, times = sighting.class_name, (timestamp, timestamp)
-        thing = Thing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
+        thing = FusedThing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
         ordinal = self._index.add(thing)
         identity = object_id(sighting.det_id)
         return ordinal, ObjectFound(offset, ordinal, identity, label, sighting.observation)
@@ -307,7 +307,9 @@ class EvidenceObjects:
         )
 
 
-def _count(thing: Thing, ordinal: ObjectOrdinal, label: str, pose: Pose, timestamp: float) -> None:
+def _count(
+    thing: FusedThing, ordinal: ObjectOrdinal, label: str, pose: Pose, timestamp: float
+) -> None:
     """Add an observation to an Object's sums."""
     if thing.count >= MAX_IN_A_SUM:
         raise OverflowError(

@@ -159,10 +159,10 @@ class OccupancyGrid:
         self._x0, self._y0 = (metres_to_um(metres) for metres in source.origin[:2])
         cos, sin = cos_sin(source.origin[2])
         self._cos, self._sin = (round(math.ldexp(part, _TURN_BITS)) for part in (cos, sin))
-        occupied = _occupied(source)
+        walls = occupied(source)
         self.block, kept = wall_blocks(source)
         block_m = self.block * source.resolution
-        self.walls = occupied & _cells(kept, self.block, occupied.shape)
+        self.walls = walls & _cells(kept, self.block, walls.shape)
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
         inside = regions(kept, block_m)
         self._small = _small_regions(inside, self.block * self.side_um)
@@ -260,14 +260,14 @@ class OccupancyGrid:
 def wall_blocks(source: OccupancyMap) -> tuple[int, Walls]:
     """The number of cells in the side of a block, and the blocks of a map that have a wall."""
     side = _block_side(source)
-    blocks = _blocks(_occupied(source), side)
+    blocks = pooled(occupied(source), side)
     least = max(1, math.ceil(LEAST_WALL_M / (side * source.resolution)))
     return side, _without_small(blocks, least)
 
 
-def _occupied(source: OccupancyMap) -> Walls:
-    occupied: Walls = (source.cells >= MIN_WALL) & (source.cells <= OCCUPIED)
-    return occupied
+def occupied(source: OccupancyMap) -> Walls:
+    """The cells of a map that are wall, small ones too."""
+    return np.asarray((source.cells >= MIN_WALL) & (source.cells <= OCCUPIED))
 
 
 def _block_side(source: OccupancyMap) -> int:
@@ -278,13 +278,12 @@ def _block_side(source: OccupancyMap) -> int:
     return side
 
 
-def _blocks(walls: Walls, side: int) -> Walls:
-    """The blocks that have a wall cell."""
-    rows, columns = walls.shape
-    padded = np.pad(walls, ((0, -rows % side), (0, -columns % side)))
+def pooled(mask: Walls, side: int) -> Walls:
+    """A block for each square of ``side`` by ``side`` cells: true where any of them is."""
+    rows, columns = mask.shape
+    padded = np.pad(mask, ((0, -rows % side), (0, -columns % side)))
     by_block = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side)
-    blocks: Walls = np.asarray(by_block.any(axis=(1, 3)))
-    return blocks
+    return np.asarray(by_block.any(axis=(1, 3)))
 
 
 def _cells(blocks: Walls, side: int, shape: tuple[int, ...]) -> Walls:

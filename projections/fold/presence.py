@@ -41,7 +41,7 @@ from .deltas import (
     RunOrdinal,
 )
 from .exact import cos_sin
-from .settings import Camera
+from .settings import CameraConstants
 from .sights import half_field
 
 _CELL_UM = 750_000
@@ -116,7 +116,12 @@ class Presence:
         self._hits, self._misses = 0, 0
 
     def fold(
-        self, offset: Offset, run: RunOrdinal, pose: Pose, camera: Camera, fused: Iterable[Delta]
+        self,
+        offset: Offset,
+        run: RunOrdinal,
+        pose: Pose,
+        camera: CameraConstants,
+        fused: Iterable[Delta],
     ) -> list[ObjectMissing]:
         """Look for all Objects that this keyframe should see; ``fused`` are the deltas of fusion.
 
@@ -222,7 +227,7 @@ class Presence:
         del self.attendance[absorbed]
 
     def _look(
-        self, run: RunOrdinal, pose: Pose, camera: Camera, seen: Sequence[ObjectOrdinal]
+        self, run: RunOrdinal, pose: Pose, camera: CameraConstants, seen: Sequence[ObjectOrdinal]
     ) -> list[ObjectOrdinal]:
         """Count hits and misses; returns the Objects that became missing."""
         self.missed = []

@@ -26,14 +26,14 @@ from pydantic_core import ErrorDetails
 from eventsrc.base.user_files import FileFault, parse_json, read_file
 from eventsrc.envelope.model import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
 
-from .errors import SettingsError
 from .evidence import EvidenceConstants
+from .map_errors import SettingsError
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
 
 
-class Camera(BaseModel):
+class CameraConstants(BaseModel):
     """A level pinhole camera: horizontal field of view, picture size in pixels, and the angle from
     the robot's heading to where it looks, radians to the left."""
 
@@ -132,7 +132,7 @@ class Settings(BaseModel):
     fusion: Literal["page", "evidence"] = "page"
     """The rule that fuses observations into Objects: by ``fusion_radius_m`` and
     ``fusion_similarity``, or by the evidence of bearings and looks."""
-    camera: Camera = Camera()
+    camera: CameraConstants = CameraConstants()
     """The camera of envelopes that do not state theirs; for fusion by evidence."""
     evidence: EvidenceConstants = EvidenceConstants()
     """The constants of fusion by evidence."""

@@ -29,7 +29,7 @@ from .deltas import ObservationOrdinal, Pose
 from .evidence import EvidenceConstants
 from .exact import cos_sin, log, metres_to_um
 from .objects import FusibleObservation
-from .settings import Camera
+from .settings import CameraConstants
 
 _CUT_PX = 2.0
 _HALF_DEGREE = 0.008726646259971648
@@ -111,7 +111,7 @@ class Sights:
     def of(
         self,
         pose: Pose,
-        camera: Camera,
+        camera: CameraConstants,
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
     ) -> list[Sight]:
@@ -129,7 +129,7 @@ class Sights:
         cos: float,
         sin: float,
         focal: float,
-        camera: Camera,
+        camera: CameraConstants,
         sighting: Sighting,
         pose_error: PoseError | None,
     ) -> Sight:
@@ -210,12 +210,12 @@ _MANY_TURNS = 1e6
 _TURN = 2.0 * math.pi
 
 
-def camera_of(envelope: Envelope, otherwise: Camera) -> Camera:
+def camera_of(envelope: Envelope, otherwise: CameraConstants) -> CameraConstants:
     """The camera that an envelope states, else ``otherwise``."""
     stated = envelope.camera
     if stated is None:
         return otherwise
-    return Camera(
+    return CameraConstants(
         hfov_deg=stated.hfov_deg,
         width_px=stated.width_px,
         height_px=stated.height_px,

@@ -19,7 +19,7 @@ from .evidence import EvidenceConstants
 from .exact import exp
 from .looks import Floats
 from .spots import PART_SIZE, Estimate, Part, Solver, Spot, Spots
-from .things import ROW, Thing
+from .things import ROW, FusedThing
 
 _REACH_SPREADS, _REACH_MORE_M = 1.5, 1.5
 _UM, _UM2 = 1e6, 1e12
@@ -36,13 +36,13 @@ class ThingIndex:
         self.reach_m = constants.range_m * spreads + _REACH_MORE_M
         self._solver = Solver(constants.range_m, constants.range_spread)
         self._heights = ClassHeights(constants.sizes_m, constants.size_spread)
-        self._things: list[Thing | None] = []
+        self._things: list[FusedThing | None] = []
         self._survivors: dict[ObjectOrdinal, ObjectOrdinal] = {}
         self._near: dict[tuple[int, int], list[ObjectOrdinal]] = {}
         self._sorted: dict[tuple[int, int], NDArray[np.int64]] = {}  # `_near` as arrays
         self.estimates: Floats = np.zeros((64, _FIELDS))
 
-    def thing(self, ordinal: ObjectOrdinal) -> Thing:
+    def thing(self, ordinal: ObjectOrdinal) -> FusedThing:
         """An Object that is not absorbed."""
         thing = self._things[ordinal]
         if thing is None:
@@ -55,14 +55,14 @@ class ThingIndex:
             ordinal = self._survivors[ordinal]
         return ordinal
 
-    def add(self, thing: Thing) -> ObjectOrdinal:
+    def add(self, thing: FusedThing) -> ObjectOrdinal:
         """Enter a new Object; `solve` must follow."""
         ordinal = ObjectOrdinal(len(self._things))
         self._things.append(thing)
         self._make_room(len(self._things))
         return ordinal
 
-    def solve(self, ordinal: ObjectOrdinal, thing: Thing, spot: int | None = None) -> None:
+    def solve(self, ordinal: ObjectOrdinal, thing: FusedThing, spot: int | None = None) -> None:
         """Estimate an Object's position after one spot changed, or all (None), and list it
         there."""
         prior = self._heights.prior(thing.class_name)
@@ -142,7 +142,7 @@ class ThingIndex:
         while len(self.estimates) < count:
             self.estimates = np.concatenate([self.estimates, self.estimates * 0.0])
 
-    def _list(self, ordinal: ObjectOrdinal, thing: Thing, cell: tuple[int, int]) -> None:
+    def _list(self, ordinal: ObjectOrdinal, thing: FusedThing, cell: tuple[int, int]) -> None:
         thing.cell = cell
         for around in _around(cell):
             self._near.setdefault(around, []).append(ordinal)
@@ -194,7 +194,7 @@ class ThingIndex:
             count, x, y, checked, exemplars, spot_count = state["sums"][row]
             name, *classes = state["classes"][row]
             given = state["given"][row]
-            thing = Thing(
+            thing = FusedThing(
                 count,
                 x,
                 y,
@@ -232,7 +232,7 @@ class ThingIndex:
             self._list(ObjectOrdinal(ordinal), thing, cell)
 
 
-def _spots_and_parts(thing: Thing) -> Iterable[tuple[Spot, Part]]:
+def _spots_and_parts(thing: FusedThing) -> Iterable[tuple[Spot, Part]]:
     return zip(thing.spots.spots, thing.spots.parts, strict=True)
 
 

@@ -29,7 +29,7 @@ ROW: Final = 5
 
 
 @dataclass(slots=True, eq=False)
-class Thing:
+class FusedThing:
     """``classes`` counts observations by class, the class seen first being first. ``marks`` are the
     exemplars, the oldest first; their looks are the first rows of ``looks``. ``met`` counts the
     pictures that show another thing too. ``checked`` is at how many observations the next search
@@ -96,7 +96,7 @@ class Thing:
         """Set the class to that of most observations; of several the one seen first."""
         self.class_name = max(self.classes, key=self.classes.__getitem__)
 
-    def absorb(self, other: "Thing") -> None:
+    def absorb(self, other: "FusedThing") -> None:
         """Add all observations, spots and exemplars of another thing."""
         self.count += other.count
         self.sum_x_um += other.sum_x_um
@@ -139,7 +139,7 @@ class LabelCounts:
             self._counts[label] = self._counts.get(label, 0) + 1
             self._total += 1
 
-    def ratio(self, thing: Thing, label: str, usual: float) -> float:
+    def ratio(self, thing: FusedThing, label: str, usual: float) -> float:
         """The logarithm of the label's probability for the thing, over its ``usual`` one."""
         own = (thing.classes.get(label, 0) + _DOUBT * usual) / (thing.count + _DOUBT)
         return log_of(own / usual)

@@ -15,7 +15,7 @@ from eventsrc.envelope.model import Offset, RunId
 from projections.fold.corrections import RecordedCommand
 from projections.map.digest import map_digest
 from projections.map.phrases import command_document
-from projections.map.records import Estimate, KeyframeRecord, Relocation
+from projections.map.records import EstimatedPosition, KeyframeRecord, Relocation
 from projections.map.view import MapView
 from projections.store.history_records import Cause
 
@@ -44,7 +44,7 @@ class ObjectRow:
     first_seen: float
     last_seen: float
     det_ids: tuple[str, ...]
-    estimate: Estimate | None = None
+    estimate: EstimatedPosition | None = None
     missing: bool = False
     relocations: tuple[Relocation, ...] = ()
 

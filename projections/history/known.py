@@ -14,7 +14,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
-from projections.fold.errors import FoldError, LogPointError
+from projections.fold.map_errors import FoldError, LogPointError
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent, fold_events
 from projections.map.own_events import new_map

@@ -13,7 +13,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectMissing, ObjectSeen, ObservationOrdinal, PlaceOrdinal
 from projections.fold.exact import Q40, UM_PER_M
-from projections.map.records import Estimate, ObjectRecord, ObservationRecord
+from projections.map.records import EstimatedPosition, ObjectRecord, ObservationRecord
 from projections.store.history import History
 from projections.store.history_records import ObjectHistory, ObjectMerge, count_before
 
@@ -181,7 +181,7 @@ def _evidence_facts(now: ObjectRecord, votes: Counter[str]) -> dict[str, Any]:
     }
 
 
-def _estimate_document(at: Estimate) -> dict[str, Any]:
+def _estimate_document(at: EstimatedPosition) -> dict[str, Any]:
     return {"x": at.est_x, "y": at.est_y, "sigma_m": at.est_sigma_m, "spots": at.spots}
 
 
@@ -197,7 +197,9 @@ def _evidence_entries(
     spots = 0
     for d in record.estimates:
         if _is_milestone(spots, d.spots):
-            at = Estimate(d.x_um, d.y_um, d.var_xx_um2, d.var_xy_um2, d.var_yy_um2, d.spots)
+            at = EstimatedPosition(
+                d.x_um, d.y_um, d.var_xx_um2, d.var_xy_um2, d.var_yy_um2, d.spots
+            )
             text = f"stands at {_where(at)}, seen from {counted(d.spots, 'spot')}"
             yield d.offset, "estimated", text, _estimate_document(at)
         spots = max(spots, d.spots)
@@ -256,7 +258,7 @@ def _is_milestone(before: int, after: int) -> bool:
     )
 
 
-def _where(at: Estimate) -> str:
+def _where(at: EstimatedPosition) -> str:
     return f"{_point((at.x_um, at.y_um))} ± {at.est_sigma_m:.2f} m"
 
 

@@ -8,7 +8,7 @@ from eventsrc.base.text import counted, table
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
 from projections.map.phrases import command_title
-from projections.map.records import Estimate
+from projections.map.records import EstimatedPosition
 from projections.store.history import History
 from projections.store.history_records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
@@ -154,7 +154,7 @@ class _ObjectChange:
         return parts[0] + " " + ", ".join(parts[1:])
 
 
-def _estimate_change(before: Estimate, after: Estimate) -> str:
+def _estimate_change(before: EstimatedPosition, after: EstimatedPosition) -> str:
     shift = math.hypot(after.est_x - before.est_x, after.est_y - before.est_y)
     place = f"stands {shift:.2f} m elsewhere, " if shift >= _MOVED_M else ""
     return f"{place}± {before.est_sigma_m:.2f} → {after.est_sigma_m:.2f} m"

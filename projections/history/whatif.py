@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from eventsrc.envelope.model import DetId, Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
-from projections.fold.errors import SettingsError
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
 from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.map.phrases import command_document, command_name

@@ -11,7 +11,7 @@ from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.deltas import Delta
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 

@@ -38,7 +38,7 @@ from projections.fold.corrections import (
     compile_corrections,
 )
 from projections.fold.edited_events import Reembedded
-from projections.fold.errors import FoldError, SettingsError
+from projections.fold.map_errors import FoldError, SettingsError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 

@@ -121,7 +121,7 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class EstimatedPosition:
     """An Object's estimated position with its covariance in µm²; it was seen from ``spots``
     spots."""
 
@@ -191,7 +191,7 @@ class ObjectRecord:
     last_seen: float = 0.0
     place: PlaceOrdinal | None = None
     observations: list[ObservationOrdinal] = field(default_factory=list)
-    estimate: Estimate | None = None
+    estimate: EstimatedPosition | None = None
     misses: int = 0
     missing_in: RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)

@@ -24,7 +24,7 @@ from projections.fold.settings import Settings
 from projections.fold.survivors import ObjectSurvivors, PlaceSurvivors
 
 from .records import (
-    Estimate,
+    EstimatedPosition,
     KeyframeRecord,
     ObjectRecord,
     ObservationRecord,
@@ -279,7 +279,7 @@ class MapView:
         self.contents.update(survivor)
 
     def _object_estimated(self, delta: deltas.ObjectEstimated) -> None:
-        self.all_objects[delta.object].estimate = Estimate(
+        self.all_objects[delta.object].estimate = EstimatedPosition(
             delta.x_um,
             delta.y_um,
             delta.var_xx_um2,

@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
+from eventsrc.envelope.occupancy_map import OccupancyMap
+from projections.fold.occupancy import occupied, pooled
 
 MOST_SEGMENTS: Final = 20_000
 _Mask = NDArray[np.bool_]
@@ -19,7 +20,7 @@ _Mask = NDArray[np.bool_]
 @lru_cache(maxsize=8)
 def wall_segments(given: OccupancyMap) -> list[list[float]]:
     """The segments: x and y of both ends, in metres in the map frame, to the millimetre."""
-    walls = (given.cells >= MIN_WALL) & (given.cells <= OCCUPIED)
+    walls = occupied(given)
     step = 1
     while True:
         mask = pooled(walls, step)
@@ -29,14 +30,6 @@ def wall_segments(given: OccupancyMap) -> list[list[float]]:
             ends = np.concatenate([_segments(across), _segments(along)[..., ::-1]])
             return _in_map_frame(given, ends * step * given.resolution)
         step *= 2
-
-
-def pooled(mask: _Mask, step: int) -> _Mask:
-    """A cell for each square of ``step`` by ``step``: True where any of them is."""
-    rows, columns = mask.shape
-    padded = np.pad(mask, ((0, -rows % step), (0, -columns % step)))
-    shape = padded.shape[0] // step, step, padded.shape[1] // step, step
-    return np.asarray(padded.reshape(shape).any(axis=(1, 3)))
 
 
 def _turns(mask: _Mask) -> _Mask:

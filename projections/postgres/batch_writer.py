@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from eventsrc.envelope.model import Offset
-from projections.fold.errors import (
+from projections.fold.map_errors import (
     CheckpointMoved,
     DatabaseError,
     DatabaseUnavailable,

@@ -24,7 +24,7 @@ from psycopg import IsolationLevel, sql
 from eventsrc.envelope.grey_images import BadImage
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
-from projections.fold.errors import ProjectionMissing
+from projections.fold.map_errors import ProjectionMissing
 from projections.fold.settings import Settings
 
 from . import checkpoints, map_table

@@ -11,7 +11,7 @@ from psycopg import sql
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
-from projections.fold.errors import CheckpointMoved, DatabaseError, ProjectionBusy
+from projections.fold.map_errors import CheckpointMoved, DatabaseError, ProjectionBusy
 
 from .connection import Connection, describe_connection
 from .sink import SINKS, Checkpoint, SinkName

@@ -23,7 +23,7 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.rows import TupleRow
 
 from eventsrc.base.errors import MisuseError
-from projections.fold.errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
+from projections.fold.map_errors import DatabaseError, DatabaseUnavailable, ExtensionMissing
 
 from .data_folder import SUPERUSER, reset_advice
 from .embedded import EmbeddedServer, embedded_log

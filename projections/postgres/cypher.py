@@ -28,7 +28,7 @@ import psycopg
 from psycopg import sql
 
 from eventsrc.base.text import advised
-from projections.fold.errors import ExtensionMissing
+from projections.fold.map_errors import ExtensionMissing
 
 from .connection import Connection, connect, describe_connection, extension_version
 from .labels import GRAPH, LABELS

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Final
 
 from eventsrc.base.text import advised
-from projections.fold.errors import EmbeddedServerError
+from projections.fold.map_errors import EmbeddedServerError
 
 from .server_user import (
     find_or_make_socket_folder,

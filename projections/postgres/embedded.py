@@ -24,7 +24,7 @@ import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
 from eventsrc.base.text import advised
-from projections.fold.errors import EmbeddedServerError
+from projections.fold.map_errors import EmbeddedServerError
 
 from .data_folder import LOG_NAME, SUPERUSER, Cluster
 from .server_user import server_user

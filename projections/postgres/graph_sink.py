@@ -16,7 +16,7 @@ from typing import Final
 from psycopg import sql
 
 from eventsrc.base.text import advised
-from projections.fold.errors import DatabaseError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from eventsrc.envelope.model import Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.errors import FoldError, FoldInterrupted
+from projections.fold.map_errors import FoldError, FoldInterrupted
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker

@@ -16,7 +16,7 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.grey_images import BadImage, decode_grey_png, encode_png
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold.errors import DatabaseError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.map.view import MapView
 
 from .connection import Connection, describe_connection

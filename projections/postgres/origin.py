@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader, event_hash
-from projections.fold.errors import ProjectionMismatch, ProjectionMissing
+from projections.fold.map_errors import ProjectionMismatch, ProjectionMissing
 from projections.fold.settings import Settings, settings_by_name
 
 from .inputs import LogInputs, MapInputs

@@ -21,7 +21,7 @@ from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers

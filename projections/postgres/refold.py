@@ -28,7 +28,7 @@ from eventsrc.base.machine import gc_paused
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
-from projections.fold.errors import DatabaseError, ImpossibleCommand
+from projections.fold.map_errors import DatabaseError, ImpossibleCommand
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 

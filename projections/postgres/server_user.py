@@ -23,7 +23,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from projections.fold.errors import EmbeddedServerError
+from projections.fold.map_errors import EmbeddedServerError
 
 SYSTEM_USER: Final = "pgserver"
 

@@ -33,7 +33,7 @@ from typing import Final, Self, TypeAlias
 import psycopg
 
 from eventsrc.log import Event, event_hash
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.digest import map_digest
 from projections.map.view import MapView

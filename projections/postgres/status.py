@@ -14,7 +14,7 @@ from typing import Final, Literal
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.fold.errors import DatabaseError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.fold.settings import Settings
 
 from . import checkpoints

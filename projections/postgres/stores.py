@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import psycopg
 
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 
 from . import checkpoints

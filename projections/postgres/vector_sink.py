@@ -24,7 +24,7 @@ from psycopg import sql
 from psycopg.rows import TupleRow
 
 from eventsrc.base.text import advised, counted
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 

@@ -25,8 +25,8 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
-from projections.fold.errors import FoldError
 from projections.fold.exact import Units
+from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_into, fold_log

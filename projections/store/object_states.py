@@ -19,7 +19,7 @@ import numpy as np
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
-from projections.map.records import Estimate, ObjectRecord
+from projections.map.records import EstimatedPosition, ObjectRecord
 
 from .columns import NONE, Array
 from .tables import Rows, Tables, last_rows
@@ -157,11 +157,11 @@ class ObjectStates:
             )
         ]
 
-    def _estimates(self) -> list[Estimate | None]:
+    def _estimates(self) -> list[EstimatedPosition | None]:
         has = self.has("estimated").tolist()
         columns = (self.of("estimated", name).tolist() for name in _ESTIMATE)
         return [
-            Estimate(*row) if is_there else None
+            EstimatedPosition(*row) if is_there else None
             for is_there, *row in zip(has, *columns, strict=True)
         ]
 

@@ -15,7 +15,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseError, DatabaseUnavailable
+from projections.fold.map_errors import DatabaseError, DatabaseUnavailable
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild
 from projections.postgres.connection import Targets, connect, describe_target

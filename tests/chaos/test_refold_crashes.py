@@ -8,7 +8,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseUnavailable
+from projections.fold.map_errors import DatabaseUnavailable
 from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets

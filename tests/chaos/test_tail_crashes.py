@@ -12,7 +12,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from projections.fold.errors import CheckpointMoved, DatabaseUnavailable
+from projections.fold.map_errors import CheckpointMoved, DatabaseUnavailable
 from projections.fold.settings import Settings
 from projections.postgres import TailProgress, TailReport, checkpoints, rebuild, tail
 from projections.postgres.connection import Connection, Targets, connect

@@ -13,7 +13,7 @@ import mapfold as public
 import pytest
 
 from eventsrc.base.errors import LogNotFound, MisuseError
-from projections.fold.errors import QuestionError, SettingsError
+from projections.fold.map_errors import QuestionError, SettingsError
 from projections.history import NoSuchThing
 from projections.surfaces import python as api
 from projections.surfaces.python import Map, Timeline, fold, open_log, relocalize

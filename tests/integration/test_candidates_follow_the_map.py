@@ -7,7 +7,7 @@ import psycopg
 import pytest
 
 from eventsrc.envelope.commands import UseSettings
-from projections.fold.errors import ProjectionMismatch, QuestionError
+from projections.fold.map_errors import ProjectionMismatch, QuestionError
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, MapConstants, QuestionCrop, read_question
 from projections.localize.relocalize import candidates as candidates_module

@@ -10,7 +10,7 @@ import psycopg
 import pytest
 
 from eventsrc.base.errors import MisuseError
-from projections.fold.errors import DatabaseUnavailable, ExtensionMissing
+from projections.fold.map_errors import DatabaseUnavailable, ExtensionMissing
 from projections.postgres.connection import (
     Targets,
     connect,
@@ -89,7 +89,7 @@ def test_errors_of_the_embedded_server_do_not_mention_urls(
 CUT = """
 import sys
 from projections.postgres.connection import connect, database_errors
-from projections.fold.errors import DatabaseUnavailable
+from projections.fold.map_errors import DatabaseUnavailable
 url = sys.argv[1]
 with connect(url, autocommit=True) as killer, connect(url) as connection:
     try:

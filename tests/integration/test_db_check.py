@@ -8,7 +8,7 @@ import pytest
 from psycopg import sql
 
 from eventsrc.base.progress import send_progress_to
-from projections.fold.errors import DatabaseError, ProjectionMismatch, ProjectionMissing
+from projections.fold.map_errors import DatabaseError, ProjectionMismatch, ProjectionMissing
 from projections.fold.settings import Settings
 from projections.postgres import checkpoints, rebuild, tail
 from projections.postgres.check import NAMED, check

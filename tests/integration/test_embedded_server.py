@@ -14,7 +14,7 @@ from typing import IO
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.fold.map_errors import DatabaseUnavailable, EmbeddedServerError
 from projections.postgres.connection import connect, database_errors
 from projections.postgres.embedded import EmbeddedServer
 from tests.support.commands import Commands

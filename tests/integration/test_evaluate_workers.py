@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from eventsrc.envelope.ingest import Accepted
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
 from projections.localize.evaluate import evaluate, parallel, read_truth
 from projections.surfaces.cli.evaluate import CameraOptions, FoldSettings

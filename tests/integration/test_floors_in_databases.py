@@ -6,7 +6,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.fold.errors import ProjectionMismatch
+from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check

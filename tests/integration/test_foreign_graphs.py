@@ -8,7 +8,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check

@@ -10,7 +10,7 @@ import pytest
 from mapfold import Settings, Timeline, fold, open_log
 
 from eventsrc.log import LogReader
-from projections.fold.errors import FoldInterrupted
+from projections.fold.map_errors import FoldInterrupted
 from projections.map.digest import map_digest
 from projections.map.own_events import read_corrections
 from projections.postgres.live_fold import LiveFold

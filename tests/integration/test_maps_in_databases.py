@@ -13,7 +13,7 @@ import pytest
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.map.fold import fold_log

@@ -11,7 +11,7 @@ import pytest
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
 from projections.map.digest import map_digest

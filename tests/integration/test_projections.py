@@ -9,7 +9,7 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.fold.errors import DatabaseError, FoldError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError, FoldError, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log

@@ -8,7 +8,7 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild
 from projections.postgres.check import check

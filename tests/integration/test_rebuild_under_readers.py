@@ -9,7 +9,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseError, ProjectionBusy
+from projections.fold.map_errors import DatabaseError, ProjectionBusy
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild, tail
 from projections.postgres.connection import Targets

@@ -19,7 +19,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.envelope.system_events import EMBEDDINGS_KEY
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.corrections import Corrections, map_fingerprint
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.localize.evaluate.questions import read_keyframes
 from projections.map.digest import map_digest

@@ -13,7 +13,7 @@ import pytest
 from eventsrc.envelope.commands import Command, UseSettings
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.fold.errors import ProjectionMismatch
+from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log

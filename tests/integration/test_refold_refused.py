@@ -9,7 +9,7 @@ import pytest
 from eventsrc.envelope import commands
 from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
-from projections.fold.errors import DatabaseError, FoldError, ImpossibleCommand
+from projections.fold.map_errors import DatabaseError, FoldError, ImpossibleCommand
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets

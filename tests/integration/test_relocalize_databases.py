@@ -8,7 +8,7 @@ import psycopg
 import pytest
 
 from eventsrc.log import LogReader
-from projections.fold.errors import ProjectionMismatch, ProjectionMissing, QuestionError
+from projections.fold.map_errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, QuestionCrop, Track, rank, read_question
 from projections.map.fold import fold_log

@@ -10,7 +10,7 @@ import pytest
 
 from eventsrc.base.errors import LogDamaged, MapfoldError
 from eventsrc.log import LogReader
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.map import parsed_log
 from projections.map.parsed_log import ParsedLog

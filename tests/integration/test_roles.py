@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
-from projections.fold.errors import DatabaseError, ExtensionMissing
+from projections.fold.map_errors import DatabaseError, ExtensionMissing
 from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.record.transport.session import ZenohOptions, open_session
-from projections.fold.errors import DatabaseError, DatabaseUnavailable, ProjectionMissing
+from projections.fold.map_errors import DatabaseError, DatabaseUnavailable, ProjectionMissing
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Connection, Targets, connect

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from eventsrc.record.transport.session import Session
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets

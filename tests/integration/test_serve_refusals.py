@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.surfaces.serve import models
 from projections.surfaces.serve.answering import BusyError, TooMuchError
 from tests.support.services import FRIEND, PATHS, Service

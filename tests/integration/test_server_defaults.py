@@ -10,7 +10,7 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild, tail
 from projections.postgres import data_folder as _cluster

@@ -16,7 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 import psycopg
 import pytest
 
-from projections.fold.errors import DatabaseUnavailable, EmbeddedServerError
+from projections.fold.map_errors import DatabaseUnavailable, EmbeddedServerError
 from projections.postgres.connection import connect
 from projections.postgres.embedded import EmbeddedServer
 from tests.support.servers import furnish

@@ -13,7 +13,7 @@ import pytest
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.log import ALWAYS, Event, LogWriter
 from eventsrc.record.append import append_payload
-from projections.fold.errors import ProjectionBusy, ProjectionMismatch
+from projections.fold.map_errors import ProjectionBusy, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets

@@ -21,7 +21,7 @@ from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter
 from eventsrc.record.transport.session import Session
-from projections.fold.errors import ProjectionMismatch
+from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, parse_question, rank
 from projections.localize.relocalize.ranking import Answer

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projections.fold.settings import Camera, Settings
+from projections.fold.settings import CameraConstants, Settings
 from projections.localize.evaluate.truth import TrueKeyframe, Truth
 from scripts.programs.bench.truth.folding import fold_timed
 from scripts.programs.bench.truth.places import places_row, places_table
@@ -26,7 +26,7 @@ def two_rooms_case() -> Case:
         )
         for k, (x, _) in enumerate(spots)
     }
-    return Case("rover two_rooms", Camera(), events, Truth(truth), {}, "run-a", {})
+    return Case("rover two_rooms", CameraConstants(), events, Truth(truth), {}, "run-a", {})
 
 
 def test_the_walls_of_a_generated_building_lie_where_its_rooms_end() -> None:

@@ -4,7 +4,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from projections.fold.settings import Camera, Settings
+from projections.fold.settings import CameraConstants, Settings
 from scripts.programs.bench.truth.folding import fold_timed
 from scripts.programs.bench.truth.worlds import NoWorldsError, load_generator, make_case, pairs
 from tests.programs.truth_cases import trial_generator
@@ -46,7 +46,7 @@ def test_a_case_is_read_from_the_cache_as_it_was_made(generator, tmp_path):
     runs = [accepted.envelope.run_id for accepted in read.events]
     assert runs == sorted(runs)
     assert runs[0] == read.first_run
-    assert read.camera == Camera(hfov_deg=69.4, width_px=640, height_px=400)
+    assert read.camera == CameraConstants(hfov_deg=69.4, width_px=640, height_px=400)
     assert read.looks_again == {}
     view, seconds = fold_timed(read.events, Settings())
     assert len(view.keyframes) == 120

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from projections.fold.deltas import Pose
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import _bounded, read
 from projections.localize.calibrate.sightings import Row, sightings_of
@@ -23,7 +23,11 @@ PIXELS = st.one_of(
 )
 POSITIONS = st.one_of(st.integers(-FAR_UM, FAR_UM), st.integers(-5_000_000, 5_000_000))
 CAMERAS = st.sampled_from(
-    [Camera(), Camera(hfov_deg=1.0, width_px=1e6, height_px=1.0), Camera(hfov_deg=170.0)]
+    [
+        CameraConstants(),
+        CameraConstants(hfov_deg=1.0, width_px=1e6, height_px=1.0),
+        CameraConstants(hfov_deg=170.0),
+    ]
 )
 LOOKS = [
     quantise(np.array(look, dtype=np.float32))
@@ -93,7 +97,7 @@ def test_every_constant_that_is_a_number_has_bounds() -> None:
 
 
 def test_looks_that_are_nearly_all_the_same_give_constants_too() -> None:
-    camera, rng = Camera(), np.random.default_rng(3)
+    camera, rng = CameraConstants(), np.random.default_rng(3)
     made = [
         Row(
             i // 2,
@@ -118,7 +122,9 @@ def test_things_that_are_always_in_the_middle_of_the_picture_give_constants_too(
     for i in range(300):
         x, y = (float(v) for v in rng.uniform(-3.0, 3.0, 2))
         pose = Pose(round(x * 1e6), round(y * 1e6), math.atan2(-y, -x))
-        made.append(Row(i, i % 2, pose, Camera(), "cup", (310.0, 150.0, 330.0, 250.0), LOOKS[0], 0))
+        made.append(
+            Row(i, i % 2, pose, CameraConstants(), "cup", (310.0, 150.0, 330.0, 250.0), LOOKS[0], 0)
+        )
     prior = EvidenceConstants()
     found = read(sightings_of(made), prior, prior)
     assert (found.things, found.camera) == (1, ())

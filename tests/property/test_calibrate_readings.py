@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import Round, read
 from projections.localize.calibrate.sightings import sightings_of
@@ -194,7 +194,7 @@ def test_a_wrong_field_of_view_is_noticed() -> None:
     rows = rows_of(known)
     assert read(sightings_of(rows), PRIOR, PRIOR).camera == ()
     for hfov, sign in ((100.0, 1.0), (62.0, -1.0)):
-        wrong = Camera(hfov_deg=hfov, width_px=800.0, height_px=600.0)
+        wrong = CameraConstants(hfov_deg=hfov, width_px=800.0, height_px=600.0)
         found = read(sightings_of(row._replace(camera=wrong) for row in rows), PRIOR, PRIOR)
         (fault,) = found.camera
         assert fault.name == "hfov"
@@ -212,7 +212,7 @@ def test_a_turned_camera_is_noticed() -> None:
 def test_boxes_of_another_picture_are_counted() -> None:
     rows = rows_of(Known(things=10))
     assert sightings_of(rows).beyond == 0
-    small = Camera(hfov_deg=80.0, width_px=400.0, height_px=300.0)
+    small = CameraConstants(hfov_deg=80.0, width_px=400.0, height_px=300.0)
     assert sightings_of(row._replace(camera=small) for row in rows).beyond > len(rows) / 3
 
 

@@ -20,7 +20,7 @@ from projections.history.bisect import CountIndex, HistoryFacts
 from projections.history.diff import difference_of, rows_of
 from projections.map.digest import map_digest
 from projections.map.export import state_document, state_text
-from projections.map.records import Estimate, ObjectRecord, Relocation
+from projections.map.records import EstimatedPosition, ObjectRecord, Relocation
 from projections.map.view import MapView
 from tests.support.histories import view_at
 from tests.support.memory_history import MemoryHistory
@@ -99,7 +99,7 @@ def test_objects_of_a_class_are_counted_as_they_are_called_at_each_offset(
     assert not falls or HistoryFacts(history, index, Offset(len(events))).objects_merge
 
 
-ESTIMATE = Estimate(1, 2, 30, 4, 50, 3)
+ESTIMATE = EstimatedPosition(1, 2, 30, 4, 50, 3)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ ESTIMATE = Estimate(1, 2, 30, 4, 50, 3)
                 "estimate",
                 dataclasses.replace(ESTIMATE, **{name: getattr(ESTIMATE, name) + 1}),
             )
-            for field in dataclasses.fields(Estimate)
+            for field in dataclasses.fields(EstimatedPosition)
         ),
         lambda o: setattr(o, "estimate", None),
         lambda o: setattr(o, "misses", 7),

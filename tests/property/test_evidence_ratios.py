@@ -13,7 +13,7 @@ from projections.fold.evidence_objects import EvidenceObjects
 from projections.fold.exact import cos_sin
 from projections.fold.looks import LookRatios
 from projections.fold.spots import Spots
-from projections.fold.things import LabelCounts, Thing
+from projections.fold.things import FusedThing, LabelCounts
 from tests.support.evidence_pictures import a_room, fold_one, pictures_of
 from tests.support.thorough import examples
 
@@ -41,7 +41,7 @@ def test_a_label_speaks_by_how_much_likelier_it_is_for_the_thing(
     counts = LabelCounts()
     counts.learn(learned)
     total = sum(classes.values())
-    thing = Thing(total, 0, 0, 0.0, 0.0, next(iter(classes)), classes, Spots())
+    thing = FusedThing(total, 0, 0, 0.0, 0.0, next(iter(classes)), classes, Spots())
     usual = counts.usual(label)
     assert usual == pytest.approx((learned.count(label) + 1) / (len(learned) + 10))
     own = (classes.get(label, 0) + 0.3 * usual) / (total + 0.3)
@@ -88,7 +88,7 @@ def test_a_look_and_exemplars_one_by_one_are_as_in_arrays(
 @given(st.lists(st.tuples(st.integers(0, 2), _ANGLE), max_size=40))
 def test_exemplars_are_the_newest_of_their_kind(kept: list[tuple[int, float]]) -> None:
     """Against a plain list: of a kind the last three, of all the last six."""
-    thing, naive = Thing(0, 0, 0, 0.0, 0.0, "chair", {}, Spots()), list[tuple[int, int, int]]()
+    thing, naive = FusedThing(0, 0, 0, 0.0, 0.0, "chair", {}, Spots()), list[tuple[int, int, int]]()
     for number, (run, angle) in enumerate(kept):
         cos, sin = cos_sin(angle)
         thing.keep(np.full(4, number, np.float32), 0.5, cos, sin, run)

@@ -16,7 +16,7 @@ from projections.fold.corrections import NO_CORRECTIONS, RecordedCommand, compil
 from projections.fold.settings import Settings
 from projections.fold.sights import MOST_OF_A_PICTURE
 from projections.fold.spots import Spots
-from projections.fold.things import Thing
+from projections.fold.things import FusedThing
 from projections.map.digest import map_digest
 from projections.map.export import state_document
 from tests.support.envelopes import detection, envelope, payload
@@ -152,7 +152,7 @@ def test_a_picture_is_at_least_one_pixel_wide_and_high(name: str) -> None:
 def test_counting_a_label_gives_the_class_that_a_look_at_all_classes_gives(
     labels: list[str],
 ) -> None:
-    thing = Thing(1, 0, 0, 0.0, 0.0, labels[0], {labels[0]: 1}, Spots())
+    thing = FusedThing(1, 0, 0, 0.0, 0.0, labels[0], {labels[0]: 1}, Spots())
     for end, label in enumerate(labels[1:], 2):
         thing.count_label(label)
         first = sorted(set(labels[:end]), key=labels.index)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize.camera import box_rows, focal_px, views
 from projections.localize.relocalize.triangulation import (
     Points,
@@ -161,7 +161,7 @@ def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> Non
     boxes, poses = [], []
     for quarter in range(8):
         angle, far = quarter * math.pi / 4, 2.0 + 0.25 * (quarter % 3)
-        half = 0.5 * 0.8 * focal_px(Camera()) / far
+        half = 0.5 * 0.8 * focal_px(CameraConstants()) / far
         boxes.append((320.0 - half, 200.0 - half, 320.0 + half, 200.0 + half))
         poses.append((far * math.cos(angle), far * math.sin(angle), angle + math.pi))
     for usual in (1.0, 2.0, 4.0):
@@ -170,7 +170,12 @@ def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> Non
         beside = [*poses, *((x + 50.0, y, angle) for x, y, angle in poses)]
         rows = box_rows([*boxes, *boxes])
         crops = triangulate(
-            np.array(beside), views(Camera(), rows), np.ones(16), np.array([0, 8]), [5, 5], evidence
+            np.array(beside),
+            views(CameraConstants(), rows),
+            np.ones(16),
+            np.array([0, 8]),
+            [5, 5],
+            evidence,
         )
         for number, found in enumerate(crops):
             assert [each.members.tolist() for each in found] == [[8 * number + i for i in range(8)]]

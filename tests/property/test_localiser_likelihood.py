@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import MapConstants
 from projections.localize.relocalize.appearance import DIRECTIONS, appearance_tables
 from projections.localize.relocalize.camera import Cue, SightLines, box_rows, half_field_rad, sights
@@ -30,7 +30,7 @@ seeds = st.integers(0, 2**32 - 1)
 def random_group(
     rng: np.random.Generator,
     counts_of: list[int],
-    camera: Camera,
+    camera: CameraConstants,
     *,
     boxed: bool,
     wide_m: float = 4.0,
@@ -178,7 +178,7 @@ def test_the_likelihood_is_that_written_out_for_each_landmark(
     seed: int, counts: list[int], side_by: str, boxed: bool
 ) -> None:
     rng = np.random.default_rng(seed)
-    camera = Camera(yaw_rad=float(rng.choice([0.0, 0.4])))
+    camera = CameraConstants(yaw_rad=float(rng.choice([0.0, 0.4])))
     evidence = EvidenceConstants.model_validate({"side_by": side_by})
     scene = Scene(MapConstants(evidence=evidence), camera, MODEL)
     group = random_group(rng, counts, camera, boxed=boxed)
@@ -204,8 +204,8 @@ def test_landmarks_that_are_left_out_as_too_far_away_change_nothing(
     """With many landmarks and positions, over some 200 m; the oracle has all of them."""
     rng = np.random.default_rng(seed)
     evidence = EvidenceConstants.model_validate({"side_by": side_by})
-    scene = Scene(MapConstants(evidence=evidence), Camera(), MODEL)
-    group = random_group(rng, [30, 1, 25], Camera(), boxed=boxed, wide_m=100.0)
+    scene = Scene(MapConstants(evidence=evidence), CameraConstants(), MODEL)
+    group = random_group(rng, [30, 1, 25], CameraConstants(), boxed=boxed, wide_m=100.0)
     beside = group.landmarks.xy[rng.integers(0, 56, 60)] + rng.uniform(-4, 4, (60, 2))
     places = np.concatenate((beside, rng.uniform(-120, 120, (60, 2))))
     yaws = rng.uniform(-4, 4, (3, len(places)))
@@ -312,7 +312,7 @@ def test_looks_are_those_written_out_for_each_observation(seed: int, counts: lis
     )
 )
 def test_whatever_a_box_holds_its_sights_are_finite(boxes: list[tuple[float, ...] | None]) -> None:
-    found: SightLines = sights(Camera(), box_rows(boxes))  # type: ignore[arg-type]
+    found: SightLines = sights(CameraConstants(), box_rows(boxes))  # type: ignore[arg-type]
     for values in (found.bearing, found.log_height, found.rise):
         assert np.isfinite(values).all()
     assert (np.abs(found.bearing) < math.pi / 2).all()

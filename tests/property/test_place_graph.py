@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.postgres.queries.graph_reads import PlaceGraph, PlaceNode
 
 SIZE = 6

@@ -31,9 +31,9 @@ from projections.fold.deltas import (
 )
 from projections.fold.exact import cos_sin
 from projections.fold.presence import Presence
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
-CAMERA = Camera(hfov_deg=70.0)
+CAMERA = CameraConstants(hfov_deg=70.0)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from projections.fold import deltas as d
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker
-from projections.map.records import Estimate
+from projections.map.records import EstimatedPosition
 from projections.map.view import MapView
 from projections.postgres.graph_rows import object_rows
 from projections.postgres.labels import COUNT_KEYS, LABELS, TABLE
@@ -172,7 +172,7 @@ def test_applying_events_twice_changes_no_object(steps: list[Step]) -> None:
 def test_sigma_is_that_of_the_least_sure_direction(
     variances: tuple[int, int, int], sigma: float
 ) -> None:
-    assert Estimate(1, 2, *variances, 3).est_sigma_m == pytest.approx(sigma, rel=1e-15)
+    assert EstimatedPosition(1, 2, *variances, 3).est_sigma_m == pytest.approx(sigma, rel=1e-15)
 
 
 def test_an_object_without_an_estimate_has_no_position() -> None:

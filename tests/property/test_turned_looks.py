@@ -11,7 +11,7 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_merging import turned_looks
 from projections.fold.looks import LookRatios, LookScale, looks_of
 from projections.fold.spots import Spots
-from projections.fold.things import Thing
+from projections.fold.things import FusedThing
 from tests.support.thorough import examples
 
 DIM = 48
@@ -23,9 +23,9 @@ Picture = tuple[np.ndarray, float, int]
 """An embedding, the side that it shows, radians, and the run."""
 
 
-def thing_of(pictures: list[Picture]) -> Thing:
+def thing_of(pictures: list[Picture]) -> FusedThing:
     """A thing whose exemplars are these pictures."""
-    thing = Thing(1, 0, 0, 0.0, 0.0, "chair", {"chair": 1}, Spots())
+    thing = FusedThing(1, 0, 0, 0.0, 0.0, "chair", {"chair": 1}, Spots())
     for vector, side, run in pictures:
         unit = np.rint(vector / np.linalg.norm(vector) * 2**20)
         looks, inverses = looks_of([unit])
@@ -46,7 +46,7 @@ def pictures(
     return made
 
 
-def slow(one: Thing, other: Thing) -> float:
+def slow(one: FusedThing, other: FusedThing) -> float:
     """As the module's text says, in plain floats."""
     likelihoods = []
     for turn in range(8):

@@ -16,7 +16,7 @@ from eventsrc.base.user_files import MAX_DEPTH, FileFault, parse_json, read_file
 from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.record.importers.map_yaml import read_map_yaml
 from projections.adapters.fleet.sites import find_sites
-from projections.fold.errors import QuestionError, SettingsError
+from projections.fold.map_errors import QuestionError, SettingsError
 from projections.localize.evaluate.truth import read_truth
 from projections.localize.relocalize import parse_question
 from projections.surfaces.cli.folded_log import settings_from

@@ -32,7 +32,7 @@ from eventsrc.envelope.commands import Command, SameObject, UseSettings
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.map.own_events import read_corrections
 from projections.postgres import rebuild, tail

@@ -11,10 +11,10 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
 from projections.fold.exact import metres_to_um, unit_vectors
 from projections.fold.pair_groups import PairGroups
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.fold.sights import Sighting
 
-CAMERA = Camera(hfov_deg=70.0, width_px=640.0, height_px=400.0)
+CAMERA = CameraConstants(hfov_deg=70.0, width_px=640.0, height_px=400.0)
 FOCAL = CAMERA.width_px / 2 / math.tan(math.radians(CAMERA.hfov_deg / 2))
 DIM = 48
 CLASSES = ("chair", "table", "plant")

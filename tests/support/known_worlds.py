@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from projections.fold.deltas import Pose
 from projections.fold.exact import metres_to_um, quantise
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.calibrate.sightings import Row
 
-CAMERA = Camera(hfov_deg=80.0, width_px=800.0, height_px=600.0)
+CAMERA = CameraConstants(hfov_deg=80.0, width_px=800.0, height_px=600.0)
 DIM = 1024
 _HARMONICS = 6
 
@@ -38,7 +38,7 @@ class Known:
     same_kappa: float = 2.0
     session_shift: float = 0.1
     side_by: str = "sight"
-    camera: Camera = CAMERA
+    camera: CameraConstants = CAMERA
     things: int = 120
     looks: int = 12
     runs: int = 2

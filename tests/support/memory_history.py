@@ -39,7 +39,7 @@ from projections.fold.deltas import (
     RunSeen,
 )
 from projections.fold.settings import Settings
-from projections.map.records import Estimate, ObjectRecord, Relocation
+from projections.map.records import EstimatedPosition, ObjectRecord, Relocation
 from projections.store.history import NEVER, NO_PLACE, History
 from projections.store.history_records import (
     Cause,
@@ -289,7 +289,7 @@ def object_of(history: ObjectHistory, end: Offset) -> ObjectRecord:
         record.place = moved.place
     if (estimated := last_before(history.estimates, end)) is not None:
         _, _, *values = astuple(estimated)
-        record.estimate = Estimate(*values)
+        record.estimate = EstimatedPosition(*values)
     again = last_before(history.relocations, end)
     looked = last_before(history.misses, end)
     if looked is not None and not (again and again.offset > looked.offset):

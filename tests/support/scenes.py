@@ -24,7 +24,7 @@ from eventsrc.log import LogReader
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise, to_float32
 from projections.fold.semantic_map import SemanticMap
-from projections.fold.settings import Camera, Settings
+from projections.fold.settings import CameraConstants, Settings
 from projections.localize.relocalize import (
     CandidatePlace,
     ExactIndex,
@@ -62,7 +62,7 @@ class Thing:
     name: str = "chair"
 
 
-def box_of(thing: Thing, pose: Pose, camera: Camera) -> Box | None:
+def box_of(thing: Thing, pose: Pose, camera: CameraConstants) -> Box | None:
     """What an upright line of the thing's height gives; None if it is not in the picture."""
     dx, dy = thing.x - pose[0], thing.y - pose[1]
     ahead = math.cos(pose[2]) * dx + math.sin(pose[2]) * dy
@@ -94,7 +94,7 @@ class Scene:
     things: Sequence[Thing]
     poses: Sequence[Pose]
     constants: MapConstants = CONSTANTS
-    camera: Camera = field(default_factory=Camera)
+    camera: CameraConstants = field(default_factory=CameraConstants)
     has_estimates: bool = True
 
     def match(self, number: int, index: int, pose: Pose, likeness: float) -> Match | None:

@@ -26,7 +26,7 @@ from urllib.parse import quote
 
 import psycopg
 
-from projections.fold.errors import EmbeddedServerError
+from projections.fold.map_errors import EmbeddedServerError
 from projections.postgres.connection import connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.server_user import server_identity, server_user

@@ -2,7 +2,7 @@
 
 import pytest
 
-from projections.fold.errors import SettingsError
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 from projections.history.whatif import alternatives, settings_name
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from projections.fold.deltas import Pose
 from projections.fold.exact import metres_to_um, quantise
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.calibrate import likenesses, qualified_things, readings
 from projections.localize.calibrate.sightings import Row, Sightings, sightings_of
 
-CAMERA = Camera(hfov_deg=90.0, width_px=800.0, height_px=600.0)
+CAMERA = CameraConstants(hfov_deg=90.0, width_px=800.0, height_px=600.0)
 FOCAL = 400.0
 
 
@@ -146,7 +146,7 @@ def test_boxes_become_bearings_and_heights() -> None:
 
 
 def test_every_envelope_may_have_a_camera_of_its_own() -> None:
-    wide = Camera(hfov_deg=120.0, width_px=1600.0, height_px=600.0)
+    wide = CameraConstants(hfov_deg=120.0, width_px=1600.0, height_px=600.0)
     rows = [_row(i, camera=(CAMERA, wide)[i % 2], bbox=(0.0, 9.0, 100.0, 99.0)) for i in range(6)]
     seen = sightings_of(rows)
     alone = [sightings_of([row]) for row in rows]

@@ -20,7 +20,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.deltas import MergeRefused, ObjectsMerged, PlaceLink, PlacesMerged
-from projections.fold.errors import ImpossibleCommand
+from projections.fold.map_errors import ImpossibleCommand
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker

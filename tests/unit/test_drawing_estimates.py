@@ -15,7 +15,7 @@ from projections.adapters.drawing.picture import EVIDENCE_LEGEND, LEGEND, compos
 from projections.adapters.drawing.scene import two_sigma
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
-from projections.map.records import Estimate
+from projections.map.records import EstimatedPosition
 from projections.map.view import MapView
 
 pytestmark = pytest.mark.seconds
@@ -166,7 +166,7 @@ def test_the_ellipse_is_two_standard_errors_in_every_direction(
     covariance: np.ndarray, turn: float
 ) -> None:
     xx, xy, yy = (round(v * 1e12) for v in (covariance[0, 0], covariance[0, 1], covariance[1, 1]))
-    width, height, angle_deg = two_sigma(Estimate(0, 0, xx, xy, yy, 1))
+    width, height, angle_deg = two_sigma(EstimatedPosition(0, 0, xx, xy, yy, 1))
     angle = math.radians(angle_deg)
     along, across = width / 2 * math.cos(turn), height / 2 * math.sin(turn)
     point = np.array(

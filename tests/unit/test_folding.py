@@ -8,7 +8,7 @@ from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import Event
 from projections.fold.deltas import KeyframeAdded
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_event, fold_events

@@ -10,7 +10,7 @@ from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.deltas import PlaceNamed
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from eventsrc.envelope.readers import EnvelopeCamera
-from projections.fold.errors import QuestionError
-from projections.fold.settings import Camera
+from projections.fold.map_errors import QuestionError
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import (
     parse_question,
     question_schema,
@@ -81,7 +81,7 @@ def test_one_picture_is_one_view() -> None:
 def test_a_question_may_state_its_camera() -> None:
     camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720, "yaw_rad": 0.5}
     asked = envelope(1, detections=[detection("cup", VECTOR)], camera=camera)
-    assert read_question(asked).camera == Camera(
+    assert read_question(asked).camera == CameraConstants(
         width_px=1280.0, height_px=720.0, hfov_deg=90.0, yaw_rad=0.5
     )
     assert read_question([detection("cup", VECTOR)]).camera is None
@@ -137,7 +137,7 @@ def test_the_service_says_what_else_it_reads() -> None:
 def test_a_view_may_repeat_the_camera_of_its_question() -> None:
     camera = {"hfov_deg": 90, "width_px": 1280, "height_px": 720}
     question = read_question({"views": [{**ONE, "camera": camera}], "camera": camera})
-    assert question.camera == Camera(width_px=1280.0, height_px=720.0, hfov_deg=90.0)
+    assert question.camera == CameraConstants(width_px=1280.0, height_px=720.0, hfov_deg=90.0)
 
 
 ONE = {"crops": [{"embedding": VECTOR}]}

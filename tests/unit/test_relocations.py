@@ -21,7 +21,7 @@ from projections.fold.deltas import (
 )
 from projections.fold.evidence_fusion import Moved, Relocations
 from projections.fold.presence import Presence
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 
 @dataclass
@@ -78,7 +78,7 @@ class Story:
     def fold(self, run: int, x_um: int, deltas: list[Delta]) -> list[Moved]:
         self.offset += 1
         pose = Pose(x_um, 0, 0.0)
-        self.presence.fold(Offset(self.offset), RunOrdinal(run), pose, Camera(), deltas)
+        self.presence.fold(Offset(self.offset), RunOrdinal(run), pose, CameraConstants(), deltas)
         told = self.relocations.fold(deltas)
         for pair in told:
             self.presence.relocate(pair.old, pair.new)

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Answer, PoseHypothesis, Track
 from projections.localize.relocalize.layout import Hypotheses
 from projections.surfaces.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.errors import SettingsError
 from projections.fold.evidence import EvidenceConstants
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import (
-    Camera,
+    CameraConstants,
     LocalizerConstants,
     RoomsConstants,
     Settings,
@@ -111,7 +111,7 @@ def test_dotted_names_change_one_value_of_a_group() -> None:
         ]
     )
     assert changed.fusion == "evidence"
-    assert changed.camera == Camera(hfov_deg=90.0)
+    assert changed.camera == CameraConstants(hfov_deg=90.0)
     assert changed.evidence.range_m == 1.3
     assert changed.evidence.sizes_m == {"no. 7=x": 0.5, "potted plant": 0.4}
     assert changed.evidence.side_by == "heading"
@@ -176,7 +176,7 @@ _CHANGED = st.builds(
     eps_m=st.floats(0.1, 9.0),
     embedding_model=st.none() | st.just("clip"),
     fusion=st.sampled_from(["page", "evidence"]),
-    camera=st.builds(Camera, hfov_deg=st.floats(1.0, 170.0), yaw_rad=st.floats(-7.0, 7.0)),
+    camera=st.builds(CameraConstants, hfov_deg=st.floats(1.0, 170.0), yaw_rad=st.floats(-7.0, 7.0)),
     evidence=st.builds(
         EvidenceConstants,
         range_m=st.floats(0.1, 9.0),
@@ -207,14 +207,14 @@ def test_changed_settings_by_name_are_the_assignments_between_two(
 def test_documents_of_page_maps_name_no_younger_setting() -> None:
     younger = {"fusion", "camera", "evidence", "localizer", "places", "rooms"}
     assert not younger & Settings(eps_m=1.0).model_dump().keys()
-    assert Settings(camera=Camera(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
+    assert Settings(camera=CameraConstants(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
 
 
 def test_documents_of_evidence_maps_name_every_constant() -> None:
     """So their fingerprint changes with a default, on which the map depends."""
     document = Settings(fusion="evidence").model_dump()
     assert document["evidence"] == EvidenceConstants().model_dump()
-    assert document["camera"] == Camera().model_dump()
+    assert document["camera"] == CameraConstants().model_dump()
     assert not {"places", "rooms"} & document.keys()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogWriter
-from projections.fold.errors import LogPointError
+from projections.fold.map_errors import LogPointError
 from projections.fold.settings import Settings
 from projections.history import ExpressionError, LogTimeline, NoSuchThing
 from projections.history.merges import merge_document

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
 from projections.adapters import palette
+from projections.fold.occupancy import pooled
 from projections.map.view import MapView
-from projections.map.wall_segments import pooled
 
 from .canvas import Canvas
 from .labels import Extent

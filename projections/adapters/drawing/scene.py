@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from eventsrc.adapters.sim import House
 from eventsrc.envelope.model import RunId
-from projections.map.records import Estimate, KeyframeRecord, ObjectRecord
+from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 _NEAR_M = 1.0
@@ -108,7 +108,7 @@ def shown_objects(view: MapView, min_observations: int) -> list[ObjectRecord]:
     return [found for found in view.objects.values() if found.obs_count >= min_observations]
 
 
-def two_sigma(at: Estimate) -> tuple[float, float, float]:
+def two_sigma(at: EstimatedPosition) -> tuple[float, float, float]:
     """The ellipse of two standard errors around an estimate: full width and height in metres, and
     the angle from the x axis to the width, in degrees."""
     half = (at.var_xx_um2 + at.var_yy_um2) / 2

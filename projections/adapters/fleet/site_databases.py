@@ -18,7 +18,7 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.postgres.connection import (
     Connection,
     Targets,

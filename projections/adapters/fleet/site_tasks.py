@@ -17,7 +17,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, Verification, verify_log
 from eventsrc.record.log_info import LogInfo, log_info
 from projections.fold.corrections import Corrections
-from projections.fold.errors import DatabaseUnavailable, ProjectionBusy, ProjectionMismatch
+from projections.fold.map_errors import DatabaseUnavailable, ProjectionBusy, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import RebuildReport, rebuild
 from projections.postgres.checkpoints import load

@@ -17,7 +17,7 @@ from eventsrc.base.errors import MapfoldError
 from eventsrc.base.text import advised
 from eventsrc.log.reader import segments_of
 from projections.fold.exact import exp
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import Answer, Question, rank
 from projections.postgres.connection import Targets
 from projections.postgres.queries.candidate_search import CandidateReader
@@ -105,7 +105,7 @@ def ask_sites(
     question: Question,
     *,
     top: int,
-    camera: Camera | None,
+    camera: CameraConstants | None,
     jobs: int,
 ) -> FleetAnswer:
     """Ask each site; one that cannot be asked does not affect the ranking of the others."""
@@ -121,7 +121,7 @@ def ask_sites(
 
 
 def _ask(
-    site: Site, databases: Targets, question: Question, *, top: int, camera: Camera | None
+    site: Site, databases: Targets, question: Question, *, top: int, camera: CameraConstants | None
 ) -> Answer | str:
     """The answer of one site's map, or the reason why there is none."""
     try:

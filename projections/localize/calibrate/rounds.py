@@ -19,7 +19,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera, LocalizerConstants, Settings
+from projections.fold.settings import CameraConstants, LocalizerConstants, Settings
 from projections.fold.sights import camera_of
 from projections.map.fold import fold_parsed, read_ahead
 from projections.map.own_events import new_map
@@ -129,7 +129,7 @@ class Calibration:
         return self.settings.model_copy(update=changed)
 
 
-Cameras = dict[KeyframeOrdinal, Camera]
+Cameras = dict[KeyframeOrdinal, CameraConstants]
 """The cameras of keyframes whose envelopes state one."""
 Fold = Callable[[Settings], tuple[MapView, Cameras]]
 """A function that folds a log under settings; the view has the embeddings."""
@@ -195,7 +195,7 @@ def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibra
 
 
 def note_camera(
-    cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta], default: Camera
+    cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta], default: CameraConstants
 ) -> None:
     """Keep the camera that an envelope states, if ``deltas`` are those of a new keyframe."""
     if envelope.camera is None:
@@ -205,7 +205,7 @@ def note_camera(
             cameras[delta.keyframe] = camera_of(envelope, default)
 
 
-def _rows(view: MapView, cameras: Cameras, default: Camera) -> Iterator[Row]:
+def _rows(view: MapView, cameras: Cameras, default: CameraConstants) -> Iterator[Row]:
     for observation in view.observations:
         keyframe = view.keyframes[observation.keyframe]
         if observation.object is None or keyframe.pose is None or observation.embedding is None:

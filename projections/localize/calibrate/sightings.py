@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from projections.fold.deltas import Pose, UnitVector
 from projections.fold.exact import Q40
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize.camera import box_rows, focal_px, views
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ class Row(NamedTuple):
     picture: int
     run: int
     pose: Pose
-    camera: Camera
+    camera: CameraConstants
     class_name: str
     bbox: tuple[float, float, float, float]
     look: UnitVector
@@ -87,7 +87,7 @@ def sightings_of(rows: Iterable[Row]) -> Sightings:
     off_axis, height = np.zeros(n), np.full(n, np.nan)
     cut, boxed = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     mounted, beyond = np.zeros(n), 0
-    by_camera: dict[Camera, list[int]] = {}
+    by_camera: dict[CameraConstants, list[int]] = {}
     for i, row in enumerate(rows):
         by_camera.setdefault(row.camera, []).append(i)
     for camera, of in by_camera.items():

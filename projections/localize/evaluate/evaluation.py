@@ -17,7 +17,7 @@ from eventsrc.base.user_files import write_files
 from eventsrc.log import LogReader
 from eventsrc.log.seek import Note, resolve
 from projections.fold.corrections import Corrections
-from projections.fold.settings import Camera, Settings
+from projections.fold.settings import CameraConstants, Settings
 from projections.localize.relocalize import Method
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
@@ -70,7 +70,7 @@ def evaluate(
     *,
     until: str = "end",
     method: Method = "joint",
-    camera: Camera | None = None,
+    camera: CameraConstants | None = None,
     seed: int = DEFAULT_SEED,
     own: bool = False,
     workers: int | None = None,

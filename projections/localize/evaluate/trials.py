@@ -16,7 +16,7 @@ import numpy as np
 
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.log.seek import Note
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize import relocalize
 from projections.localize.relocalize import Answer, ExactIndex, Match, Method, rank
 from projections.map.view import MapView
@@ -133,7 +133,7 @@ class Asker:
     """Asks a map by exact search."""
 
     index: ExactIndex
-    camera: Camera | None
+    camera: CameraConstants | None
     method: Method
 
     def ask(self, question: relocalize.Question) -> Asked:
@@ -160,7 +160,7 @@ class TrialRunner:
         view: MapView,
         truth: Truth,
         *,
-        camera: Camera | None,
+        camera: CameraConstants | None,
         method: Method,
         room_index: RoomIndex | None = None,
     ) -> None:

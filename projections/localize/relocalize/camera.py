@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 from .constants import RankingModel
 
@@ -40,12 +40,12 @@ _FARTHEST_PX = 1e6
 """The limit of coordinates, which keeps squares in the geometry finite."""
 
 
-def focal_px(camera: Camera) -> float:
+def focal_px(camera: CameraConstants) -> float:
     """The focal length in pixels."""
     return camera.width_px / 2.0 / math.tan(half_field_rad(camera))
 
 
-def half_field_rad(camera: Camera) -> float:
+def half_field_rad(camera: CameraConstants) -> float:
     """Half the horizontal field of view."""
     return math.radians(camera.hfov_deg) / 2.0
 
@@ -75,7 +75,7 @@ def box_rows(boxes: Sequence[_Box | None]) -> Floats:
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
-def views(camera: Camera, rows: Floats) -> Views:
+def views(camera: CameraConstants, rows: Floats) -> Views:
     """The slopes and heights of boxes of `box_rows`."""
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -_FARTHEST_PX), _FARTHEST_PX)
     known = (x1 > x0) & (y1 > y0)
@@ -127,7 +127,7 @@ class SightLines:
         )
 
 
-def sights(camera: Camera, rows: Floats) -> SightLines:
+def sights(camera: CameraConstants, rows: Floats) -> SightLines:
     """The lines of sight of boxes of `box_rows`; parts farther outside the picture than the picture
     is large are cut off."""
     most = np.array((camera.width_px, camera.height_px) * 2)[:, None]

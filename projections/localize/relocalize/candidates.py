@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import RunId
 from projections.fold.deltas import ObservationOrdinal, PlaceOrdinal
-from projections.fold.errors import QuestionError
 from projections.fold.exact import Q40, quantise
-from projections.map.records import Estimate
+from projections.fold.map_errors import QuestionError
+from projections.map.records import EstimatedPosition
 from projections.map.view import MapView
 
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
@@ -241,7 +241,7 @@ class ExactIndex:
         )
 
 
-def _in_metres(estimate: Estimate | None) -> ObjectEstimate | None:
+def _in_metres(estimate: EstimatedPosition | None) -> ObjectEstimate | None:
     if estimate is None:
         return None
     return ObjectEstimate(

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple, Self
 
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import Camera, LocalizerConstants, Settings
+from projections.fold.settings import CameraConstants, LocalizerConstants, Settings
 
 SAMPLED: Final = 1_024
 """The most observations that are compared with others of their picture."""
@@ -66,7 +66,7 @@ class MapConstants:
     """
 
     evidence: EvidenceConstants = field(default_factory=EvidenceConstants)
-    camera: Camera = field(default_factory=Camera)
+    camera: CameraConstants = field(default_factory=CameraConstants)
     localizer: LocalizerConstants = field(default_factory=LocalizerConstants)
     different: float = _GUESS
     different_spread: float = 0.06

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 from .appearance import DIRECTIONS, appearance_tables, relative, subtract_shifts
 from .camera import Cue, Floats, SightLines, box_rows, cues, sights, views, with_class_sizes
@@ -143,7 +143,7 @@ class Seen(NamedTuple):
 def crop_groups(
     views_seen: Sequence[Sequence[Seen]],
     constants: MapConstants,
-    camera: Camera,
+    camera: CameraConstants,
     model: RankingModel,
 ) -> list[list[CropGroup]]:
     """The evidence of the crops of each view, in two groups at most; there is at least one crop.

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 from .appearance import DIRECTIONS
 from .camera import Floats, half_field_rad
@@ -109,7 +109,7 @@ class Scene:
     parameters and walls."""
 
     constants: MapConstants
-    camera: Camera
+    camera: CameraConstants
     model: RankingModel
     walls: WallLookup | None = None
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 from .camera import Floats
 
@@ -75,7 +75,7 @@ class Question:
     """
 
     views: tuple[QuestionView, ...]
-    camera: Camera | None = None
+    camera: CameraConstants | None = None
 
     @property
     def crops(self) -> tuple[QuestionCrop, ...]:

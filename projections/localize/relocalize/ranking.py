@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from projections.fold.deltas import PlaceOrdinal
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 from .candidates import MapCandidates, Match
 from .certainty import UNKNOWN_BELOW, known_probability, thinness
@@ -139,7 +139,7 @@ def rank(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera | None = None,
+    camera: CameraConstants | None = None,
     model: RankingModel = MODEL,
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel

@@ -25,9 +25,9 @@ from eventsrc.base.text import counted
 from eventsrc.base.user_files import FileFault
 from eventsrc.envelope.model import MAX_DIMENSION, Text, describe_error
 from eventsrc.envelope.readers import EnvelopeCamera
-from projections.fold.errors import QuestionError
 from projections.fold.exact import quantise, to_float32
-from projections.fold.settings import Camera
+from projections.fold.map_errors import QuestionError
+from projections.fold.settings import CameraConstants
 
 from .question import (
     MAX_CROPS,
@@ -125,7 +125,7 @@ def read_question(document: Any) -> Question:
     _check_crops(question.crops)
     if isinstance(document, dict) and document.get("camera") is not None:
         given = _checked(EnvelopeCamera, document["camera"], "camera")
-        camera = Camera.model_validate(given, from_attributes=True)
+        camera = CameraConstants.model_validate(given, from_attributes=True)
         return replace(question, camera=camera)
     return question
 

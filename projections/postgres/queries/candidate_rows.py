@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from eventsrc.base.text import advised
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import ObservationOrdinal, PlaceOrdinal
-from projections.fold.errors import (
+from projections.fold.map_errors import (
     ProjectionMismatch,
 )
 from projections.fold.settings import Settings

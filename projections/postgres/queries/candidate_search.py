@@ -20,14 +20,14 @@ from pgvector.psycopg import register_vector
 from psycopg import sql
 
 from eventsrc.base.text import advised
-from projections.fold.errors import (
+from projections.fold.map_errors import (
     DatabaseError,
     ExtensionMissing,
     ProjectionMismatch,
     ProjectionMissing,
     QuestionError,
 )
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import (
     NEIGHBOURS,
     Answer,
@@ -274,7 +274,7 @@ def relocalize(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera | None = None,
+    camera: CameraConstants | None = None,
 ) -> Answer:
     """Answer a question for re-localisation from the databases as they are now."""
     crops = question.crops if isinstance(question, Question) else question

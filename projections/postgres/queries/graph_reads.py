@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import psycopg
 
 from eventsrc.base.text import advised
-from projections.fold.errors import ProjectionMissing, QuestionError
+from projections.fold.map_errors import ProjectionMissing, QuestionError
 from projections.map.view import MapView
 from projections.postgres.connection import Connection, database_errors, describe_connection
 from projections.postgres.graph_rows import text

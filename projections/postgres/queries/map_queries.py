@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from eventsrc.base.text import advised
 from projections.fold.deltas import PlaceOrdinal
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.fold.place_types import type_of_name
 from projections.localize.relocalize import CandidatePlace, MapCandidates, QuestionCrop
 from projections.map.records import ObjectRecord

@@ -20,7 +20,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.errors import SettingsError
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import PRESETS, Settings, read_settings
 from projections.map.own_events import read_corrections
 

@@ -14,11 +14,11 @@ import typer
 
 from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 
 if TYPE_CHECKING:
     from eventsrc.record.transport.session import Session
-    from projections.fold.settings import Camera
+    from projections.fold.settings import CameraConstants
     from projections.localize.relocalize import Question
     from projections.postgres.connection import Targets
 
@@ -206,17 +206,17 @@ class CameraOptions:
     image: _ImageOption = None
 
     @property
-    def camera(self) -> "Camera | None":
+    def camera(self) -> "CameraConstants | None":
         """The camera that these describe; None without either of them, and with one alone the other
         is that of mapfold's defaults. Raises QuestionError for a bad size."""
-        from projections.fold.settings import Camera
+        from projections.fold.settings import CameraConstants
 
         given = {} if self.hfov is None else {"hfov_deg": self.hfov}
         try:
             if self.image is not None:
                 width, _, height = self.image.lower().partition("x")
                 given |= {"width_px": float(width), "height_px": float(height)}
-            return Camera.model_validate(given) if given else None
+            return CameraConstants.model_validate(given) if given else None
         except ValueError:
             raise QuestionError(
                 "no such camera: write --image as 640x400, in pixels, and --hfov as 1 to 170, in"

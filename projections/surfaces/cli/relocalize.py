@@ -17,8 +17,8 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
 from eventsrc.base.user_files import FileFault, open_file
 from eventsrc.log import LogReader
-from projections.fold.errors import QuestionError
-from projections.fold.settings import Camera
+from projections.fold.map_errors import QuestionError
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import (
     UNKNOWN_BELOW,
     Answer,
@@ -243,7 +243,7 @@ def _lines(read: Callable[[int], bytes], name: str) -> Iterator[bytes]:
 
 
 def print_tracked(
-    lines: Iterator[bytes], search: Search, *, top: int, camera: Camera | None
+    lines: Iterator[bytes], search: Search, *, top: int, camera: CameraConstants | None
 ) -> None:
     """Answer each line as soon as it comes. Raises QuestionError at the end if any was invalid."""
     track, asked, wrong = Track("relocalize --track"), 0, 0
@@ -263,7 +263,7 @@ def print_tracked(
 
 
 def _tracked(
-    line: bytes, track: Track, search: Search, top: int, camera: Camera | None
+    line: bytes, track: Track, search: Search, top: int, camera: CameraConstants | None
 ) -> dict[str, Any]:
     document = parse_json(line)
     question, moved = read_question(document), read_moved(document)

@@ -15,8 +15,8 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections
-from projections.fold.errors import SettingsError
-from projections.fold.settings import Camera, Settings, read_settings
+from projections.fold.map_errors import SettingsError
+from projections.fold.settings import CameraConstants, Settings, read_settings
 from projections.localize.relocalize import (
     Answer,
     ExactIndex,
@@ -136,7 +136,7 @@ def relocalize(
     *,
     top: int = 3,
     method: Method = "joint",
-    camera: Camera | None = None,
+    camera: CameraConstants | None = None,
 ) -> Answer:
     """The likeliest Places and the pose of a robot that sees some crops.
 

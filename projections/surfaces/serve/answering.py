@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple, cast, get_args
 
 from eventsrc.base.errors import MapfoldError
-from projections.fold.errors import (
+from projections.fold.map_errors import (
     DatabaseError,
     DatabaseUnavailable,
     ProjectionMismatch,
     ProjectionMissing,
     QuestionError,
 )
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import (
     Method,
     Question,
@@ -132,7 +132,7 @@ class Answerer:
         *,
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
-        camera: Camera | None = None,
+        camera: CameraConstants | None = None,
         note: Callable[[str], None] = lambda _: None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:

@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.record.metrics import METRICS_TYPE
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Method, describe_value
 
 from .answering import MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal

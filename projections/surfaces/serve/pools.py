@@ -14,7 +14,7 @@ from typing import Final, Self, TypeVar
 from psycopg_pool import ConnectionPool, PoolTimeout
 
 from eventsrc.base.text import advised
-from projections.fold.errors import DatabaseUnavailable, ProjectionMissing
+from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.postgres import checkpoints
 from projections.postgres.connection import (

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Answer, Track, describe_value
 from projections.localize.relocalize.question import Movement
 

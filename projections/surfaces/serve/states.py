@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import describe_value
 from projections.postgres.connection import Connection
 from projections.postgres.queries.graph_reads import (

@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.record.transport.session import Query, Session
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 
 from .answering import Answerer, encode, refusal
 from .fair_queue import FairQueue

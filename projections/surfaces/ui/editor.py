@@ -29,7 +29,7 @@ from projections.edit.record import (
     record_command,
     void_text,
 )
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
 from projections.history.rendering import difference_text
 

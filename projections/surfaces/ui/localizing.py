@@ -22,7 +22,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import Event
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import map_fingerprint
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import (
     ExactIndex,
     MapCandidates,

@@ -20,7 +20,7 @@ from eventsrc.log.format import list_growing
 from eventsrc.log.reader import OnGap
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections, map_fingerprint
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.history import LogTimeline, Progress
 from projections.history.timeline import SettingsChoice

@@ -15,8 +15,8 @@ import numpy as np
 from starlette.datastructures import QueryParams
 
 from eventsrc.envelope.model import Offset
-from projections.fold.errors import QuestionError
 from projections.fold.exact import UM_PER_M, mean_m
+from projections.fold.map_errors import QuestionError
 from projections.history.names import keyframe_name
 from projections.map.digest import map_digest
 from projections.map.view import MapView

@@ -19,7 +19,7 @@ from starlette.datastructures import QueryParams
 from eventsrc.base.errors import LogError, MapfoldError, MisuseError
 from eventsrc.base.text import visible_lines
 from eventsrc.envelope.model import Offset
-from projections.fold.errors import DatabaseError, LogPointError, QuestionError, SettingsError
+from projections.fold.map_errors import DatabaseError, LogPointError, QuestionError, SettingsError
 from projections.history import ExpressionError, KnownHistory, NoSuchThing
 from projections.store.columns import Array
 from projections.surfaces.serve.answering import TooMuchError

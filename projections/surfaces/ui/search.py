@@ -8,7 +8,7 @@ from starlette.datastructures import QueryParams
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, ObservationOrdinal
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
 from projections.history.names import find_keyframe, keyframe_name
 from projections.map.records import ObservationRecord

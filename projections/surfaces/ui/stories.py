@@ -13,7 +13,7 @@ from starlette.datastructures import QueryParams
 from eventsrc.base.text import visible, visible_lines
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
 from projections.history.explanation import Entry, Explanation, explain_same_place
 from projections.history.merges import (

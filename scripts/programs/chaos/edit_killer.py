@@ -25,7 +25,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.recorder.edits import send_command
 from eventsrc.record.transport.session import Router, ZenohOptions, open_session
-from projections.fold.errors import DatabaseError
+from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.map.own_events import read_commands
 from projections.postgres import rebuild

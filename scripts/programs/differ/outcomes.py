@@ -10,7 +10,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
-from projections.fold.errors import FoldError
+from projections.fold.map_errors import FoldError
 from projections.fold.settings import PRESETS, Settings
 from projections.history.known import KnownHistory
 from projections.history.merges import merge_document, object_merge_document, refusal_document

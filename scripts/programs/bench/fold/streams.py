@@ -8,7 +8,7 @@ import numpy as np
 
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import Detection, DetId, Envelope
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 
 WIDTH_M, DEPTH_M = 20.0, 15.0
 DIM = 512
@@ -57,7 +57,7 @@ def keyframes(count: int, detections: int) -> Iterator[Accepted]:
 def pictures(count: int) -> Iterator[Accepted]:
     """Keyframes of `house_walk` that look where the robot drives: of the 60 pieces of furniture the
     nearest three in view, their boxes as a camera with the settings' defaults draws them."""
-    rng, camera = np.random.default_rng(9), Camera()
+    rng, camera = np.random.default_rng(9), CameraConstants()
     spots = rng.uniform((0, 0), (WIDTH_M, DEPTH_M), (60, 2))
     heights, elevations = rng.uniform(0.3, 1.5, 60), rng.uniform(-0.4, 0.4, 60)
     classes = rng.normal(size=(20, DIM))

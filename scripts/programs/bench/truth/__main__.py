@@ -21,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
-from projections.fold.errors import SettingsError
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 
 from . import tables

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest_all
-from projections.fold.settings import Camera
+from projections.fold.settings import CameraConstants
 from projections.localize.evaluate.truth import Truth, read_truth
 from tests.support.shared_data import DATA, WORLDS
 
@@ -58,7 +58,7 @@ class Case:
     """
 
     name: str
-    camera: Camera
+    camera: CameraConstants
     events: list[Accepted]
     truth: Truth
     things: dict[str, TrueThing]
@@ -191,7 +191,9 @@ def read_case(folder: Path, profile: str, world: str) -> Case:
     camera = json.loads((folder / "camera.json").read_text())
     return Case(
         f"{profile} {world}",
-        Camera(hfov_deg=camera["hfov_deg"], width_px=camera["width"], height_px=camera["height"]),
+        CameraConstants(
+            hfov_deg=camera["hfov_deg"], width_px=camera["width"], height_px=camera["height"]
+        ),
         [accepted for path in runs for accepted in _accepted(path)],
         read_truth([path.with_name(path.name.replace(".jsonl", ".truth.jsonl")) for path in runs]),
         {thing.instance: thing for thing in _things(folder)},
@@ -207,7 +209,7 @@ def house_case(run: str = "house-a") -> Case | None:
         return None
     truth = read_truth([path.with_name(f"{run}.truth.jsonl.gz")])
     things = {thing.instance: thing for thing in _things(path.parent)}
-    return Case(run, Camera(), _accepted(path), truth, things, run, {})
+    return Case(run, CameraConstants(), _accepted(path), truth, things, run, {})
 
 
 def _runs(folder: Path, world: str) -> list[Path]:

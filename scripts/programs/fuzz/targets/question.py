@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from projections.fold.errors import QuestionError
+from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import parse_question
 from projections.localize.relocalize.question import MAX_VIEWS
 from scripts.programs.attack.corruption import corrupt_json

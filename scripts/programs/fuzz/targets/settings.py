@@ -5,7 +5,7 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-from projections.fold.errors import SettingsError
+from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 from projections.surfaces.cli.folded_log import settings_from
 from scripts.programs.attack.corruption import corrupt_json
