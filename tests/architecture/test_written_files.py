@@ -19,7 +19,7 @@ OWN_WAY = {
     "projections/postgres/embedded.py": "locks and the server's log",
     "projections/postgres/server_user.py": "renamed when it is whole",
     "projections/surfaces/cli/program.py": "/dev/null",
-    "projections/surfaces/demo/folder.py": "the lock of the demo's folder",
+    "projections/surfaces/demo/play.py": "the lock of the demo's folder",
     "projections/surfaces/demo/recording.py": "what a running child process says",
 }
 """Modules that write otherwise, and what."""

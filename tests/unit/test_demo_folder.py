@@ -5,17 +5,17 @@ from pathlib import Path
 import pytest
 
 from eventsrc.base.errors import MisuseError
-from projections.surfaces.demo.folder import fresh_folder
+from projections.surfaces.demo.play import fresh_folder
 
 
 def test_a_second_demo_in_the_same_folder_is_refused(tmp_path: Path) -> None:
     with fresh_folder(tmp_path / "demo") as folder:
-        folder.log.mkdir()
+        (folder / "log").mkdir()
         with pytest.raises(MisuseError, match="another demo is at work there; wait"):
             fresh_folder(tmp_path / "demo").__enter__()
-        assert folder.log.is_dir()
+        assert (folder / "log").is_dir()
     with fresh_folder(tmp_path / "demo") as again:
-        assert not again.log.exists()
+        assert not (again / "log").exists()
 
 
 def test_a_folder_that_no_demo_made_is_refused(tmp_path: Path) -> None:

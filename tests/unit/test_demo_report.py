@@ -5,22 +5,19 @@ from typing import Any
 
 import pytest
 
-from eventsrc.envelope.commands import Anchor, NamePlace, UndoMerge
-from eventsrc.envelope.model import KeyframeId, Offset, RunId
-from projections.fold.corrections import RecordedCommand
 from projections.fold.settings import Settings
 from projections.map.view import MapView
 from projections.postgres import RebuildReport
 from projections.postgres.labels import LABELS, TABLE
 from projections.surfaces.demo import report
-from projections.surfaces.demo.correcting import Corrected
-from projections.surfaces.demo.mapping import Folded, Part, RoomMerge, most_telling
-from projections.surfaces.demo.recording import Followed, Recorded
+from projections.surfaces.demo.acts import Corrected, Explored, RoomMerge, RoomPart, most_telling
+from projections.surfaces.demo.recording import Followed, RecordedRun
 from projections.surfaces.demo.report import DemoResult, type_lines
+from projections.surfaces.python import Map
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import fold
 
-RECORDED = Recorded(
+RECORDED = RecordedRun(
     run_id="sim-1-a",
     published=10,
     recorded=10,
@@ -32,10 +29,11 @@ RECORDED = Recorded(
     seconds=3.0,
 )
 FOLLOWED = Followed(events=10, batches=4, median_delay_s=0.04, worst_delay_s=0.09)
-FOLDED = Folded(MapView(Settings()), (), (), "abcdef0123456789" * 4, 0.1)
+HOUSE = Map(MapView(Settings()))
+EXPLORED = Explored(HOUSE, (), 0.1)
 REPLAYED = RebuildReport(
     events=10,
-    digest=FOLDED.digest,
+    digest=HOUSE.digest,
     counts={},
     rows=dict.fromkeys([*LABELS, TABLE], 2),
     fold_s=0.1,
@@ -45,19 +43,15 @@ REPLAYED = RebuildReport(
 
 
 def _merge(offset: int, one: str, other: str, smaller: int) -> RoomMerge:
-    parts = Part("sim-1-a_p0", 30, one), (Part("sim-1-a_p1", smaller, other),)
+    parts = RoomPart("sim-1-a_p0", 30, one), (RoomPart("sim-1-a_p1", smaller, other),)
     return RoomMerge(offset, "sim-1-a", offset + 1, "hall", *parts, places_before=5)
 
 
-ANCHORS = tuple(Anchor(run_id=RunId("sim-1-a"), keyframe_id=KeyframeId(k)) for k in (3, 90))
-SAID = {"command_id": "c", "issued_by": "demo@mapfold"}
-UNDO_MERGE = UndoMerge(merge_offset=Offset(1234), places=ANCHORS, **SAID)
-NAME_PLACE = NamePlace(place=ANCHORS[1], name="dining room", **SAID)
 CORRECTED = Corrected(
-    (RecordedCommand(Offset(1300), UNDO_MERGE), RecordedCommand(Offset(1301), NAME_PLACE)),
-    Part("sim-1-a_p12", 120, "dining room"),
-    (Part("sim-1-a_p11", 345, "living room"), Part("sim-1-a_p12", 120, "dining room")),
-    FOLDED,
+    ({"kind": "undo-merge", "offset": 1300}, {"kind": "name-place", "offset": 1301}),
+    RoomPart("sim-1-a_p12", 120, "dining room"),
+    (RoomPart("sim-1-a_p11", 345, "living room"), RoomPart("sim-1-a_p12", 120, "dining room")),
+    HOUSE,
     REPLAYED,
     0.3,
 )
@@ -66,7 +60,7 @@ CORRECTED = Corrected(
 def _result() -> DemoResult:
     lost: Any = None
     return DemoResult(
-        1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, FOLDED, CORRECTED, lost=lost
+        1, Settings(), RECORDED, FOLLOWED, REPLAYED, True, EXPLORED, CORRECTED, lost=lost
     )
 
 
@@ -100,11 +94,11 @@ def test_an_incomplete_log_is_reported() -> None:
 
 @pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
 def test_a_replay_with_other_rows_is_reported(same: bool, says: str) -> None:
-    assert says in "\n".join(report.replay_lines(REPLAYED, FOLDED, same))
+    assert says in "\n".join(report.replay_lines(REPLAYED, HOUSE, same))
 
 
 def test_a_replay_with_another_digest_is_reported() -> None:
-    lines = "\n".join(report.replay_lines(replace(REPLAYED, digest="0" * 64), FOLDED, True))
+    lines = "\n".join(report.replay_lines(replace(REPLAYED, digest="0" * 64), HOUSE, True))
     assert "ANOTHER digest" in lines
 
 
@@ -134,8 +128,8 @@ def test_lines_fit_a_terminal() -> None:
     merges = (_merge(1234, "living room", "dining room", 120), _merge(7, "hall", "hall", 3))
     lines = [
         *report.recording_lines(RECORDED, FOLLOWED, 12_345, 8, 30.0),
-        *report.replay_lines(REPLAYED, FOLDED, True),
-        *report.map_lines(FOLDED, Settings(), 1),
+        *report.replay_lines(REPLAYED, HOUSE, True),
+        *report.map_lines(HOUSE, Settings(), 1),
         *report.merge_lines(merges),
         *report.correction_lines(CORRECTED),
         *report.correction_lines(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
@@ -158,9 +152,9 @@ def test_types_of_places_are_told_in_lines_that_fit() -> None:
         for room in range(7)
         for k in range(4)
     ]
-    lines = list(type_lines(fold(documents).view))
+    lines = list(type_lines(Map(fold(documents).view)))
     assert lines[0].startswith("   by what stands in them (1 unsure): p1 bathroom ")
     assert sum(line.count("bathroom") for line in lines) == 6
     assert len(lines) > 1
     assert all(len(line) <= 96 for line in lines)
-    assert list(type_lines(fold(documents[:4]).view)) == []
+    assert list(type_lines(Map(fold(documents[:4]).view))) == []

@@ -25,7 +25,7 @@ def test_drawing() -> None:
 
 
 def test_demo() -> None:
-    assert projections.surfaces.demo.__all__ == ["DemoOptions", "run_demo"]
+    assert projections.surfaces.demo.__all__ == ["run_demo"]
 
 
 def test_the_command_line_loads_no_matplotlib_until_something_is_drawn() -> None:

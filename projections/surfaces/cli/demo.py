@@ -35,9 +35,9 @@ def demo(
     Exit 3 when log, databases and fold do not agree.
     """
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
-    from projections.surfaces.demo import DemoOptions, run_demo
+    from projections.surfaces.demo import run_demo
 
-    numbers = run_demo(DemoOptions(out, seed, speed, databases.db, databases.vector_db), say)
+    numbers = run_demo(out, seed, speed, databases.db, databases.vector_db, say)
     if json_:
         emit(numbers)
     finish(findings=not numbers["sound"])

@@ -1,5 +1,5 @@
 """`mapfold demo`: record, replay, map and re-localise on one machine, with real parts."""
 
-from .play import DemoOptions, run_demo
+from .play import run_demo
 
-__all__ = ["DemoOptions", "run_demo"]
+__all__ = ["run_demo"]

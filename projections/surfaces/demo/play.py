@@ -1,118 +1,155 @@
 """The demo's stages in order: record, replay, map, correct, ask, draw; then commands to go on with.
 
 House and runs are made before the time is taken: simulating them is no part of mapfold.
+
+The output folder is emptied at the start, if a demo made it, which a file named ``MARKER`` says.
+The database server's files in it are kept, because making them takes longest and a replay replaces
+what is in them. A running demo holds a lock on ``MARKER``: a second one would remove its log.
 """
 
 import contextlib
+import fcntl
 import os
 import shlex
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from eventsrc.adapters.sim import DEFAULT_SEED, occupancy_map, simulate_run
-from eventsrc.base.text import command_line
-from eventsrc.base.user_files import write_files
+from eventsrc.adapters.sim import occupancy_map, simulate_run
+from eventsrc.base.advised import command_line
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.output_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
-from projections.adapters.drawing import draw_map, floor_of
+from projections import history
+from projections.adapters.drawing import Bridge, LostRobot, Spot, draw_map, floor_of
 from projections.adapters.drawing.picture import bridges_of
-from projections.fold.settings import PRESETS, Settings
 from projections.postgres import rebuild
+from projections.postgres.check import check
 from projections.postgres.connection import Targets, open_targets
 from projections.postgres.embedded import EmbeddedServer
+from projections.surfaces.python import Map, Settings, fold
 
 from . import report
-from .asking import ask_lost, place_rooms
-from .correcting import correct
-from .folder import DemoFolder, fresh_folder
-from .mapping import RoomMerge, fold_with_rooms, hash_tables, most_telling, places_with
+from .acts import (
+    SETTINGS,
+    LostRun,
+    RoomMerge,
+    ask_lost,
+    correct,
+    explore,
+    most_telling,
+    place_rooms,
+)
 from .recording import record_run
-from .report import DemoResult, result_document
 
-SETTINGS: Final = Settings().with_assignments(PRESETS["rooms"])
-"""With the default settings the whole house becomes one place."""
-
-
-@dataclass(frozen=True, slots=True)
-class DemoOptions:
-    """Output folder, house, speed of the robot, and databases if not the demo's own."""
-
-    out: Path
-    seed: int = DEFAULT_SEED
-    speed: float = 30.0
-    db: str | None = None
-    vector_db: str | None = None
+MARKER: Final = ".mapfold-demo"
+_GENERATED: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
 
 
-PrintLine = Callable[[str], None]
+@contextlib.contextmanager
+def fresh_folder(path: Path) -> Iterator[Path]:
+    """An empty demo folder at ``path``, locked until the end.
+
+    Raises MisuseError when something else is there, or another demo is at work in it.
+    """
+    with contextlib.ExitStack() as held:
+        try:
+            _lock(path, held)
+            if (path / "log").exists():
+                shutil.rmtree(path / "log")
+            for pattern in _GENERATED:
+                for old in path.glob(pattern):
+                    old.unlink()
+        except OSError as error:
+            raise MisuseError(f"{path}: {error.strerror}; choose another --out") from None
+        yield path
 
 
-def run_demo(options: DemoOptions, print_line: PrintLine) -> dict[str, Any]:
-    """Run the demo; ``print_line`` gets each line of its report. Returns its numbers for JSON."""
-    with fresh_folder(options.out) as folder:
-        return _play(options, folder, print_line)
+def _lock(path: Path, held: contextlib.ExitStack) -> None:
+    """Mark the folder, and lock the mark for as long as ``held`` is; see `fresh_folder`."""
+    if path.exists() and not (path / MARKER).exists() and any(path.iterdir()):
+        raise MisuseError(
+            f"{path}: not empty and not made by the demo; choose another --out or remove it"
+        )
+    path.mkdir(parents=True, exist_ok=True)
+    mark = held.enter_context((path / MARKER).open("a"))
+    try:
+        fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise MisuseError(
+            f"{path}: another demo is at work there; wait for it or choose another --out"
+        ) from None
+    mark.truncate(0)
+    mark.write("made by mapfold demo; the next one removes it\n")
+    mark.flush()
 
 
-def _play(options: DemoOptions, folder: DemoFolder, print_line: PrintLine) -> dict[str, Any]:
-    explorer, lost_run = simulate_run(options.seed, "a"), simulate_run(options.seed, "b")
-    settings = SETTINGS.model_dump_json(indent=2) + "\n"
-    write_files({folder.settings: settings.encode()})
-    clock = _Stages(print_line)
-    house = explorer.house
+def run_demo(
+    out: Path,
+    seed: int,
+    speed: float,
+    db: str | None,
+    vector_db: str | None,
+    print_line: Callable[[str], None],
+) -> dict[str, Any]:
+    """Run the demo; ``print_line`` gets each line of its report. Returns its numbers for JSON.
+
+    ``speed`` is that of the robot, ``db`` and ``vector_db`` are databases if not the demo's own.
+    """
+    explorer, lost_run = simulate_run(seed, "a"), simulate_run(seed, "b")
+    house, clock = explorer.house, _Stages(print_line)
     detections = sum(len(envelope["detections"]) for envelope in explorer.envelopes)
-    rooms = len(house.plan.rooms)
-    with contextlib.ExitStack() as stack:
+    with fresh_folder(out) as folder, contextlib.ExitStack() as stack:
+        log, settings = folder / "log", folder / "settings.json"
+        write_files({settings: (SETTINGS.model_dump_json(indent=2) + "\n").encode()})
         with clock.stage("Run A explores the house and is recorded"):
-            targets = stack.enter_context(_databases(folder, options))
-            with LogWriter(folder.log) as writer:
+            targets = stack.enter_context(_databases(folder, db, vector_db))
+            with LogWriter(log) as writer:
                 writer.append(MAP_KEY, occupancy_map(house).encode())
-            recorded, followed = record_run(explorer, options.speed, folder, targets, SETTINGS)
-            clock.show(report.recording_lines(recorded, followed, detections, rooms, options.speed))
+            recorded, followed = record_run(explorer, speed, folder, targets, SETTINGS)
+            rooms = len(house.plan.rooms)
+            clock.show(report.recording_lines(recorded, followed, detections, rooms, speed))
         with clock.stage("The databases are thrown away and the log is replayed"):
-            before = hash_tables(targets)
-            replayed = rebuild(folder.log, targets, SETTINGS)
-            same_rows = hash_tables(targets) == before
-            folded = fold_with_rooms(folder, SETTINGS, explorer)
-            clock.show(report.replay_lines(replayed, folded, same_rows))
+            tailed = _have_rows(log, targets)
+            replayed = rebuild(log, targets, SETTINGS)
+            same_rows = tailed and _have_rows(log, targets)
+            explored = explore(log, explorer)
+            clock.show(report.replay_lines(replayed, explored.house, same_rows))
         with clock.stage("The map"):
-            default_places = places_with(folder, Settings())
-            clock.show(report.map_lines(folded, Settings(), default_places))
-            clock.show(report.type_lines(folded.view))
-            clock.show(report.merge_lines(folded.merges))
+            default_places = len(fold(log, settings=Settings(), embeddings=False).places)
+            clock.show(report.map_lines(explored.house, Settings(), default_places))
+            clock.show(report.type_lines(explored.house))
+            clock.show(report.merge_lines(explored.merges))
         with clock.stage("A person corrects the map"):
-            corrected = correct(folder, targets, SETTINGS, explorer, folded)
+            corrected = correct(log, targets, explorer, explored)
             clock.show(report.correction_lines(corrected))
         with clock.stage("Run B is lost and asks"):
-            lost = ask_lost(targets, lost_run, folder)
-            clock.show(report.question_lines(lost, place_rooms(corrected.folded.view, explorer)))
-    with clock.stage("The map is drawn"):
-        draw_map(
-            corrected.folded.view,
-            folder.map,
-            title=f"House {house.seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
-            floor=floor_of(house),
-            lost=lost.drawing,
-            bridges=bridges_of(corrected.folded.view, corrected.folded.deltas),
-        )
-        clock.show([f"   {folder.map}"])
+            lost = ask_lost(corrected.house, lost_run, folder)
+            clock.show(report.question_lines(lost, place_rooms(corrected.house, explorer)))
+        with clock.stage("The map is drawn"):
+            draw_map(
+                corrected.house.view,
+                folder / "map.png",
+                title=f"House {seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
+                floor=floor_of(house),
+                lost=_where_lost(lost),
+                bridges=_bridges(log, corrected.house),
+            )
+            clock.show([f"   {folder / 'map.png'}"])
     print_line(f"{clock.total:.1f} s in all. Go on with it:")
-    clock.show(_next_commands(folder, most_telling(folded.merges), options.db, options.vector_db))
-    return result_document(
-        DemoResult(
-            options.seed, SETTINGS, recorded, followed, replayed, same_rows, folded, corrected, lost
-        ),
-        clock.seconds,
-        folder,
+    clock.show(_next_commands(folder, most_telling(explored.merges), db, vector_db))
+    done = report.DemoResult(
+        seed, SETTINGS, recorded, followed, replayed, same_rows, explored, corrected, lost
     )
+    return report.result_document(done, clock.seconds, folder)
 
 
 class _Stages:
-    def __init__(self, print_line: PrintLine) -> None:
+    def __init__(self, print_line: Callable[[str], None]) -> None:
         self._print_line = print_line
         self.seconds: dict[str, float] = {}
 
@@ -134,38 +171,58 @@ class _Stages:
 
 
 @contextlib.contextmanager
-def _databases(folder: DemoFolder, options: DemoOptions) -> Iterator[Targets]:
+def _databases(folder: Path, db: str | None, vector_db: str | None) -> Iterator[Targets]:
     """The user's databases if given, else a server of the demo's own, in its folder.
 
     Not the user's embedded server, nor what MAPFOLD_DB names: the demo must not replace their map.
     """
-    if options.db is not None:
-        with open_targets(options.db, options.vector_db or options.db) as targets:
+    if db is not None:
+        with open_targets(db, vector_db or db) as targets:
             yield targets
         return
-    with EmbeddedServer(folder.path) as server:
-        yield Targets(server.url, options.vector_db or server.url, server)
+    with EmbeddedServer(folder) as server:
+        yield Targets(server.url, vector_db or server.url, server)
+
+
+def _have_rows(log: Path, targets: Targets) -> bool:
+    """Whether the databases have exactly the rows of the log's fold."""
+    return not any(report.differing for report in check(log, targets, SETTINGS))
+
+
+def _where_lost(lost: LostRun) -> LostRobot:
+    """The lost robot and the last question's estimate of its pose."""
+    pose, truth = lost.questions[-1].answer.pose, Spot(**lost.truth)
+    if pose is None:
+        return LostRobot(truth, None)
+    return LostRobot(truth, Spot(pose.x, pose.y, pose.yaw), pose.spread_m)
+
+
+def _bridges(log: Path, house: Map) -> list[Bridge]:
+    """A mark for each merge that the corrections left."""
+    with history.Timeline(log, lambda _: SETTINGS, cache=False) as timeline:
+        merges = timeline.knowing(timeline.end).merges(timeline.end)
+    return bridges_of(house.view, merges)
 
 
 def _next_commands(
-    folder: DemoFolder, merge: RoomMerge | None, db: str | None, vector_db: str | None
+    folder: Path, merge: RoomMerge | None, db: str | None, vector_db: str | None
 ) -> Iterator[str]:
     """Commands to paste into a POSIX shell, with comments. A test runs them."""
     if shutil.which("mapfold") is None:
         activate = Path(sys.prefix) / "bin" / "activate"
         yield f"   . {_quoted(_relative(activate))}    # puts mapfold on the path"
     if db is None:
-        yield f"   export MAPFOLD_HOME={_quoted(folder.path)}    # where the databases are"
+        yield f"   export MAPFOLD_HOME={_quoted(folder)}    # where the databases are"
     if db is not None or vector_db is not None:  # a URL may hold a password: not printed
         yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
-    log, settings = folder.log, ("--settings", folder.settings)
+    log, settings = folder / "log", ("--settings", folder / "settings.json")
     yield f"   {command_line('state', log, *settings)}"
     if merge is not None:
         before_and_behind = merge.offset, merge.offset + 1
         yield f"   {command_line('diff', log, *before_and_behind, *settings)}    # that merge"
         yield f"   {command_line('merges', log, *settings, '--refused')}    # undone since"
     yield f"   {command_line('edits', log, *settings)}"
-    yield f"   {command_line('relocalize', folder.question(1))}"
+    yield f"   {command_line('relocalize', folder / 'question-1.json')}"
     yield f"   {command_line('status', log, *settings)}"
     shown = ("--at", merge.offset + 1, "--select", f"merge:{merge.offset}") if merge else ()
     yield f"   {command_line('ui', log, *settings, *shown)}    # in a browser"

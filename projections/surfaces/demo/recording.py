@@ -1,7 +1,9 @@
 """Record run A: one process publishes it, another records, over a router in this process.
 
 Meanwhile a tail in a thread of this process writes the log into the databases. `Children` are
-mapfold commands as child processes, which end with the demo, even when it is killed.
+mapfold commands as child processes, which end with the demo, even when it is killed. On a busy
+machine a fixed deadline would end work that proceeds: waiting ends when nothing has changed for
+`STALLED_S`.
 """
 
 import statistics
@@ -13,7 +15,6 @@ from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from eventsrc.adapters.sim import SimulatedRun
@@ -27,96 +28,103 @@ from projections.fold.settings import Settings
 from projections.postgres import TailReport, rebuild, tail
 from projections.postgres.connection import Targets
 
-from .folder import DemoFolder
-from .progress import STALLED_S, Progress, cpu_steps, size_of
-
+STALLED_S: Final = 180.0
 _END_S: Final = 10.0
 _POLL_S: Final = 0.05
+_ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
+_WAIT_S: Final = 600
+"""Seconds that the publisher waits for the recorder, which is running already."""
+
+
+def wait_until(
+    done: Callable[[], bool],
+    observe: Callable[[], Hashable],
+    complaint: Callable[[], str],
+    stalled_s: float = STALLED_S,
+) -> None:
+    """Wait until ``done``. Raises MapfoldError with ``complaint`` when what ``observe`` returns has
+    not changed for ``stalled_s`` seconds."""
+    pause = threading.Event()
+    seen, since = observe(), time.monotonic()
+    while not done():
+        now = observe()
+        if now != seen:
+            seen, since = now, time.monotonic()
+        elif time.monotonic() - since > stalled_s:
+            raise MapfoldError(complaint())
+        pause.wait(_POLL_S)
 
 
 class Children:
     """Child processes that end with the ``with`` block: terminated, after 10 s killed."""
 
     def __init__(self) -> None:
-        self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._stderr: dict[str, Path] = {}
+        self._all: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
 
     def start(self, name: str, arguments: Sequence[str], stderr: Path) -> None:
         """Start ``mapfold *arguments``; its stderr goes to the file ``stderr``."""
+        program = [sys.executable, "-m", "projections.surfaces.cli", "--ends-with-stdin"]
         with stderr.open("wb") as errors:
-            self._running[name] = subprocess.Popen(  # noqa: S603  # our own program and arguments
-                [sys.executable, "-m", "projections.surfaces.cli.child_process", *arguments],
-                stdin=subprocess.PIPE,  # its end stops the child process
+            child = subprocess.Popen(  # noqa: S603  # our own program and arguments
+                [*program, *arguments],
+                stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
             )
-        self._stderr[name] = stderr
+        self._all[name] = child, stderr
 
     def wait(
         self,
-        observe: Callable[[], Hashable],
-        *,
-        working: Sequence[str] = (),
+        done: Callable[[], bool] | None = None,
+        observe: Callable[[], Hashable] = lambda: None,
         stalled_s: float = STALLED_S,
     ) -> None:
-        """Wait until all have ended, however long it takes while there is progress: what
-        ``observe`` returns changes, one of them ends or writes to stderr, or one that is named in
-        ``working`` uses its processor. Raises MapfoldError if one fails or there is none for
-        ``stalled_s`` seconds."""
+        """Wait until ``done``, by default until all have ended, while there is progress: what
+        ``observe`` returns changes, or a child ends or writes to stderr. Raises MapfoldError if a
+        child fails or there is no progress for ``stalled_s`` seconds."""
+
+        def finished() -> bool:
+            over = done() if done is not None else not self._running()
+            self._check()
+            return over
 
         def seen() -> Hashable:
-            written = tuple(map(size_of, self._stderr.values()))
-            return observe(), written, tuple(self._names_running()), self._cpu_steps(working)
+            each = ((p.poll(), err.stat().st_size) for p, err in self._all.values())
+            return observe(), tuple(each)
 
-        progress = Progress(seen, stalled_s)
-        pause = threading.Event()
-        while names := self._names_running():
-            self._check()
-            if progress.is_stalled():
-                raise MapfoldError(
-                    f"mapfold {' and '.join(names)} made no progress for {stalled_s:g} s; "
-                    f"see {self._stderr[names[0]]}"
-                )
-            pause.wait(_POLL_S)
-        self._check()
+        def complaint() -> str:
+            names = self._running() or list(self._all)
+            return (
+                f"mapfold {' and '.join(names)} made no progress for {stalled_s:g} s; see "
+                f"{self._all[names[-1]][1]}"
+            )
+
+        wait_until(finished, seen, complaint, stalled_s)
 
     def wait_for_output(self, name: str, text: str, stalled_s: float = STALLED_S) -> None:
-        """Wait until ``name`` has written ``text`` to stderr, while it writes or uses its
-        processor; raises as `wait` does."""
-        file = self._stderr[name]
-        progress = Progress(lambda: (size_of(file), self._cpu_steps([name])), stalled_s)
-        pause = threading.Event()
-        while text not in file.read_text("utf-8", "replace"):
-            self._check()
-            if progress.is_stalled():
-                raise MapfoldError(
-                    f"mapfold {name} did not start: no progress for {stalled_s:g} s; see {file}"
-                )
-            pause.wait(_POLL_S)
+        """Wait until ``name`` has written ``text`` to stderr; raises as `wait` does."""
+        _, file = self._all[name]
+        self.wait(lambda: text in file.read_text("utf-8", "replace"), stalled_s=stalled_s)
 
-    def _names_running(self) -> list[str]:
-        return [name for name, process in self._running.items() if process.poll() is None]
-
-    def _cpu_steps(self, names: Sequence[str]) -> tuple[int, ...]:
-        return tuple(cpu_steps(self._running[name].pid) for name in names)
+    def _running(self) -> list[str]:
+        return [name for name, (process, _) in self._all.items() if process.poll() is None]
 
     def _check(self) -> None:
-        for name, process in self._running.items():
+        for name, (process, stderr) in self._all.items():
             code = process.poll()
             if code:
-                lines = self._stderr[name].read_text("utf-8", "replace").strip().splitlines()
+                lines = stderr.read_text("utf-8", "replace").strip().splitlines()
                 last_line = lines[-1] if lines else "no output"
                 raise MapfoldError(f"mapfold {name} ended with exit {code}: {last_line}")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        for process in self._running.values():
+    def __exit__(self, *_: object) -> None:
+        processes = [process for process, _ in self._all.values()]
+        for process in processes:
             process.terminate()  # does nothing to one that has ended
-        for process in self._running.values():
+        for process in processes:
             try:
                 process.wait(_END_S)
             except subprocess.TimeoutExpired:
@@ -126,13 +134,8 @@ class Children:
                 process.stdin.close()  # not before: the end of its stdin is another SIGTERM
 
 
-_ANY_PORT: Final = ZenohOptions(listen=("tcp/127.0.0.1:0",))
-_WAIT_S: Final = 600
-"""Seconds that the publisher waits for the recorder, which is running already."""
-
-
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedRun:
     """The numbers of published, recorded, rejected and lost envelopes.
 
     ``intact`` says that the log holds every payload, in order, byte for byte.
@@ -160,52 +163,37 @@ class Followed:
 
 
 def record_run(
-    run: SimulatedRun,
-    speed: float,
-    folder: DemoFolder,
-    targets: Targets,
-    settings: Settings,
-) -> tuple[Recorded, Followed]:
-    """Publish run A, record it into the folder's log after the events there, and tail it into the
+    run: SimulatedRun, speed: float, folder: Path, targets: Targets, settings: Settings
+) -> tuple[RecordedRun, Followed]:
+    """Publish run A, record it into ``folder/log`` after the events there, and tail it into the
     databases."""
-    started = time.monotonic()
-    with LogReader(folder.log) as reader:
+    started, log = time.monotonic(), folder / "log"
+    with LogReader(log) as reader:
         before = reader.next_offset
     count = len(run.envelopes)
-    drive_s = run.true_poses[-1].time_s
     with Router(_ANY_PORT) as router, Children() as children:
         connect = ("--connect", router.endpoints[0])
-        children.start(
-            "record",
-            ("record", str(folder.log), *connect, "--max-events", str(count)),
-            folder.stderr_of("record"),
-        )
+        recorder = ("record", str(log), *connect, "--max-events", str(count))
+        children.start("record", recorder, folder / "record.txt")
         children.wait_for_output("record", "recording")
-        with BackgroundTail(folder.log, targets, settings) as background_tail:
-            seed = str(run.house.seed)
+        with BackgroundTail(log, targets, settings) as background_tail:
+            robot = ("simulate", "--seed", str(run.house.seed), "--run", "a", *connect)
             paced = ("--speed", str(speed), "--wait", str(_WAIT_S))
-            children.start(
-                "simulate",
-                ("simulate", "--seed", seed, "--run", "a", *paced, *connect),
-                folder.stderr_of("simulate"),
-            )
-            children.wait(
-                lambda: (size_of(folder.log), background_tail.reached),
-                working=["simulate"],
-            )
+            children.start("simulate", (*robot, *paced), folder / "simulate.txt")
+            children.wait(observe=lambda: background_tail.reached)
             followed = background_tail.wait_for(Offset(before + count))
     seconds = time.monotonic() - started
-    info = log_info(folder.log)
-    with LogReader(folder.log) as reader:
+    info = log_info(log)
+    with LogReader(log) as reader:
         payloads = [event.payload for event in reader.read() if event.is_envelope]
-    recorded = Recorded(
+    recorded = RecordedRun(
         run_id=run.run_id,
         published=count,
         recorded=len(payloads),
         intact=payloads == list(run.payloads),
         rejected=info.rejected,
         lost=info.lost,
-        drive_seconds=drive_s,
+        drive_seconds=run.true_poses[-1].time_s,
         log_bytes=info.size_bytes,
         seconds=seconds,
     )
@@ -223,11 +211,10 @@ class BackgroundTail:
         self._stop = threading.Event()
         self._commits: list[tuple[Offset, int]] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="tail")
-        self._running: Future[TailReport] | None = None
 
     def __enter__(self) -> Self:
         rebuild(self._log, self._targets, self._settings, until=FIRST_OFFSET)
-        self._running = self._pool.submit(
+        self._running: Future[TailReport] = self._pool.submit(
             tail, self._log, self._targets, self._settings, stop=self._stop, on_batch=self._on_batch
         )
         return self
@@ -243,20 +230,21 @@ class BackgroundTail:
 
     def wait_for(self, end: Offset) -> Followed:
         """Wait until ``end`` events are in the databases; returns the delays."""
-        assert self._running is not None  # noqa: S101 - inside the with block
-        progress, pause = Progress(lambda: self.reached), threading.Event()
-        while self.reached < end:
+
+        def done() -> bool:
             if self._running.done():
                 self._running.result()  # raises the tail's error
-            if progress.is_stalled():
-                raise MapfoldError(
-                    f"{self._log}: the databases are at event {self.reached} of {end}, without "
-                    f"progress for {STALLED_S:g} s; run `{advised('status', self._log)}`"
-                )
-            pause.wait(_POLL_S)
+            return self.reached >= end
+
+        def complaint() -> str:
+            return (
+                f"{self._log}: the databases are at event {self.reached} of {end}, without "
+                f"progress for {STALLED_S:g} s; run `{advised('status', self._log)}`"
+            )
+
+        wait_until(done, lambda: self.reached, complaint)
         self._stop.set()
-        report = self._running.result()
-        delays = self._delays()
+        report, delays = self._running.result(), self._delays()
         return Followed(len(delays), report.batches, statistics.median(delays), max(delays))
 
     def _on_batch(self, report: TailReport) -> None:

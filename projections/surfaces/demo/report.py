@@ -5,25 +5,32 @@ Lengths in metres, times in seconds.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 from eventsrc.base.text import counted
 from projections.fold.settings import Settings
 from projections.localize.relocalize import UNKNOWN_BELOW
-from projections.map.view import MapView
 from projections.postgres import RebuildReport
 from projections.postgres.labels import EDGE_LABELS, TABLE, VERTEX_LABELS
+from projections.surfaces.python import Map
 
-from .asking import NEAR_M, AskedQuestion, LostRun
-from .correcting import Corrected
-from .folder import DemoFolder
-from .mapping import Folded, Part, RoomMerge, most_telling
-from .recording import Followed, Recorded
+from .acts import (
+    NEAR_M,
+    AskedQuestion,
+    Corrected,
+    Explored,
+    LostRun,
+    RoomMerge,
+    RoomPart,
+    most_telling,
+)
+from .recording import Followed, RecordedRun
 
 
 def recording_lines(
-    recorded: Recorded, followed: Followed, detections: int, rooms: int, speed: float
+    recorded: RecordedRun, followed: Followed, detections: int, rooms: int, speed: float
 ) -> Iterator[str]:
     """How run A was recorded, and tailed into the databases."""
     kept = "byte for byte" if recorded.intact else "NOT byte for byte"
@@ -51,7 +58,7 @@ def recording_lines(
     )
 
 
-def replay_lines(replayed: RebuildReport, folded: Folded, same_rows: bool) -> Iterator[str]:
+def replay_lines(replayed: RebuildReport, house: Map, same_rows: bool) -> Iterator[str]:
     """Whether a replay gives the same rows and digest."""
     nodes = sum(replayed.rows[label] for label in VERTEX_LABELS)
     edges = sum(replayed.rows[label] for label in EDGE_LABELS)
@@ -61,23 +68,27 @@ def replay_lines(replayed: RebuildReport, folded: Folded, same_rows: bool) -> It
         f"{counted(nodes, 'node')}, {counted(edges, 'edge')}, "
         f"{counted(replayed.rows[TABLE], 'vector')};"
     )
-    digest = "the same digest as" if replayed.digest == folded.digest else "ANOTHER digest than"
-    yield f"   {rows} the tail wrote, {digest} a fold without databases: {folded.digest[:16]}…"
+    yield f"   {rows} the tail wrote, {_digest_text(replayed, house, 16)}"
 
 
-def map_lines(folded: Folded, other_settings: Settings, other_places: int) -> Iterator[str]:
+def _digest_text(replayed: RebuildReport, house: Map, shown: int) -> str:
+    digest = "the same digest as" if replayed.digest == house.digest else "ANOTHER digest than"
+    return f"{digest} a fold without databases: {house.digest[:shown]}…"
+
+
+def map_lines(house: Map, other_settings: Settings, other_places: int) -> Iterator[str]:
     """The map's numbers, with which settings, and with the default settings."""
-    counts, settings = folded.view.counts(), folded.view.settings
-    transitions = sum(count for _, _, count in folded.view.edges())
+    counts = house.state["counts"]
     yield (
         f"   {counted(counts['places'], 'place')} from {counted(counts['keyframes'], 'keyframe')} "
         f"({counts['noise']} in none), {counted(counts['objects'], 'object')} from "
         f"{counted(counts['observations'], 'observation')},"
     )
+    transitions = counted(_transitions(house), "transition")
     pairs = counted(counts["adjacency"], "pair")
     yield (
-        f"   {counted(transitions, 'transition')} between {pairs} of neighbouring places; "
-        f"{settings.places_text()}"
+        f"   {transitions} between {pairs} of neighbouring places; "
+        f"{house.view.settings.places_text()}"
     )
     yield (
         f"   (the default, {other_settings.eps_m:g} m and {other_settings.min_samples}, chains "
@@ -85,16 +96,19 @@ def map_lines(folded: Folded, other_settings: Settings, other_places: int) -> It
     )
 
 
-def type_lines(view: MapView) -> Iterator[str]:
+def _transitions(house: Map) -> int:
+    return sum(pair["shared_transitions"] for pair in house.adjacency)
+
+
+def type_lines(house: Map) -> Iterator[str]:
     """The likely types of the places."""
-    kinds = ((place, view.type_of(place.ordinal)) for place in view.places.values())
     typed = [
-        f"{_short(place.place_id)} {kind.type} {kind.probability:.0%}".replace("%", " %")
-        for place, kind in kinds
-        if kind is not None and kind.type is not None
+        f"{_short(place['place_id'])} {place['type']} {100 * place['type_probability']:.0f} %"
+        for place in house.places
+        if place.get("type") is not None
     ]
     if typed:
-        unsure = len(view.places) - len(typed)
+        unsure = len(house.places) - len(typed)
         text = f"by what stands in them ({unsure} unsure): {', '.join(typed)}"
         yield from wrap(text, 96, initial_indent="   ", subsequent_indent="   ")
 
@@ -121,8 +135,8 @@ def merge_lines(merges: tuple[RoomMerge, ...]) -> Iterator[str]:
 
 def correction_lines(corrected: Corrected) -> Iterator[str]:
     """The correction, and the map under it."""
-    offsets = {recorded.command.kind: recorded.offset for recorded in corrected.commands}
-    places = counted(len(corrected.folded.view.places), "place")
+    offsets = {command["kind"]: command["offset"] for command in corrected.commands}
+    places = counted(len(corrected.house.places), "place")
     if corrected.apart:
         parts = " and ".join(map(_part, corrected.apart))
         yield (
@@ -135,10 +149,9 @@ def correction_lines(corrected: Corrected) -> Iterator[str]:
             f'   {_short(named.place_id)} is called "{named.room}" in graph, answers and picture, '
             f"by another command, event {offsets['name-place']};"
         )
-    digest = "the same digest as" if corrected.same_digest else "ANOTHER digest than"
     yield (
-        f"   rebuilt from the log in {corrected.replayed.total_s:.2f} s, {digest} a fold "
-        f"without databases: {corrected.folded.digest[:8]}…"
+        f"   rebuilt from the log in {corrected.replayed.total_s:.2f} s, "
+        f"{_digest_text(corrected.replayed, corrected.house, 8)}"
     )
 
 
@@ -181,7 +194,7 @@ def _pose(asked: AskedQuestion) -> str:
     return f"pose {off}, {sure}, {1000 * asked.seconds:.0f} ms"
 
 
-def _part(part: Part) -> str:
+def _part(part: RoomPart) -> str:
     return f"{_short(part.place_id)} ({counted(part.keyframes, 'keyframe')}, {part.room})"
 
 
@@ -195,11 +208,11 @@ class DemoResult:
 
     seed: int
     settings: Settings
-    recorded: Recorded
+    recorded: RecordedRun
     followed: Followed
     replayed: RebuildReport
     same_rows: bool
-    folded: Folded
+    explored: Explored
     corrected: Corrected
     lost: LostRun
 
@@ -208,16 +221,15 @@ class DemoResult:
         """Whether log and run, tail and replay, databases and fold agree."""
         recorded = self.recorded
         whole = recorded.intact and not recorded.rejected and not recorded.lost
-        same_digest = self.replayed.digest == self.folded.digest and self.corrected.same_digest
-        return whole and self.same_rows and same_digest
+        same_digest = self.replayed.digest == self.explored.house.digest
+        return whole and self.same_rows and same_digest and self.corrected.same_digest
 
 
-def result_document(
-    result: DemoResult, seconds: dict[str, float], folder: DemoFolder
-) -> dict[str, Any]:
+def result_document(result: DemoResult, seconds: dict[str, float], folder: Path) -> dict[str, Any]:
     """The output of ``mapfold demo --json``; ``seconds`` by stage."""
-    view, replayed = result.folded.view, result.replayed
-    counts = view.counts()
+    house, replayed = result.explored.house, result.replayed
+    corrected, lost = result.corrected, result.lost
+    counts = house.state["counts"]
     return {
         "sound": result.sound,
         "seed": result.seed,
@@ -235,38 +247,40 @@ def result_document(
             "places": counts["places"],
             "objects": counts["objects"],
             "adjacent_pairs": counts["adjacency"],
-            "transitions": sum(count for _, _, count in view.edges()),
-            "digest": result.folded.digest,
-            "fold_seconds": result.folded.seconds,
+            "transitions": _transitions(house),
+            "digest": house.digest,
+            "fold_seconds": result.explored.seconds,
         },
-        "merges": [asdict(merge) for merge in result.folded.merges],
-        "corrected": result.corrected.document(),
-        "relocalize": _lost_document(result.lost),
+        "merges": [asdict(merge) for merge in result.explored.merges],
+        "corrected": {
+            "commands": list(corrected.commands),
+            "named": None if corrected.named is None else asdict(corrected.named),
+            "apart": [asdict(part) for part in corrected.apart],
+            "places": len(corrected.house.places),
+            "digest": corrected.house.digest,
+            "seconds": corrected.seconds,
+        },
+        "relocalize": {
+            "run_id": lost.run_id,
+            "keyframe_id": lost.keyframe_id,
+            "room": lost.room,
+            "truth": lost.truth,
+            "questions": [
+                {
+                    "classes": list(asked.classes),
+                    "error_m": asked.error_m,
+                    "seconds": asked.seconds,
+                    **asked.answer.document(),
+                }
+                for asked in lost.questions
+            ],
+            "everywhere": asdict(lost.everywhere),
+        },
         "seconds": {**seconds, "total": sum(seconds.values())},
         "files": {
-            "folder": str(folder.path),
-            "log": str(folder.log),
-            "settings": str(folder.settings),
-            "map": str(folder.map),
+            "folder": str(folder),
+            "log": str(folder / "log"),
+            "settings": str(folder / "settings.json"),
+            "map": str(folder / "map.png"),
         },
-    }
-
-
-def _lost_document(lost: LostRun) -> dict[str, Any]:
-    return {
-        "run_id": lost.run_id,
-        "keyframe_id": lost.keyframe_id,
-        "room": lost.room,
-        "truth": asdict(lost.truth),
-        "questions": [_asked_document(asked) for asked in lost.questions],
-        "everywhere": asdict(lost.everywhere),
-    }
-
-
-def _asked_document(asked: AskedQuestion) -> dict[str, Any]:
-    return {
-        "classes": list(asked.classes),
-        "error_m": asked.error_m,
-        "seconds": asked.seconds,
-        **asked.answer.document(),
     }
