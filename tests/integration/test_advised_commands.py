@@ -17,7 +17,7 @@ from eventsrc.base.text import advised, complete_by
 from eventsrc.log import LogWriter
 from projections.postgres.connection import Targets, check_url, url_without_secrets
 from projections.surfaces.cli import COMMANDS, command_line
-from projections.surfaces.cli.in_force import _command
+from projections.surfaces.cli.composition import _command
 from tests.support.commands import Commands, Said
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import flip

@@ -17,9 +17,8 @@ from rich.console import Console
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.progress import report_progress, reported, send_progress_to, working
 from eventsrc.log import verify_log
-from projections.surfaces.cli import COMMANDS, command_line, reading_bar, terminal
-from projections.surfaces.cli.reading_bar import ReadingBar
-from projections.surfaces.cli.terminal import Bar, FileBars, output_begins
+from projections.surfaces.cli import COMMANDS, command_line, terminal
+from projections.surfaces.cli.terminal import Bar, FileBars, ReadingBar, output_begins
 from tests.docs.commands_page import commands
 from tests.support.logs import append_command, name_place, walk, write_log
 
@@ -191,7 +190,7 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=100, markup=False)
     monkeypatch.setattr(terminal, "people", console)
-    monkeypatch.setattr(reading_bar, "people", console)
+    monkeypatch.setattr(terminal, "people", console)
     yield text
     send_progress_to(None)
 
@@ -248,11 +247,11 @@ def test_data_on_stdout_removes_it_for_good(
     screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ReadingBar(0.0) as bar:
-        monkeypatch.setattr(reading_bar, "_is_file", lambda _: True)
+        monkeypatch.setattr(terminal, "_is_file", lambda _: True)
         begin(bar)
         output_begins()
         assert bar._bar is not None
-        monkeypatch.setattr(reading_bar, "_is_file", lambda _: False)
+        monkeypatch.setattr(terminal, "_is_file", lambda _: False)
         output_begins()
         begin(bar)
         assert bar._timer is bar._bar is None
@@ -269,7 +268,7 @@ def test_what_a_server_reads_is_not_shown(screen: io.StringIO) -> None:
 def test_nothing_is_told_without_a_terminal(
     screen: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reading_bar, "people", Console(file=screen))
+    monkeypatch.setattr(terminal, "people", Console(file=screen))
     with ReadingBar(0.0) as bar:
         begin(bar)
         assert bar._timer is bar._bar is None

@@ -9,7 +9,8 @@ import pytest
 from typer.main import get_command
 
 from projections.surfaces.cli import SECTIONS, command_line
-from projections.surfaces.cli.program import Program, _needed
+from projections.surfaces.cli.composition import Program
+from projections.surfaces.cli.program import _needed
 from tests.support.commands import Commands
 from tests.support.prefork import folder_with_mapfold
 from tests.support.thorough import rounds

@@ -29,7 +29,7 @@ import pydantic
 from projections.surfaces.cli import COMMANDS, terminal
 
 MODULES = (
-    *COMMANDS.values(),
+    *(f"projections.surfaces.cli.{place.partition(':')[0]}" for place in COMMANDS.values()),
     "email.policy",
     "fastapi.responses",
     "matplotlib.figure",

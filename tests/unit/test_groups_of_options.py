@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from projections.surfaces.cli.option_groups import flattened
+from projections.surfaces.cli.composition import flattened
 
 
 @dataclass(frozen=True, kw_only=True)

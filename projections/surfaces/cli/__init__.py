@@ -14,66 +14,67 @@ if TYPE_CHECKING:
 
 SECTIONS: "Mapping[str, Mapping[str, str]]" = {
     "Try it": {
-        "demo": "projections.surfaces.cli.demo",
-        "simulate": "projections.surfaces.cli.simulate",
+        "demo": "demo:demo",
+        "simulate": "simulate:simulate",
     },
     "Record a log": {
-        "record": "projections.surfaces.cli.recording",
-        "router": "projections.surfaces.cli.recording",
-        "detect": "projections.surfaces.cli.detect",
-        "spool": "projections.surfaces.cli.spool",
-        "import": "projections.surfaces.cli.import_",
-        "log": "projections.surfaces.cli.log",
+        "record": "recording:record",
+        "router": "recording:router",
+        "detect": "detect:detect",
+        "spool": "spool:spool",
+        "import": "import_:import_",
+        "log": "log:log_commands",
     },
     "Project it into databases": {
-        "replay": "projections.surfaces.cli.databases",
-        "tail": "projections.surfaces.cli.databases",
-        "status": "projections.surfaces.cli.db",
-        "db": "projections.surfaces.cli.db",
-        "fleet": "projections.surfaces.cli.fleet",
+        "replay": "databases:replay",
+        "tail": "databases:tail_command",
+        "status": "db:status",
+        "db": "db:group",
+        "fleet": "fleet:fleet",
     },
     "Look at the map": {
-        "state": "projections.surfaces.cli.maps",
-        "draw": "projections.surfaces.cli.maps",
-        "ui": "projections.surfaces.cli.ui",
-        "query": "projections.surfaces.cli.query",
-        "export": "projections.surfaces.cli.export",
-        "foxglove": "projections.surfaces.cli.export",
+        "state": "maps:state",
+        "draw": "maps:draw",
+        "ui": "ui:ui",
+        "query": "query:query",
+        "export": "export:export",
+        "foxglove": "export:foxglove",
     },
     "Find a robot": {
-        "relocalize": "projections.surfaces.cli.relocalize",
-        "serve": "projections.surfaces.cli.serve",
+        "relocalize": "relocalize:relocalize",
+        "serve": "serve:serve",
     },
     "Travel in time": {
-        "merges": "projections.surfaces.cli.time_travel",
-        "why": "projections.surfaces.cli.time_travel",
-        "diff": "projections.surfaces.cli.time_travel",
-        "bisect": "projections.surfaces.cli.time_travel",
-        "whatif": "projections.surfaces.cli.whatif",
+        "merges": "time_travel:merges",
+        "why": "time_travel:why",
+        "diff": "time_travel:diff",
+        "bisect": "time_travel:bisect",
+        "whatif": "whatif:whatif",
     },
     "Correct and measure": {
-        "edit": "projections.surfaces.cli.edit",
-        "edits": "projections.surfaces.cli.edit",
-        "evaluate": "projections.surfaces.cli.evaluate",
-        "calibrate": "projections.surfaces.cli.calibrate",
-        "reembed": "projections.surfaces.cli.reembed",
+        "edit": "edit:edit",
+        "edits": "edit:edits",
+        "evaluate": "evaluate:evaluate",
+        "calibrate": "calibrate:calibrate_command",
+        "reembed": "reembed:reembed_log",
     },
     "Shell": {
-        "completion": "projections.surfaces.cli.shell",
-        "help": "projections.surfaces.cli.shell",
+        "completion": "shell:completion",
+        "help": "shell:help_",
     },
 }
-"""The sections of ``--help``, with the commands of each and the module of each command."""
+"""The sections of ``--help``, with the commands of each. Beside each command stand its module here
+and the function or group in it that is the command."""
 
 COMMANDS: "Mapping[str, str]" = {
-    name: module for commands in SECTIONS.values() for name, module in commands.items()
+    name: place for commands in SECTIONS.values() for name, place in commands.items()
 }
-"""The module of each command, in the order of ``--help``."""
+"""The place of each command, in the order of ``--help``."""
 
 
 def command_line(names: "Iterable[str]" = tuple(COMMANDS)) -> "typer.Typer":
     """The program with these commands."""
-    from .program import compose  # here: it imports typer
+    from .composition import compose  # here: it imports typer
 
     return compose(names, COMMANDS)
 

@@ -133,8 +133,3 @@ def _calibrated(log: Path, chosen: Callable[[Corrections], Settings]) -> Calibra
     with LogReader(log) as reader, Bar() as bar:
         corrections = read_corrections(reader)
         return calibrate(reader, chosen(corrections), corrections, progress=bar.show_fold)
-
-
-def register(app: typer.Typer) -> None:
-    """Add `calibrate` to the program."""
-    app.command("calibrate")(calibrate_command)

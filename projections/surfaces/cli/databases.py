@@ -327,9 +327,3 @@ def _print_followed(report: TailReport) -> None:
     say(f"{'; '.join(done)}; the databases are at offset {report.next_offset:,}")
     for letter in report.parked:
         say(f"parked: offset {letter.offset:,}: {letter.reason}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `replay` and `tail` to the program."""
-    app.command()(replay)
-    app.command(name="tail")(tail_command)

@@ -277,9 +277,3 @@ def _sink_line(sink: SinkStatus) -> str:
     if sink.refold_done is not None and sink.refold_total:
         condition += f", {100 * sink.refold_done // sink.refold_total} %, old map"
     return f"{condition} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"
-
-
-def register(app: typer.Typer) -> None:
-    """Add `status` and `db` to the program."""
-    app.command()(status)
-    app.add_typer(group, name="db")

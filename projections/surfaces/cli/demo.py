@@ -41,8 +41,3 @@ def demo(
     if json_:
         emit(numbers)
     finish(findings=not numbers["sound"])
-
-
-def register(app: typer.Typer) -> None:
-    """Add `demo` to ``app``."""
-    app.command()(demo)

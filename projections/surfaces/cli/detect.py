@@ -398,8 +398,3 @@ def _output(
 
 def _note(line: str) -> None:
     say(visible(line))
-
-
-def register(app: typer.Typer) -> None:
-    """Add `detect` to the program."""
-    app.command()(detect)

@@ -40,36 +40,36 @@ OtherObjectArgument = Annotated[
 RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="The run's id.")]
 
 
-app = typer.Typer(
+edit = typer.Typer(
     no_args_is_help=True,
     help="Correct the map by an event in the log: it survives rebuilds, and can be undone.",
     rich_markup_mode=None,
 )
 
 
-@app.callback()
+@edit.callback()
 def _log(context: typer.Context, log: LogArgument) -> None:
     context.obj = log
 
 
-@app.command("name-place")
+@edit.command("name-place")
 def _name_place(
     *,
     place: PlaceArgument,
     name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Give a place a name."""
-    edit.record(lambda current, stamp: make.name_place(current, stamp, place, name))
+    new.record(lambda current, stamp: make.name_place(current, stamp, place, name))
 
 
-@app.command("keep-apart")
-def _keep_apart(*, first: PlaceArgument, second: OtherPlaceArgument, edit: EditOptions) -> None:
+@edit.command("keep-apart")
+def _keep_apart(*, first: PlaceArgument, second: OtherPlaceArgument, new: EditOptions) -> None:
     """Keep two places apart, whatever joins them later."""
-    edit.record(lambda current, stamp: make.keep_apart(current, stamp, first, second))
+    new.record(lambda current, stamp: make.keep_apart(current, stamp, first, second))
 
 
-@app.command("undo-merge")
+@edit.command("undo-merge")
 def _undo_merge(
     *,
     offset: Annotated[
@@ -78,78 +78,78 @@ def _undo_merge(
             metavar="OFFSET", help="The offset of the merge, from `mapfold merges LOG`."
         ),
     ],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Undo a merge of places and keep them apart."""
-    edit.record(lambda current, stamp: make.undo_merge(current, stamp, offset))
+    new.record(lambda current, stamp: make.undo_merge(current, stamp, offset))
 
 
-@app.command("join")
-def _join(*, first: PlaceArgument, second: OtherPlaceArgument, edit: EditOptions) -> None:
+@edit.command("join")
+def _join(*, first: PlaceArgument, second: OtherPlaceArgument, new: EditOptions) -> None:
     """Join two places into one.
 
     Also where no chain of poses connects them.
     """
-    edit.record(lambda current, stamp: make.join(current, stamp, first, second))
+    new.record(lambda current, stamp: make.join(current, stamp, first, second))
 
 
-@app.command("same-object")
-def _same_object(*, first: ObjectArgument, second: OtherObjectArgument, edit: EditOptions) -> None:
+@edit.command("same-object")
+def _same_object(*, first: ObjectArgument, second: OtherObjectArgument, new: EditOptions) -> None:
     """Fuse two objects into one."""
-    edit.record(lambda current, stamp: make.same_object(current, stamp, first, second))
+    new.record(lambda current, stamp: make.same_object(current, stamp, first, second))
 
 
-@app.command("different-objects")
+@edit.command("different-objects")
 def _different_objects(
-    *, first: ObjectArgument, second: OtherObjectArgument, edit: EditOptions
+    *, first: ObjectArgument, second: OtherObjectArgument, new: EditOptions
 ) -> None:
     """Keep two objects apart.
 
     Two observations of one object, named by their det_ids, become two objects.
     """
-    edit.record(lambda current, stamp: make.different_objects(current, stamp, first, second))
+    new.record(lambda current, stamp: make.different_objects(current, stamp, first, second))
 
 
-@app.command("drop-object")
+@edit.command("drop-object")
 def _drop_object(
     *,
     thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Drop an object from the map, with the observations that it has now.
 
     The log keeps them.
     """
-    edit.record(lambda current, stamp: make.drop_object(current, stamp, thing))
+    new.record(lambda current, stamp: make.drop_object(current, stamp, thing))
 
 
-@app.command("drop-detection")
+@edit.command("drop-detection")
 def _drop_detection(
     *,
     det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID", help="The det_id of each.")],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Drop detections from the map; the log keeps them."""
-    edit.record(lambda current, stamp: make.drop_detection(current, stamp, det_ids))
+    new.record(lambda current, stamp: make.drop_detection(current, stamp, det_ids))
 
 
-@app.command("forget-run")
-def _forget_run(*, run: RunArgument, edit: EditOptions) -> None:
+@edit.command("forget-run")
+def _forget_run(*, run: RunArgument, new: EditOptions) -> None:
     """Drop all keyframes of a run from the map; the log keeps them."""
-    edit.record(lambda current, stamp: make.forget_run(current, stamp, run))
+    new.record(lambda current, stamp: make.forget_run(current, stamp, run))
 
 
-@app.command("forget-keyframes")
+@edit.command("forget-keyframes")
 def _forget_keyframes(
     *,
     run: RunArgument,
     span: Annotated[
         str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
     ],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Drop some keyframes of a run from the map; the log keeps them."""
-    edit.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
+    new.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
 
 
 _FromOption = Annotated[
@@ -160,7 +160,7 @@ _ToOption = Annotated[
 ]
 
 
-@app.command("correct-poses")
+@edit.command("correct-poses")
 def _correct_poses(
     *,
     run: RunArgument,
@@ -190,7 +190,7 @@ def _correct_poses(
             "--ignore-missing", help="Skip poses of keyframes that the run does not have."
         ),
     ] = False,
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Correct the poses of a run.
 
@@ -203,10 +203,10 @@ def _correct_poses(
     span = Span(_keyframe_id(first), _keyframe_id(last))
     if file is None:
         moves = (dx or 0.0, dy or 0.0, dyaw or 0.0)
-        edit.record(lambda current, stamp: by_transform(current, stamp, run, span, *moves))
+        new.record(lambda current, stamp: by_transform(current, stamp, run, span, *moves))
         return
     trajectory = read_trajectory(file)
-    edit.record(
+    new.record(
         lambda current, stamp: by_trajectory(
             current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
         )
@@ -217,7 +217,7 @@ def _keyframe_id(number: int | None) -> KeyframeId | None:
     return None if number is None else KeyframeId(number)
 
 
-@app.command("use-settings")
+@edit.command("use-settings")
 def _use_settings(
     *,
     file: Annotated[
@@ -241,17 +241,17 @@ def _use_settings(
     new.record(command)
 
 
-@app.command("undo")
+@edit.command("undo")
 def _undo(
     *,
     undone: Annotated[str, typer.Argument(metavar="COMMAND_ID", help="From `mapfold edits LOG`.")],
-    edit: EditOptions,
+    new: EditOptions,
 ) -> None:
     """Undo a command, as if it had never been given.
 
     Undoing an undo restores the command.
     """
-    edit.record(lambda current, stamp: make.undo(current, stamp, undone))
+    new.record(lambda current, stamp: make.undo(current, stamp, undone))
 
 
 def edits(
@@ -278,9 +278,3 @@ def edits(
         emit(edits_document(found, times))
     else:
         display(edits_text(found, times))
-
-
-def register(program: typer.Typer) -> None:
-    """Add `edit` and `edits` to the program."""
-    program.add_typer(app, name="edit")
-    program.command()(edits)

@@ -273,9 +273,3 @@ def _run(playback: "Playback", stop: threading.Event) -> None:
     player.join()
     if failed:
         raise failed[0]
-
-
-def register(app: typer.Typer) -> None:
-    """Add `export` and `foxglove` to the program."""
-    for command in (export, foxglove):
-        app.command()(command)

@@ -35,7 +35,7 @@ from .terminal import display, emit, finish, say
 if TYPE_CHECKING:
     from projections.adapters.fleet.site_tasks import ChosenSettings
 
-fleet_app = typer.Typer(
+fleet = typer.Typer(
     help="Rebuild, check and ask many sites, each with a log and a database of its own.",
     no_args_is_help=True,
 )
@@ -61,7 +61,7 @@ def _check_reach(engine: str, db: str | None) -> None:
         )
 
 
-@fleet_app.command()
+@fleet.command()
 def replay(
     *,
     place: SitesArgument,
@@ -158,7 +158,7 @@ def _say_failed(failed: list[tuple[str, str]]) -> None:
         say(f"failed: {visible(name)}: {error}")
 
 
-@fleet_app.command()
+@fleet.command()
 def status(
     *,
     place: SitesArgument,
@@ -200,7 +200,7 @@ def status(
     finish(findings=not all(each.healthy for each in found))
 
 
-@fleet_app.command()
+@fleet.command()
 def verify(
     *,
     place: SitesArgument,
@@ -241,7 +241,7 @@ def verify(
     finish(findings=bool(wrong))
 
 
-@fleet_app.command()
+@fleet.command()
 def relocalize(
     *,
     place: SitesArgument,
@@ -289,7 +289,7 @@ def relocalize(
     finish(findings=bool(answer.not_asked))
 
 
-@fleet_app.command()
+@fleet.command()
 def url(
     *,
     place: SitesArgument,
@@ -307,8 +307,3 @@ def url(
         raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
     with FleetDatabases(db=db).opened(sites) as databases:
         display(databases[site].graph_url)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the `fleet` group to ``app``."""
-    app.add_typer(fleet_app, name="fleet")

@@ -226,8 +226,3 @@ def _passed_over(report: ImportReport) -> Iterator[str]:
 
 def _show(bars: FileBars, source: Source) -> None:
     bars.show(id(source), source.name, source.bytes_read(), source.size_bytes)
-
-
-def register(app: typer.Typer) -> None:
-    """Add `import` to ``app``."""
-    app.command("import")(import_)

@@ -1,4 +1,4 @@
-"""The commands of `mapfold log`, except for `spaces`."""
+"""The commands of `mapfold log`."""
 
 import contextlib
 import sys
@@ -31,8 +31,7 @@ from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 from .event_text import event_document, event_line, iso_time
 from .folded_log import LogArgument
 from .options import JsonOption
-from .spaces import spaces
-from .terminal import display, emit, emit_lines, finish, say
+from .terminal import Bar, display, emit, emit_lines, finish, say
 
 
 class RangeNotes:
@@ -91,12 +90,12 @@ class RangeNotes:
                     yield f"{log}: no event has the key {key!r}; there are {names}"
 
 
-log_app = typer.Typer(
+log_commands = typer.Typer(
     help="Inspect and repair a log: info, cat, verify, recover, spaces.", no_args_is_help=True
 )
 
 
-@log_app.command()
+@log_commands.command()
 def info(log: LogArgument, json_: JsonOption = False) -> None:
     """Show what a log holds: id, segments, offsets, counts by key, rejected, losses, times."""
     report = log_info(log, note=say)
@@ -158,7 +157,7 @@ def _span(first_ns: int, last_ns: int) -> str:
     return f"{iso_time(first_ns)} to {iso_time(last_ns)}"
 
 
-@log_app.command()
+@log_commands.command()
 def cat(
     log: LogArgument,
     from_: Annotated[str, typer.Option("--from", metavar="W", help="Start of the range.")] = "0",
@@ -222,7 +221,7 @@ def _end(reader: LogReader, to: str, start: Offset, on_gap: OnGap | None) -> Off
     return None if met else end
 
 
-@log_app.command()
+@log_commands.command()
 def verify(log: LogArgument, json_: JsonOption = False) -> None:
     """Read every byte of a log and report everything that is wrong; exit 3 if anything is.
 
@@ -255,7 +254,7 @@ def finding_text(finding: Finding) -> str:
     return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")
 
 
-@log_app.command()
+@log_commands.command()
 def recover(
     log: LogArgument,
     yes: Annotated[bool, typer.Option("--yes", help="Add any number of loss events.")] = False,
@@ -299,7 +298,24 @@ def _recovery_text(segment: SegmentRecovery) -> str:
     return ", ".join(parts)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the `log` group to ``app``."""
-    log_app.command()(spaces)
-    app.add_typer(log_app, name="log")
+@log_commands.command()
+def spaces(log: LogArgument, json_: JsonOption = False) -> None:
+    """Print the embedding spaces of a log: a model, its dimension, and how many detections have a
+    vector of it.
+
+    `mapfold reembed` adds vectors of another space; --space NAME maps a log in it.
+    """
+    from projections.map.own_events import log_spaces
+
+    with LogReader(log) as reader, Bar() as bar:
+        found = log_spaces(reader, lambda done, all_: bar.show("reading", done, all_))
+    if json_:
+        emit(asdict(found))
+        return
+    bare = f", {found.bare:,} of them recorded without a vector" if found.bare else ""
+    display(f"{counted(found.detections, 'detection')}{bare}")
+    for each in found.spaces:
+        name = "(no name)" if each.model is None else visible(each.model)
+        parts = [f"{each.recorded:,} recorded"] if each.recorded else []
+        parts += [f"{each.reembedded:,} re-embedded"] if each.reembedded else []
+        display(f"  {name}, dimension {each.dim:,}: {', '.join(parts) or 'none'}")

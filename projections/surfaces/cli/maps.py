@@ -119,9 +119,3 @@ def draw(
         )
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
     say(f"wrote {out}: {places}, {objects}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `state` and `draw` to the program."""
-    for command in (state, draw):
-        app.command()(command)

@@ -12,52 +12,37 @@ recorder goes on when the disk of its messages is full or its terminal is gone.
 
 Exit codes: 0 done · 1 failed · 2 misuse · 3 done, with loss or findings · 129 hung up ·
 130 interrupted · 141 the reader of stdout left before everything was printed · 143 terminated.
-typer itself would answer Ctrl-C with an empty line and a closed pipe with exit 1; `Program` passes
-both on to `run_app` as exceptions of their own.
+typer itself would answer Ctrl-C with an empty line and a closed pipe with exit 1;
+`composition.Program` passes both on to `run_app` as exceptions of their own.
 """
 
 import contextlib
 import errno
 import gc
-import importlib
-import inspect
 import io
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO, get_args
-
-import typer
-from typer.core import TyperGroup
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 
-from . import COMMANDS, SECTIONS
-from .in_force import AdvisingCommand
-from .option_groups import flattened
-from .reading_bar import ReadingBar
+from .composition import MAX_NAME, Interrupted, ReaderGone
 from .signals import unwind_on_signals
-from .terminal import EXIT_FAILED, OutputLost, output_begins, say
+from .terminal import EXIT_FAILED, OutputLost, ReadingBar, output_begins, say
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 EXIT_INTERRUPTED: Final = 130
-_MAX_NAME: Final = 80
 EXIT_READER_GONE: Final = 141
 """128 + SIGPIPE, as a shell shows a program that writes to a closed pipe."""
 
 COMPLETION_VARIABLE: Final = "_MAPFOLD_COMPLETE"
 """The environment variable by which a shell asks for completions."""
-
-# typer's own class or click's, depending on typer's version.
-_UsageError: Any = typer.BadParameter.__base__
-_DATABASE_OPTION: Final = re.compile(r"--(vector-)?db\b")
-_SECRET: Final = re.compile(r"://|password", re.IGNORECASE)
 
 
 def start(
@@ -114,100 +99,6 @@ def _exit_interrupted(_number: int, _frame: FrameType | None) -> None:
     os._exit(EXIT_INTERRUPTED)
 
 
-def compose(names: Iterable[str], modules: Mapping[str, str]) -> typer.Typer:
-    """The program with these commands.
-
-    ``modules`` names the module of each; its ``register`` adds the commands of that module.
-    """
-    app = typer.Typer(
-        name="mapfold",
-        cls=Program,
-        help="A robot's semantic map as a deterministic fold over an append-only log.",
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"help_option_names": ["--help", "-h"]},
-    )
-    app.callback()(_main_options)
-    for module in dict.fromkeys(modules[name] for name in names):
-        importlib.import_module(module).register(app)
-    _complete(app)
-    return app
-
-
-def _complete(app: typer.Typer) -> None:
-    """Give typer the options of groups, refuse empty paths, have each command complete the command
-    lines that it advises, and list its whole first sentence, which typer would cut."""
-    for command in app.registered_commands:
-        said = inspect.getdoc(command.callback) or ""
-        command.short_help = said.split("\n\n")[0].replace("\n", " ")
-        command.cls = AdvisingCommand
-        if command.callback is not None:
-            command.callback = flattened(command.callback)
-            _refuse_empty_paths(command.callback)
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            group.short_help = group.typer_instance.info.help
-            _complete(group.typer_instance)
-
-
-class _GivenPath(type(Path())):  # type: ignore[misc]
-    """Makes the Path of an option or argument, neither empty (``Path("")`` would be the working
-    folder, so ``--out=$UNSET`` would name that) nor longer than the system takes."""
-
-    def __new__(cls, text: str | Path) -> Path:  # type: ignore[misc]
-        if text == "":
-            raise typer.BadParameter("the path is empty")
-        try:
-            os.lstat(text)
-        except OSError as error:
-            if error.errno == errno.ENAMETOOLONG:
-                raise typer.BadParameter(f"{str(text)[:_MAX_NAME]}…: {error.strerror}") from None
-        return Path(text)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, *_: object) -> Any:  # newer versions of typer call it
-        from pydantic_core import core_schema
-
-        return core_schema.no_info_plain_validator_function(cls)
-
-
-def _refuse_empty_paths(command: Callable[..., Any]) -> None:
-    """Make every path of a command a `_GivenPath`."""
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
-        if _has_path(parameter.annotation):
-            for note in parameter.annotation.__metadata__:
-                note.path_type = _GivenPath
-
-
-def _has_path(annotation: Any) -> bool:
-    return annotation is Path or any(map(_has_path, get_args(annotation)))
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version  # it takes as long to import as typer does
-
-        sys.stdout.write(f"mapfold {version('mapfold')}\n")
-        raise typer.Exit
-
-
-def _main_options(
-    _version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            "-V",
-            help="Print the version and exit.",
-            callback=_print_version,
-            is_eager=True,
-        ),
-    ] = False,
-) -> None:  # without a callback typer would drop the name of a single command
-    pass
-
-
 class _Stdout(io.FileIO):
     def write(self, data: "ReadableBuffer", /) -> int:
         output_begins()
@@ -260,71 +151,6 @@ def _secured(stream: TextIO | None, kind: type[io.FileIO]) -> io.TextIOWrapper:
     )
 
 
-class _Interrupted(Exception):
-    """Ctrl-C."""
-
-
-class _ReaderGone(Exception):
-    """The reader of stdout has closed it: ``mapfold log cat L | head``."""
-
-
-@contextlib.contextmanager
-def _exceptions_passed_on() -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise _Interrupted from None
-    except BrokenPipeError:
-        raise _ReaderGone from None
-    except _UsageError as error:
-        message = error.message.removeprefix("Value error, ")
-        error.message = _without_secrets(message, sys.argv)
-        raise
-
-
-def _without_secrets(message: str, arguments: Sequence[str]) -> str:
-    """A usage error's message without words that may be a database's URL or a part of one.
-
-    A URL without quotes is split at its spaces: ``--db host=h password=…`` leaves an argument that
-    no command takes.
-    """
-    split = "extra argument" in message and any(_DATABASE_OPTION.match(a) for a in arguments)
-    if not split and not _SECRET.search(message):
-        return message
-    head = re.split(r"[('\"]", message, maxsplit=1)[0].rstrip()
-    return f"{head} (not shown, it may hold a password)".lstrip()
-
-
-class Program(TyperGroup):
-    """The group of all commands."""
-
-    def make_context(self, *args: Any, **kwargs: Any) -> Any:
-        """As typer does it; ``--help`` prints from in here."""
-        with _exceptions_passed_on():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: Any) -> Any:
-        """As typer does it."""
-        with _exceptions_passed_on():
-            return super().invoke(ctx)
-
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 (click calls it so)
-        """The names of the commands, in the order of their sections."""
-        return [name for name in COMMANDS if name in self.commands]
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 (as above)
-        """Write the list of commands for ``--help``, by section."""
-        longest = max(map(len, self.commands), default=0)
-        width = formatter.width - 6 - longest
-        for title, modules in SECTIONS.items():
-            commands = [(name, self.commands[name]) for name in modules if name in self.commands]
-            if commands:
-                with formatter.section(title):
-                    formatter.write_dl(
-                        [(f"{k:{longest}}", v.get_short_help_str(width)) for k, v in commands]
-                    )
-
-
 def run_app(app: Callable[..., Any]) -> NoReturn:
     """Run a typer app made of `Program` and exit; a MapfoldError is one line on stderr."""
     secure_streams()
@@ -357,13 +183,13 @@ def _exit_code(app: Callable[..., Any]) -> int:
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:  # of a name that was given
             raise
-        say(f"mapfold: {str(error.filename)[:_MAX_NAME]}…: {error.strerror}; check the path")
+        say(f"mapfold: {str(error.filename)[:MAX_NAME]}…: {error.strerror}; check the path")
         return MisuseError.exit_code
     except OutputLost as lost:
         return _report_lost_output(lost)
-    except _ReaderGone:
+    except ReaderGone:
         return EXIT_READER_GONE
-    except (_Interrupted, KeyboardInterrupt):
+    except (Interrupted, KeyboardInterrupt):
         signal.signal(signal.SIGINT, _exit_interrupted)  # a second one must not end in a traceback
         say("mapfold: interrupted")
         return EXIT_INTERRUPTED

@@ -29,6 +29,10 @@ from .folded_log import FoldSettings, W, point, say_defaults
 from .options import Databases, DbOption, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, say
 
+query = typer.Typer(
+    no_args_is_help=True, help="Ask the map: similar, where, contents, holding, path."
+)
+
 PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
 
 
@@ -75,9 +79,10 @@ class AskedMap(FoldSettings, PastMap):
             yield LiveMap(connection)
 
 
+@query.command()
 def similar(
     *,
-    query: QuestionArgument,
+    question: QuestionArgument,
     top: Annotated[
         int, typer.Option("--top", metavar="N", min=1, max=64, help="Objects to list.")
     ] = 10,
@@ -85,12 +90,13 @@ def similar(
     json_: JsonOption = False,
 ) -> None:
     """List the objects that look most like the crops of QUERY."""
-    crops = question_from(query).crops
+    crops = question_from(question).crops
     with databases.opened() as targets, CandidateReader(targets) as reader:
         found = similar_objects(crops, reader.candidates(crops), top)
     _print(found, json_)
 
 
+@query.command()
 def where(
     *,
     wanted: Annotated[
@@ -111,6 +117,7 @@ def where(
         _print(where_is(source, wanted), json_)
 
 
+@query.command()
 def contents(
     *,
     place_id: PlaceArgument,
@@ -122,6 +129,7 @@ def contents(
         _print(objects_of(source, place_id), json_)
 
 
+@query.command()
 def holding(
     *,
     class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
@@ -140,6 +148,7 @@ def holding(
         _print(places_holding(source, class_name, start, hops), json_)
 
 
+@query.command()
 def path(
     *,
     start: PlaceArgument,
@@ -166,13 +175,3 @@ def _format(row: dict[str, Any]) -> str:
         for name, value in row.items()
         if value is not None
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add `query` and its questions to the program."""
-    group = typer.Typer(
-        no_args_is_help=True, help="Ask the map: similar, where, contents, holding, path."
-    )
-    for command in (similar, where, contents, holding, path):
-        group.command()(command)
-    app.add_typer(group, name="query")

@@ -228,9 +228,3 @@ def router(
         say(f"router listening on {', '.join(running.endpoints)}; Ctrl-C ends it")
         stop.wait()
     say("router ended")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `record` and `router` to the program."""
-    for command in (record, router):
-        app.command()(command)

@@ -152,8 +152,3 @@ def _report(log: Path, encoder: Path, done: Reembedding) -> None:
         say(f"{log}: interrupted, and no map has these yet; go on with: {visible(again)}")
     elif done.command is not None:
         say(f"{log}: in force by the command at offset {done.command}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `reembed` to the program."""
-    app.command("reembed")(reembed_log)

@@ -208,11 +208,6 @@ def _place_lines(number: int, place: RankedPlace) -> list[str]:
     return lines
 
 
-def register(app: typer.Typer) -> None:
-    """Add `relocalize` to the program."""
-    app.command()(relocalize)
-
-
 Search = Callable[[Sequence[QuestionCrop]], MapCandidates]
 _MAX_LINE: Final = 16 * 1024 * 1024
 

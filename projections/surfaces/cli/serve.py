@@ -227,8 +227,3 @@ def _metrics(answerer: Answerer, queue: FairQueue) -> "ServiceMetrics":
     from projections.surfaces.serve.metrics import ServiceMetrics
 
     return ServiceMetrics(answerer, queue)
-
-
-def register(app: typer.Typer) -> None:
-    """Add `serve` to the program."""
-    app.command()(serve)

@@ -45,9 +45,3 @@ def completion(
         prog_name="mapfold", complete_var=COMPLETION_VARIABLE, shell=shell.value
     )
     sys.stdout.write(f"{script}\n")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `help` and `completion` to the program."""
-    app.command("completion")(completion)
-    app.command("help")(help_)

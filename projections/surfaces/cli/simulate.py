@@ -161,8 +161,3 @@ def _summary(document: dict[str, Any]) -> str:
         f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
         f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add `simulate` to the program."""
-    app.command()(simulate)

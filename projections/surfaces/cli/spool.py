@@ -88,8 +88,3 @@ def spool(
 def _line(refused: Refused) -> str:
     who = f"{refused.run_id}:{refused.keyframe_id}"
     return visible(f"{who}  refused by log {refused.log_id}: {refused.reason}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add `spool` to the program."""
-    app.command()(spool)

@@ -6,13 +6,17 @@ and reasons come from the network.
 
 import contextlib
 import json
+import os
+import stat
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any
+import threading
+from collections.abc import Iterable
+from typing import Any, Self
 
 import typer
 from rich.console import Console
 
+from eventsrc.base.progress import send_progress_to
 from eventsrc.base.text import visible, visible_json, visible_lines
 
 EXIT_FAILED = 1
@@ -94,66 +98,53 @@ def finish(*, findings: bool) -> None:
         raise typer.Exit(EXIT_FINDINGS)
 
 
-class _Listeners:
-    """The functions that `reading_bar` has registered."""
+class _Bars:
+    """Progress on stderr while inside it; prints nothing when stderr is not a terminal.
 
-    output: Callable[[], None] | None = None
-    own_bar: Callable[[int], None] | None = None
+    `ReadingBar` gives way to bars of a command, and gives ``own=False`` to its own.
+    """
 
-
-def on_output(listener: Callable[[], None] | None) -> None:
-    """Register a function that is called before data is written to stdout."""
-    _Listeners.output = listener
-
-
-def on_own_bar(listener: Callable[[int], None] | None) -> None:
-    """Register a function that is called with 1 before a command shows a bar of its own, and with
-    -1 after it."""
-    _Listeners.own_bar = listener
-
-
-def output_begins() -> None:
-    """Call the registered function; for code that writes to stdout by itself."""
-    if _Listeners.output is not None:
-        _Listeners.output()
-
-
-def _own_bar(opened: int) -> None:
-    if _Listeners.own_bar is not None:
-        _Listeners.own_bar(opened)
-
-
-class Bar:
-    """A progress bar with rate and time left; prints nothing when stderr is not a terminal. Unless
-    it is ``announced``, it is that of `reading_bar`, which gives way to all others."""
-
-    def __init__(self, *, announced: bool = True) -> None:
+    def __init__(self, *columns: Any, own: bool = True) -> None:
         from rich import progress  # here: importing it takes a tenth of a short command
 
-        self._announced = announced
+        self._own = own
         self._progress = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
-            progress.MofNCompleteColumn(),
-            progress.TextColumn("{task.fields[rate]}"),
+            *(getattr(progress, each)() if isinstance(each, str) else each for each in columns),
             progress.TimeRemainingColumn(),
             console=people,
             transient=True,
             disable=not people.is_terminal,
         )
-        self._stage = ""
-        self._task = self._progress.add_task("", total=None, rate="")
 
-    def __enter__(self) -> "Bar":
-        if self._announced:
-            _own_bar(1)
+    def __enter__(self) -> Self:
+        self._displace_reading(1)
         self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-        if self._announced:
-            _own_bar(-1)
+        self._displace_reading(-1)
+
+    def stop(self) -> None:
+        """Remove the bar. May be called twice."""
+        self._progress.stop()
+
+    def _displace_reading(self, opened: int) -> None:
+        for bar in _reading if self._own else ():
+            bar.give_way(opened)
+
+
+class Bar(_Bars):
+    """A progress bar with rate and time left."""
+
+    def __init__(self, *, own: bool = True) -> None:
+        from rich.progress import TextColumn
+
+        super().__init__("MofNCompleteColumn", TextColumn("{task.fields[rate]}"), own=own)
+        self._stage = ""
+        self._task = self._progress.add_task("", total=None, rate="")
 
     def show(self, stage: str, done: int, total: int, unit: str = "events") -> None:
         """Show the current stage and how much of it is done, ``done`` of ``total`` events or other
@@ -173,40 +164,106 @@ class Bar:
         if done >= total:
             self.stop()
 
-    def stop(self) -> None:
-        """Remove the bar. May be called twice."""
-        self._progress.stop()
 
-
-class FileBars:
-    """A progress bar for each file that is read, by its bytes; nothing without a terminal."""
+class FileBars(_Bars):
+    """A progress bar for each file that is read, by its bytes."""
 
     def __init__(self) -> None:
-        from rich import progress
-
-        self._progress = progress.Progress(
-            progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(),
-            progress.TaskProgressColumn(),
-            progress.TransferSpeedColumn(),
-            progress.TimeRemainingColumn(),
-            console=people,
-            transient=True,
-            disable=not people.is_terminal,
-        )
-        self._tasks: dict[int, progress.TaskID] = {}
-
-    def __enter__(self) -> "FileBars":
-        _own_bar(1)
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-        _own_bar(-1)
+        super().__init__("TaskProgressColumn", "TransferSpeedColumn")
+        self._tasks: dict[int, Any] = {}
 
     def show(self, file: int, name: str, done: int, size: int | None) -> None:
         """Show that ``done`` bytes of a file are read; ``file`` is a number of its own."""
         if file not in self._tasks:
             self._tasks[file] = self._progress.add_task(visible(name), total=size)
         self._progress.update(self._tasks[file], completed=done)
+
+
+class ReadingBar:
+    """The bar of every command: shows the reports of `base.progress` once work takes a second.
+
+    Commands need no code for it. It is hidden while a command shows a bar of its own, and ends once
+    data is written to stdout, unless that is a file, because both would be mixed on a terminal or
+    in a pager. Work in other threads, as of a server, is not shown.
+    """
+
+    def __init__(self, delay_s: float = 1.0) -> None:
+        self._delay_s = delay_s
+        self._lock = threading.RLock()
+        self._timer: threading.Timer | None = None
+        self._bar: Bar | None = None
+        self._latest = ("", 0, 0, "")
+        self._others = 0
+        """Bars of the command itself."""
+        self._over = not people.is_terminal
+
+    def __enter__(self) -> "ReadingBar":
+        if not self._over:
+            send_progress_to(self.show)
+            _reading.append(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        send_progress_to(None)
+        _reading.clear()
+        self._stop()
+
+    def show(self, stage: str, done: int, total: int, unit: str) -> None:
+        """Show the stage from ``delay_s`` after its first report until its last."""
+        if self._over or self._others or threading.current_thread() is not threading.main_thread():
+            return
+        if 0 < total <= done:
+            self._stop()
+            return
+        with self._lock:
+            self._latest = (stage, done, total, unit)
+            if self._bar is not None:
+                self._bar.show(*self._latest)
+            elif self._timer is None:
+                self._timer = threading.Timer(self._delay_s, self._start)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._timer is None:  # stopped meanwhile
+                return
+            self._bar = Bar(own=False)
+            self._bar.show(*self._latest)
+            self._bar.__enter__()
+
+    def _stop(self) -> None:
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            bar, self._timer, self._bar = self._bar, None, None
+        if bar is not None:
+            bar.stop()
+
+    def give_way(self, opened: int) -> None:
+        """Hide it: a command shows ``opened`` more bars of its own."""
+        self._others += opened
+        self._stop()
+
+    def end_before_output(self) -> None:
+        """End it, unless stdout is a file: data is written to it."""
+        if not self._over and not _is_file(1):
+            self._over = True
+            self._stop()
+
+
+_reading: list[ReadingBar] = []
+"""That of the command that runs."""
+
+
+def output_begins() -> None:
+    """To be called before data is written to stdout."""
+    for bar in _reading:
+        bar.end_before_output()
+
+
+def _is_file(number: int) -> bool:
+    try:
+        return stat.S_ISREG(os.fstat(number).st_mode)
+    except OSError:
+        return False

@@ -243,17 +243,6 @@ def diff(
         display(difference_text(found, most=None if all_ else MOST_LINES))
 
 
-_BISECT_HELP = f"""Find the first event that made a condition over the map true.
-
-EXPR compares numbers and ids, joined by and, or, not and parentheses, for example
-"place_count < 3", "same_place('run:12', 'run:90')", "located_in('obj-…') == 'run_p2'";
-none is no place. It may call:
-
-\b
-{indent(functions_help(), "    ")}
-"""
-
-
 def bisect(
     *,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
@@ -281,6 +270,17 @@ def bisect(
         display(search_text(found, most=None if all_ else MOST_LINES))
 
 
+bisect.__doc__ = f"""Find the first event that made a condition over the map true.
+
+EXPR compares numbers and ids, joined by and, or, not and parentheses, for example
+"place_count < 3", "same_place('run:12', 'run:90')", "located_in('obj-…') == 'run_p2'";
+none is no place. It may call:
+
+\b
+{indent(functions_help(), "    ")}
+"""
+
+
 @contextlib.contextmanager
 def _columns_shown() -> Iterator[None]:
     """Print an expression with a mark where it is wrong, above the error message."""
@@ -289,10 +289,3 @@ def _columns_shown() -> Iterator[None]:
     except ExpressionError as error:
         say(error.pointer)
         raise
-
-
-def register(app: typer.Typer) -> None:
-    """Add these commands to the program."""
-    for command in (merges, why, diff):
-        app.command()(command)
-    app.command(help=_BISECT_HELP)(bisect)

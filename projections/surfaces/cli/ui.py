@@ -190,8 +190,3 @@ def _tails(
         ]
 
     return ask
-
-
-def register(app: typer.Typer) -> None:
-    """Add `ui` to the program."""
-    app.command()(ui)

@@ -165,8 +165,3 @@ def _draw_maps(found: WhatIf, out: Path) -> None:
 def _title(each: Alternative) -> str:
     counts = each.result.counts
     return f"{each.name}: {counted(counts['places'], 'place')}, {counts['noise']} noise"
-
-
-def register(app: typer.Typer) -> None:
-    """Add `whatif` to the program."""
-    app.command()(whatif)
