@@ -199,7 +199,7 @@ def _where_lost(lost: LostRun) -> LostRobot:
 
 def _bridges(log: Path, house: Map) -> list[Bridge]:
     """A mark for each merge that the corrections left."""
-    with history.Timeline(log, lambda _: SETTINGS, cache=False) as timeline:
+    with history.LogTimeline(log, lambda _: SETTINGS, cache=False) as timeline:
         merges = timeline.knowing(timeline.end).merges(timeline.end)
     return bridges_of(house.view, merges)
 
