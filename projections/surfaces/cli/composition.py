@@ -28,7 +28,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import ArgumentInfo
 
-from eventsrc.base.advised import complete_by
+from eventsrc.base.text import complete_by
 
 from . import COMMANDS, SECTIONS
 

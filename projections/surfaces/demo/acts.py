@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from eventsrc.adapters.sim import SimulatedRun
-from eventsrc.base.output_files import write_files
+from eventsrc.base.user_files import write_files
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from projections.edit.make import Stamp, name_place, undo_merge

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from eventsrc.adapters.sim import occupancy_map, simulate_run
-from eventsrc.base.advised import command_line
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.output_files import write_files
+from eventsrc.base.text import command_line
+from eventsrc.base.user_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections import history
