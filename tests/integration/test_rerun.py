@@ -68,7 +68,7 @@ def rrd(command: str, *arguments: str | Path, home: Path) -> "subprocess.Complet
 
 
 def record(log: Path, path: Path, *, every: int | None = None, end: int | None = None) -> int:
-    from projections.adapters.rerun.recording import (
+    from projections.adapters.rerun.rrd_recording import (
         write_recording,  # takes half a second to import
     )
 
@@ -220,14 +220,14 @@ def test_what_cannot_be_recorded_is_said(
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "projections.adapters.rerun.recording", raising=False)
-    monkeypatch.delattr("projections.adapters.rerun.recording", raising=False)
+    monkeypatch.delitem(sys.modules, "projections.adapters.rerun.rrd_recording", raising=False)
+    monkeypatch.delattr("projections.adapters.rerun.rrd_recording", raising=False)
     with pytest.raises(MisuseError, match=r"--rerun needs rerun.*pip install 'mapfold\[rerun\]'"):
         _recorder("rerun", "")
 
 
 def test_an_interrupted_recording_ends_and_leaves_no_file(tmp_path: Path) -> None:
-    from projections.adapters.rerun.recording import write_recording
+    from projections.adapters.rerun.rrd_recording import write_recording
 
     def interrupt(offset: int, _: int) -> None:
         if offset == 300:

@@ -17,7 +17,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from projections.adapters.export import Origin, dot, geojson, graphml, nav2_waypoints, tables
-from projections.adapters.export.waypoints import NEAR_M
+from projections.adapters.export.lists import NEAR_M
 from projections.map.view import MapView
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import fold

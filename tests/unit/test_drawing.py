@@ -9,9 +9,9 @@ import pytest
 
 from eventsrc.adapters.sim import build_house
 from eventsrc.base.errors import MisuseError
-from projections.adapters.drawing import Bridge, Floor, LostRobot, Spot, draw_map, floor_of
-from projections.adapters.drawing.canvas import Canvas
-from projections.adapters.drawing.picture import compose, legend_lines
+from projections.adapters.drawing import Floor, LostRobot, MergeMark, Spot, draw_map, floor_of
+from projections.adapters.drawing.canvas import Sheet
+from projections.adapters.drawing.map_picture import compose, legend_lines
 from projections.adapters.palette import place_colour
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
@@ -52,7 +52,7 @@ def _two_places() -> MapView:
     return view
 
 
-def _texts(canvas: Canvas) -> list[str]:
+def _texts(canvas: Sheet) -> list[str]:
     return [text.get_text() for text in (*canvas.axes.texts, *canvas.figure.texts)]
 
 
@@ -121,7 +121,7 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
         "",
         floor_of(house),
         LostRobot(Spot(2, 1, 0.3), Spot(3, 1), 0.5),
-        [Bridge(5.0, 0.5, "p0 took in p2")],
+        [MergeMark(5.0, 0.5, "p0 took in p2")],
     )
     texts = _texts(canvas)
     assert {room.name for room in house.plan.rooms} | {"p0 took in p2"} <= set(texts)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from matplotlib.patches import Ellipse
 
 from projections.adapters.drawing import Floor, draw_map
-from projections.adapters.drawing.canvas import Canvas
-from projections.adapters.drawing.picture import EVIDENCE_LEGEND, LEGEND, compose
-from projections.adapters.drawing.scene import two_sigma
+from projections.adapters.drawing.canvas import Sheet
+from projections.adapters.drawing.map_picture import EVIDENCE_LEGEND, LEGEND, compose
+from projections.adapters.scene import two_sigma
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.map.records import EstimatedPosition
@@ -58,15 +58,15 @@ CUP = d.ObjectEstimated(3, 0, 1_000_000, 1_500_000, 90_000_000_000, 0, 40_000_00
 VASE = d.ObjectEstimated(3, 1, 3_000_000, 9_000_000, 10_000_000_000, 0, 40_000_000_000, 2)
 
 
-def texts(canvas: Canvas) -> list[str]:
+def texts(canvas: Sheet) -> list[str]:
     return [text.get_text() for text in (*canvas.axes.texts, *canvas.figure.texts)]
 
 
-def ellipses(canvas: Canvas) -> list[Ellipse]:
+def ellipses(canvas: Sheet) -> list[Ellipse]:
     return [patch for patch in canvas.axes.patches if isinstance(patch, Ellipse)]
 
 
-def diamonds(canvas: Canvas) -> list[tuple[float, float]]:
+def diamonds(canvas: Sheet) -> list[tuple[float, float]]:
     """Where points that are 15 square points large are, which only objects are."""
     return [
         (float(x), float(y))

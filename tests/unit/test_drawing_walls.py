@@ -6,7 +6,7 @@ import pytest
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.adapters.drawing import Floor
 from projections.adapters.drawing.base_layers import wall_spots
-from projections.adapters.drawing.picture import compose
+from projections.adapters.drawing.map_picture import compose
 from projections.fold.deltas import MapGiven
 from projections.fold.settings import Settings
 from projections.map.view import MapView

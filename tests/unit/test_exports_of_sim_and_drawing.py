@@ -20,7 +20,7 @@ def test_sim() -> None:
 
 
 def test_drawing() -> None:
-    names = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of", "map_png"]
+    names = ["Floor", "LostRobot", "MergeMark", "Spot", "draw_map", "floor_of", "map_png"]
     assert projections.adapters.drawing.__all__ == names
 
 

@@ -3,7 +3,8 @@
 matplotlib is used through its objects alone: no pyplot, no global state.
 """
 
-from .picture import draw_map, map_png
-from .scene import Bridge, Floor, LostRobot, Spot, floor_of
+from projections.adapters.scene import Floor, LostRobot, MergeMark, Spot, floor_of
 
-__all__ = ["Bridge", "Floor", "LostRobot", "Spot", "draw_map", "floor_of", "map_png"]
+from .map_picture import draw_map, map_png
+
+__all__ = ["Floor", "LostRobot", "MergeMark", "Spot", "draw_map", "floor_of", "map_png"]

@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
 from projections.adapters import palette
+from projections.adapters.scene import Box, Floor, drives, place_spots
 from projections.fold.occupancy import pooled
 from projections.map.view import MapView
 
-from .canvas import Canvas
-from .labels import Extent
-from .scene import Box, Floor, drives, place_spots
+from .canvas import Extent, Sheet
 
 REACH_M = 0.55
 """A place's region reaches this far around its keyframes."""
@@ -89,7 +88,7 @@ def _within(span: slice, whole: slice) -> slice:
     return slice(span.start - whole.start, span.stop - whole.start)
 
 
-def draw_floor(canvas: Canvas, floor: Floor) -> None:
+def draw_floor(canvas: Sheet, floor: Floor) -> None:
     """Rooms and the furniture in them."""
     for _, box in floor.rooms:
         _rectangle(canvas, box, palette.FLOOR, palette.FLOOR, 0)
@@ -97,7 +96,7 @@ def draw_floor(canvas: Canvas, floor: Floor) -> None:
         _rectangle(canvas, box, palette.FURNITURE, palette.FURNITURE_EDGE, 1)
 
 
-def draw_walls(canvas: Canvas, floor: Floor) -> None:
+def draw_walls(canvas: Sheet, floor: Floor) -> None:
     """Walls, on top of the regions, which may reach a little through them."""
     for x0, y0, x1, y1 in floor.walls:
         canvas.axes.plot(
@@ -108,7 +107,7 @@ def draw_walls(canvas: Canvas, floor: Floor) -> None:
             canvas.occupied.append(Extent((x0 + x1) / 2, (y0 + y1) / 2, half_x, half_y))
 
 
-def draw_regions(canvas: Canvas, view: MapView) -> None:
+def draw_regions(canvas: Sheet, view: MapView) -> None:
     """Each place's region, in its colour."""
     raster = Raster(canvas.bounds)
     patches = {p: raster.distances(spots) for p, spots in place_spots(view).items()}
@@ -126,7 +125,7 @@ def draw_regions(canvas: Canvas, view: MapView) -> None:
         canvas.axes.contour(*grid, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
 
 
-def draw_drives(canvas: Canvas, view: MapView) -> None:
+def draw_drives(canvas: Sheet, view: MapView) -> None:
     """Each run's path, where it started, and its keyframes in their places' colours."""
     for _, spots in drives(view):
         if spots:
@@ -139,7 +138,7 @@ def draw_drives(canvas: Canvas, view: MapView) -> None:
             canvas.axes.scatter(xs, ys, s=6, color=palette.place_colour(place), zorder=5)
 
 
-def _rectangle(canvas: Canvas, box: Box, fill: str, edge: str, zorder: int) -> None:
+def _rectangle(canvas: Sheet, box: Box, fill: str, edge: str, zorder: int) -> None:
     x0, y0, x1, y1 = box
     patch = Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=fill, edgecolor=edge, lw=0.6)
     patch.set_zorder(zorder)
@@ -172,7 +171,7 @@ def wall_spots(view: MapView) -> Spots:
     return [(corner[0], corner[1]) for corner in (at.min(axis=0).tolist(), at.max(axis=0).tolist())]
 
 
-def draw_map_walls(canvas: Canvas, view: MapView) -> None:
+def draw_map_walls(canvas: Sheet, view: MapView) -> None:
     """Free floor below the places' regions, walls above them."""
     if view.map is None:
         return

@@ -22,7 +22,7 @@ from projections.store.history import History
 from projections.store.history_records import Merge
 
 from .base_layers import draw_drives, draw_regions
-from .canvas import HALO, Bounds, Canvas, check_suffix
+from .canvas import HALO, Bounds, Sheet, check_suffix
 from .overlays import draw_place_names
 
 _PANEL_IN = 6.5
@@ -79,7 +79,7 @@ def draw_maps(maps: Sequence[tuple[str, MapView]], out: Path) -> None:
 
 def _panels(
     count: int, bounds: Bounds, layout: tuple[int, float], header_in: float
-) -> tuple[Figure, list[Canvas]]:
+) -> tuple[Figure, list[Sheet]]:
     """A figure with ``count`` equal panels of ``bounds`` (metres x0, y0, x1, y1); ``layout`` is
     the columns and their width, ``header_in`` the space above, in inches."""
     columns, width_in = layout
@@ -96,10 +96,10 @@ def _panels(
     for each in axes:
         each.set_axis_off()
     unit = (x1 - x0) / (width_in * 72)
-    return figure, [Canvas(figure, each, bounds, unit) for each in axes[:count]]
+    return figure, [Sheet(figure, each, bounds, unit) for each in axes[:count]]
 
 
-def _draw_map(panel: Canvas, view: MapView) -> None:
+def _draw_map(panel: Sheet, view: MapView) -> None:
     x0, y0, x1, y1 = panel.bounds
     draw_regions(panel, view)
     draw_drives(panel, view)
@@ -111,7 +111,7 @@ def _draw_map(panel: Canvas, view: MapView) -> None:
     panel.axes.set_aspect("equal")
 
 
-def _draw_chains(panel: Canvas, history: History, merge: Merge) -> None:
+def _draw_chains(panel: Sheet, history: History, merge: Merge) -> None:
     """The bridge with its ε circle and neighbours, and the chains of core points."""
     end = Offset(merge.cause.offset + 1)
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
@@ -129,14 +129,14 @@ def _draw_chains(panel: Canvas, history: History, merge: Merge) -> None:
     )  # fmt: skip
 
 
-def _draw_links(panel: Canvas, history: History, merge: Merge) -> None:
+def _draw_links(panel: Sheet, history: History, merge: Merge) -> None:
     """The founders of the cells of places by rooms that are the shortest drive apart."""
     for link in merge.links:
         ends = history.neighbours.positions([link.core, link.neighbour])
         panel.axes.plot(*ends.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
 
 
-def _draw_neighbours(panel: Canvas, history: History, merge: Merge, end: Offset) -> None:
+def _draw_neighbours(panel: Sheet, history: History, merge: Merge, end: Offset) -> None:
     """The bridge's ε circle, and the keyframes in it."""
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
     circle = Circle((x, y), history.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
@@ -174,4 +174,4 @@ def _bounds_of_maps(views: Sequence[MapView]) -> Bounds:
 
 def _save(figure: Figure, out: Path) -> None:
     check_suffix(out)
-    Canvas(figure, figure.axes[0], (0, 0, 1, 1), 1.0).save(out)
+    Sheet(figure, figure.axes[0], (0, 0, 1, 1), 1.0).save(out)

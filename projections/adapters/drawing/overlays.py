@@ -10,12 +10,19 @@ from collections.abc import Sequence
 from matplotlib.patches import Circle, Ellipse
 
 from projections.adapters import palette
+from projections.adapters.scene import (
+    Floor,
+    LostRobot,
+    MergeMark,
+    Spot,
+    object_groups,
+    place_badges,
+    two_sigma,
+)
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 
-from .canvas import HALO, Canvas
-from .labels import Extent, LabelRequest, place_labels
-from .scene import Bridge, Floor, LostRobot, Spot, object_groups, place_badges, two_sigma
+from .canvas import HALO, Extent, LabelRequest, Sheet, place_labels
 
 DOT_M = 0.04
 """Half the size of the box that an object's dot occupies."""
@@ -25,7 +32,7 @@ _WIDE_M = 2.0
 _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
 
 
-def draw_adjacency(canvas: Canvas, view: MapView) -> None:
+def draw_adjacency(canvas: Sheet, view: MapView) -> None:
     """A dashed line between neighbouring places and the number of transitions on it; a dotted one
     between two floors."""
     for a, b, count in view.edges():
@@ -40,7 +47,7 @@ def draw_adjacency(canvas: Canvas, view: MapView) -> None:
         )
 
 
-def draw_place_names(canvas: Canvas, view: MapView) -> None:
+def draw_place_names(canvas: Sheet, view: MapView) -> None:
     """Each place's name on its centroid, in its colour, with its likely type."""
     names = place_badges(view)
     for ordinal, place in view.places.items():
@@ -51,7 +58,7 @@ def draw_place_names(canvas: Canvas, view: MapView) -> None:
         )
 
 
-def draw_room_names(canvas: Canvas, floor: Floor) -> None:
+def draw_room_names(canvas: Sheet, floor: Floor) -> None:
     """Each room's name, in the first of its corners that is free."""
     height = 12 * canvas.unit
     for name, (x0, y0, x1, y1) in floor.rooms:
@@ -63,7 +70,7 @@ def draw_room_names(canvas: Canvas, floor: Floor) -> None:
         _draw_text(canvas, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
 
 
-def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
+def draw_objects(canvas: Sheet, view: MapView, min_observations: int) -> int:
     """A dot for each object, a label for each group; returns how many labels did not fit."""
     groups = object_groups(view, min_observations)
     for group in groups:
@@ -86,7 +93,7 @@ def draw_objects(canvas: Canvas, view: MapView, min_observations: int) -> int:
     return sum(box is None for box in boxes)
 
 
-def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
+def _draw_evidence(canvas: Sheet, found: ObjectRecord, colour: str) -> None:
     """An estimate's ellipse, and an arrow from where the object stood before it was moved."""
     if found.estimate is not None:
         width, height, angle = two_sigma(found.estimate)
@@ -103,7 +110,7 @@ def _draw_evidence(canvas: Canvas, found: ObjectRecord, colour: str) -> None:
         canvas.axes.annotate("", found.spot, start, zorder=9, arrowprops=arrow)
 
 
-def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:
+def draw_bridges(canvas: Sheet, bridges: Sequence[MergeMark]) -> None:
     """A ring around each keyframe that merged places, with its text."""
     for bridge in bridges:
         canvas.axes.scatter(
@@ -119,7 +126,7 @@ def draw_bridges(canvas: Canvas, bridges: Sequence[Bridge]) -> None:
             _draw_text(canvas, box, bridge.text, _LABEL_PT, palette.BRIDGE, weight="bold")
 
 
-def draw_lost(canvas: Canvas, lost: LostRobot) -> None:
+def draw_lost(canvas: Sheet, lost: LostRobot) -> None:
     """The lost robot's true position, the estimate with its spread, and a line between them."""
     truth, estimate = lost.truth, lost.estimate
     if estimate is not None:
@@ -135,7 +142,7 @@ def draw_lost(canvas: Canvas, lost: LostRobot) -> None:
     _draw_robot(canvas, truth, palette.TRUTH, "X")
 
 
-def _draw_robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
+def _draw_robot(canvas: Sheet, spot: Spot, colour: str, marker: str) -> None:
     canvas.axes.scatter(
         [spot.x], [spot.y], s=120, marker=marker, facecolor=colour, edgecolor="white", lw=1.2,
         zorder=16,
@@ -148,7 +155,7 @@ def _draw_robot(canvas: Canvas, spot: Spot, colour: str, marker: str) -> None:
 
 
 def _draw_badge(
-    canvas: Canvas,
+    canvas: Sheet,
     spot: tuple[float, float],
     text: str,
     size: float,
@@ -168,17 +175,17 @@ def _draw_badge(
     canvas.occupied.append(Extent(*spot, half_width, half_height))
 
 
-def _label_request(canvas: Canvas, text: str, spot: tuple[float, float]) -> LabelRequest:
+def _label_request(canvas: Sheet, text: str, spot: tuple[float, float]) -> LabelRequest:
     width = (0.58 * len(text) * _LABEL_PT + 3) * canvas.unit
     return LabelRequest(*spot, width, 1.3 * _LABEL_PT * canvas.unit)
 
 
-def _draw_leader(canvas: Canvas, anchor: tuple[float, float], box: Extent) -> None:
+def _draw_leader(canvas: Sheet, anchor: tuple[float, float], box: Extent) -> None:
     canvas.axes.plot((anchor[0], box.x), (anchor[1], box.y), color=palette.LEADER, lw=0.5, zorder=9)
 
 
 def _draw_text(
-    canvas: Canvas,
+    canvas: Sheet,
     box: Extent,
     text: str,
     size: float,

@@ -3,9 +3,8 @@
 Each function takes a `MapView` and returns the text of a file; the same view gives the same bytes.
 """
 
-from .geojson import Origin, Point, geojson, hull
+from .geojson import Origin, geojson
 from .graphs import dot, graphml
-from .tables import tables
-from .waypoints import nav2_waypoints
+from .lists import nav2_waypoints, tables
 
-__all__ = ["Origin", "Point", "dot", "geojson", "graphml", "hull", "nav2_waypoints", "tables"]
+__all__ = ["Origin", "dot", "geojson", "graphml", "nav2_waypoints", "tables"]

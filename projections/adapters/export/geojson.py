@@ -11,16 +11,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from projections.fold.deltas import Pose
-from projections.fold.exact import UM_PER_M
+from projections.adapters.scene import Point, places_of
 from projections.map.view import MapView
 
 _WGS84_A_M: Final = 6_378_137.0
 _WGS84_E2: Final = 6.694_379_990_141_316e-3
 _DECIMALS: Final = 9
 """Decimals of a degree: 0.1 mm."""
-
-Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,42 +74,20 @@ def _feature(kind: str, shape: str, coordinates: Any, **values: Any) -> dict[str
 
 
 def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
-    for place in view.places.values():
-        ring = hull(view.keyframes[member].pose for member in place.members)
-        kind = view.type_of(place.ordinal)
+    for shown in places_of(view):
+        place, kind = shown.record, view.type_of(shown.record.ordinal)
         values = {
             "place_id": place.place_id,
             "name": place.name,
             "type": None if kind is None else kind.type,
-            "floor": view.floor_of(place.ordinal),
+            "floor": shown.floor,
             "keyframe_count": place.keyframe_count,
         }
-        if len(ring) < 3:  # all poses on one line
-            centre = at(place.centroid_x, place.centroid_y)
-            yield _feature("place", "Point", centre, **values)
+        if not shown.outline:
+            yield _feature("place", "Point", at(*shown.centroid), **values)
         else:
-            closed = [at(x, y) for x, y in [*ring, ring[0]]]
+            closed = [at(x, y) for x, y in [*shown.outline, shown.outline[0]]]
             yield _feature("place", "Polygon", [closed], **values)
-
-
-def hull(poses: Iterable[Pose | None]) -> list[Point]:
-    """Corners in metres of the convex hull of poses, counter-clockwise, by Andrew's monotone chain
-    in whole micrometres: none lies on the line between its neighbours."""
-
-    def chain(ordered: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-        corners: list[tuple[int, int]] = []
-        for x, y in ordered:
-            while len(corners) > 1:
-                (ax, ay), (bx, by) = corners[-2:]
-                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
-                    break
-                corners.pop()
-            corners.append((x, y))
-        return corners[:-1]
-
-    ordered = sorted({(pose.x_um, pose.y_um) for pose in poses if pose is not None})
-    ring = chain(ordered) + chain(reversed(ordered)) if len(ordered) > 1 else ordered
-    return [(x / UM_PER_M, y / UM_PER_M) for x, y in ring]
 
 
 def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:

@@ -46,8 +46,7 @@ from projections.store.history_recorder import map_at
 from projections.store.stored_view import StoredView
 from projections.store.tables import Tables
 
-from .messages import MapTopics
-from .scene import FRAME
+from .topics import FRAME, MapTopics
 
 _SERIES: Final = (("places", "#3b82c4"), ("objects", "#e08a1e"), ("noise", "#8b939c"))
 

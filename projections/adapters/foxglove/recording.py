@@ -13,7 +13,7 @@ from projections.fold.deltas import KeyframeAdded, MapGiven
 from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold
 
-from .messages import MapTopics
+from .topics import MapTopics
 
 
 def write_recording(fold: RecordedFold, path: Path) -> int:

@@ -163,13 +163,13 @@ def _recorder(name: str, identity: str) -> Callable[[RecordedFold, Path], int]:
             from projections.adapters.foxglove.recording import write_recording
 
             return write_recording
-        from projections.adapters.rerun import recording
+        from projections.adapters.rerun import rrd_recording
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"--{name} needs {error.name}, which is not installed; pip install 'mapfold[{name}]'"
         ) from None
     recording_id = hashlib.sha256(identity.encode()).hexdigest()[:32]
-    return partial(recording.write_recording, recording_id=recording_id)
+    return partial(rrd_recording.write_recording, recording_id=recording_id)
 
 
 def _degrees(text: str) -> tuple[float, ...]:

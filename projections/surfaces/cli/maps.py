@@ -94,7 +94,7 @@ def draw(
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.adapters.sim import build_house
     from projections.adapters.drawing import draw_map, floor_of
-    from projections.adapters.drawing.picture import bridges_of
+    from projections.adapters.drawing.map_picture import bridges_of
     from projections.map.one_floor import view_of_floor
 
     check_picture(out)

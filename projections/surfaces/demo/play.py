@@ -25,8 +25,8 @@ from eventsrc.base.user_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections import history
-from projections.adapters.drawing import Bridge, LostRobot, Spot, draw_map, floor_of
-from projections.adapters.drawing.picture import bridges_of
+from projections.adapters.drawing import LostRobot, MergeMark, Spot, draw_map, floor_of
+from projections.adapters.drawing.map_picture import bridges_of
 from projections.postgres import rebuild
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, open_targets
@@ -197,7 +197,7 @@ def _where_lost(lost: LostRun) -> LostRobot:
     return LostRobot(truth, Spot(pose.x, pose.y, pose.yaw), pose.spread_m)
 
 
-def _bridges(log: Path, house: Map) -> list[Bridge]:
+def _bridges(log: Path, house: Map) -> list[MergeMark]:
     """A mark for each merge that the corrections left."""
     with history.LogTimeline(log, lambda _: SETTINGS, cache=False) as timeline:
         merges = timeline.knowing(timeline.end).merges(timeline.end)

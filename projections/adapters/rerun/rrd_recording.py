@@ -2,7 +2,7 @@
 
 | path | what |
 |---|---|
-| ``map/…``, ``floors/…``, ``graph`` | the map (`scene`); an entity is logged where it changed |
+| ``map/…``, ``floors/…``, ``graph`` | the map (`parts`); an entity is logged where it changed |
 | ``changes`` | one line for each change of the map |
 | ``counts/places``, ``counts/objects`` | after each event |
 | ``lag`` | seconds from a robot's event to its being written into the log |
@@ -34,7 +34,7 @@ from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold
 from projections.map.view import MapView
 
-from .scene import Arrow, Graph, Lines, Part, Path, Points, map_parts, robot_parts
+from .parts import Arrow, Graph, Lines, Part, Path, Points, map_parts, robot_parts
 
 APPLICATION: Final = "mapfold"
 _MARGIN_M: Final = 1.0

@@ -1,17 +1,29 @@
-"""The contents of a picture: floor plan, lost robot, merges; and from the map groups, names,
-drives.
+"""What is drawn of a map, for pictures, files and viewers: places with outline and label, objects
+where they stand, ways, drives, the robot; and what pictures add: a plan, a lost robot, merges.
 
 Lengths in metres, angles in radians.
 """
 
 import math
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from eventsrc.adapters.sim import House
 from eventsrc.envelope.model import RunId
-from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
+from projections.adapters import palette
+from projections.fold.deltas import Pose
+from projections.fold.exact import UM_PER_M
+from projections.map.records import (
+    EstimatedPosition,
+    KeyframeRecord,
+    ObjectRecord,
+    PlaceRecord,
+)
 from projections.map.view import MapView
+
+if TYPE_CHECKING:
+    from eventsrc.adapters.sim import House
 
 _NEAR_M = 1.0
 _MOST_LETTERS = 24
@@ -19,6 +31,117 @@ _MOST_LETTERS = 24
 
 Line = tuple[float, float, float, float]
 Box = tuple[float, float, float, float]
+
+
+Point = tuple[float, float]
+_T = TypeVar("_T")
+_MOST_POSES: Final = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class ShownPlace:
+    """A place: the corners of the hull of its poses, none where these are on one line; ``label`` is
+    its name or likely type, and its id."""
+
+    record: PlaceRecord
+    floor: str | None
+    outline: tuple[Point, ...]
+    label: str
+
+    @property
+    def centroid(self) -> Point:
+        """The mean of its poses."""
+        return self.record.centroid_x, self.record.centroid_y
+
+    @property
+    def colour(self) -> str:
+        """Its colour, #rrggbb."""
+        return palette.place_colour(self.record.ordinal)
+
+
+@dataclass(frozen=True, slots=True)
+class ShownObject:
+    """An object where it stands, on the floor that it was first seen from; ``label`` is its class,
+    and whether it is missing."""
+
+    record: ObjectRecord
+    floor: str | None
+    missing: bool
+
+    @property
+    def label(self) -> str:
+        """Its class, and whether it is missing."""
+        return f"{self.record.class_name} (missing)" if self.missing else self.record.class_name
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """That robots went from one of two places to the other, how often."""
+
+    ends: tuple[ShownPlace, ShownPlace]
+    transitions: int
+
+
+def places_of(view: MapView) -> list[ShownPlace]:
+    """The places of a map, in the order in which they were founded."""
+    found = []
+    for place in view.places.values():
+        ring = hull(view.keyframes[member].pose for member in place.members)
+        kind = view.type_of(place.ordinal)
+        name = place.name or (kind.type if kind is not None else None)
+        label = place.place_id if name is None else f"{name} ({place.place_id})"
+        outline = tuple(ring) if len(ring) > 2 else ()
+        found.append(ShownPlace(place, view.floor_of(place.ordinal), outline, label))
+    return found
+
+
+def objects_of(view: MapView) -> list[ShownObject]:
+    """The objects of a map, in the order in which they were founded."""
+    return [
+        ShownObject(
+            found,
+            view.keyframes[view.observations[found.observations[0]].keyframe].floor,
+            found.missing_in is not None,
+        )
+        for found in view.objects.values()
+    ]
+
+
+def ways_of(view: MapView, places: Iterable[ShownPlace]) -> list[Way]:
+    """The adjacent ones of a map's places."""
+    by_ordinal = {place.record.ordinal: place for place in places}
+    return [Way((by_ordinal[a], by_ordinal[b]), count) for a, b, count in view.edges()]
+
+
+def robot_of(view: MapView) -> KeyframeRecord | None:
+    """The latest keyframe that has a pose."""
+    return next((k for k in reversed(view.keyframes) if k.pose is not None), None)
+
+
+def thinned(items: Sequence[_T]) -> Sequence[_T]:
+    """At most 2,000 of a path's poses and one of them, the last one included."""
+    step = -(-len(items) // _MOST_POSES)
+    return [*items[:-1:step], items[-1]] if items else []
+
+
+def hull(poses: Iterable[Pose | None]) -> list[Point]:
+    """Corners in metres of the convex hull of poses, counter-clockwise, by Andrew's monotone chain
+    in whole micrometres: none lies on the line between its neighbours."""
+
+    def chain(ordered: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        corners: list[tuple[int, int]] = []
+        for x, y in ordered:
+            while len(corners) > 1:
+                (ax, ay), (bx, by) = corners[-2:]
+                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
+                    break
+                corners.pop()
+            corners.append((x, y))
+        return corners[:-1]
+
+    ordered = sorted({(pose.x_um, pose.y_um) for pose in poses if pose is not None})
+    ring = chain(ordered) + chain(reversed(ordered)) if len(ordered) > 1 else ordered
+    return [(x / UM_PER_M, y / UM_PER_M) for x, y in ring]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +175,7 @@ class LostRobot:
 
 
 @dataclass(frozen=True, slots=True)
-class Bridge:
+class MergeMark:
     """The keyframe that merged places, and a label for it."""
 
     x: float
@@ -188,7 +311,7 @@ def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
     }
 
 
-def floor_of(house: House) -> Floor:
+def floor_of(house: "House") -> Floor:
     """Walls, standing furniture and room names of ``house``."""
     standing = (thing.footprint for thing in house.things if thing.model.stands)
     return Floor(

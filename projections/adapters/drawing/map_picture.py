@@ -9,6 +9,14 @@ from pathlib import Path
 
 from eventsrc.base.text import counted
 from projections.adapters import palette
+from projections.adapters.scene import (
+    Floor,
+    LostRobot,
+    MergeMark,
+    place_names,
+    shown_objects,
+    spot_of,
+)
 from projections.fold.deltas import PlacesMerged
 from projections.map.view import MapView
 from projections.store.history_records import Merge
@@ -21,8 +29,7 @@ from .base_layers import (
     draw_walls,
     wall_spots,
 )
-from .canvas import Canvas, check_suffix, new_canvas
-from .labels import Extent
+from .canvas import Extent, Sheet, check_suffix, new_canvas
 from .overlays import (
     DOT_M,
     draw_adjacency,
@@ -32,7 +39,6 @@ from .overlays import (
     draw_place_names,
     draw_room_names,
 )
-from .scene import Bridge, Floor, LostRobot, place_names, shown_objects, spot_of
 
 LEGEND = (
     "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
@@ -52,7 +58,7 @@ def draw_map(
     title: str,
     floor: Floor | None = None,
     lost: LostRobot | None = None,
-    bridges: Sequence[Bridge] = (),
+    bridges: Sequence[MergeMark] = (),
     min_observations: int = 2,
 ) -> None:
     """Draw ``view`` to ``out``, in the format of its suffix (.png, .svg, .pdf).
@@ -74,9 +80,9 @@ def compose(
     title: str,
     floor: Floor,
     lost: LostRobot | None = None,
-    bridges: Sequence[Bridge] = (),
+    bridges: Sequence[MergeMark] = (),
     min_observations: int = 2,
-) -> Canvas:
+) -> Sheet:
     """The finished canvas, not yet written to a file."""
     by_evidence = view.settings.fusion == "evidence"
     shown = shown_objects(view, min_observations) if by_evidence else []
@@ -116,7 +122,11 @@ def _numbers(view: MapView, min_observations: int) -> str:
 
 
 def legend_lines(
-    lost: LostRobot | None, bridges: Sequence[Bridge], left_out: int, *, by_evidence: bool = False
+    lost: LostRobot | None,
+    bridges: Sequence[MergeMark],
+    left_out: int,
+    *,
+    by_evidence: bool = False,
 ) -> list[str]:
     """The lines below the map; ``left_out`` counts labels without room."""
     parts = []
@@ -129,15 +139,15 @@ def legend_lines(
     return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
 
 
-def bridges_of(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[Bridge]:
+def bridges_of(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[MergeMark]:
     """One mark for each merge, at the position of its bridging keyframe."""
     names = place_names(view)
-    marks: list[Bridge] = []
+    marks: list[MergeMark] = []
     for merge in merges:
         keyframe = view.keyframes[merge.bridge]
         spot = spot_of(keyframe)
         if spot is not None:
             absorbed = " and ".join(names[place] for place in merge.absorbed)
             text = f"{absorbed} into {names[merge.survivor]}, keyframe {keyframe.keyframe_id}"
-            marks.append(Bridge(*spot, text))
+            marks.append(MergeMark(*spot, text))
     return marks
