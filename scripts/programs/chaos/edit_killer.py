@@ -221,6 +221,8 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--seed", type=int, default=random.randrange(10**6))
     args = parser.parse_args()
+    # A shell has programs in the background ignore Ctrl-C, and so would the recorders.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     print(f"seed {args.seed}", flush=True)
     with tempfile.TemporaryDirectory() as folder, server_to_kill() as other:
         fresh = Targets(other.url, other.url)

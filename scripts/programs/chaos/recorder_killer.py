@@ -384,6 +384,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=20260324)
     parser.add_argument("--progress", type=Path, help="file of finished batches; it goes on there")
     args = parser.parse_args()
+    # A shell has programs in the background ignore Ctrl-C, and so would the recorders.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     batch, total = finished_batches(args.progress, args.seed)
     print(f"seed {args.seed}, after {batch} batches: {total}", flush=True)
     while total.kills < args.kills and total.good:
