@@ -33,7 +33,7 @@ main()
 """
 _CTRL_C_IN_A_WORKER = """
 import os, signal, sys
-if "--multiprocessing-fork" in sys.orig_argv:
+if any("worker_process" in word for word in sys.orig_argv):
     os.kill(os.getpid(), signal.SIGINT)
 """
 
