@@ -19,7 +19,7 @@ from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.guard import Guard
 from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
-from projections.surfaces.serve.metrics import ServiceMetrics
+from projections.surfaces.serve.service_metrics import ServiceMetrics
 from projections.surfaces.serve.states import DEFAULT_PAGE, MAX_PAGE
 from tests.docs.console import ROOT
 from tests.support.services import RUN

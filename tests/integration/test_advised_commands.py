@@ -57,8 +57,8 @@ def test_no_message_has_a_command_line_of_its_own() -> None:
         if ADVICE.search(text)
     ]
     named = {
-        "projections/surfaces/cli/recording.py": 1,  # "taking commands of `mapfold edit`"
-        "projections/surfaces/demo/report.py": 1,  # what the demo ran
+        "projections/surfaces/cli/record_command.py": 1,  # "taking commands of `mapfold edit`"
+        "projections/surfaces/demo/story.py": 1,  # what the demo ran
     }
     others = [each for each in found if each.split(":")[0] not in named]
     assert not others, "\n".join(others)

@@ -11,13 +11,13 @@ import pytest
 from eventsrc.base.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
 from eventsrc.record.transport.session import Router, ZenohOptions
-from projections.surfaces.demo.recording import Children
+from projections.surfaces.demo.recorded_run import Children
 from tests.support.fixtures_zenoh import Program
 
 STARTER = """
 import signal, sys
 from pathlib import Path
-from projections.surfaces.demo.recording import Children
+from projections.surfaces.demo.recorded_run import Children
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))

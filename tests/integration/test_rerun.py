@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from projections.adapters.palette import place_colour
 from projections.fold.settings import Settings
 from projections.map.scenes import RecordedFold
-from projections.surfaces.cli.export import _recorder
+from projections.surfaces.cli.export_command import _recorder
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import write_log

@@ -17,7 +17,7 @@ from eventsrc.record.recorder.bridged import HOLD_MESSAGES
 from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import token_selectors, topic_of, type_of_token
-from projections.surfaces.cli.bridged import recording_of
+from projections.surfaces.cli.bridge_options import recording_of
 from tests.support import ros2dds
 from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log

@@ -17,7 +17,7 @@ from eventsrc.record.recorder.queue import BridgedMessage, MessageQueue
 from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording, read_recording
-from projections.surfaces.cli.bridged import recording_of
+from projections.surfaces.cli.bridge_options import recording_of
 from tests.support import ros2dds
 from tests.support.fixtures_log import KEY, read_log
 from tests.support.recorders import Running

@@ -22,17 +22,17 @@ from tests.support.services import Service, documents
 CROPS = [crop for document in documents(4) for crop in document["detections"]]
 CLASS = {"crops": [{"class": "toilet"}]}
 ASKED = (
-    ("/relocalize", {"crops": CROPS}, models.Answer),
-    ("/relocalize?method=plain", {"crops": CROPS}, models.Answer),
-    ("/relocalize?session=a", {"crops": CROPS}, models.Answer),
-    ("/relocalize?top=1", CLASS, models.Answer),
-    ("/relocalize", [{"embedding": [1.0] * 512}], models.Answer),
-    ("/state/places", None, models.Places),
-    ("/state/objects?limit=3", None, models.Objects),
-    ("/state/objects", None, models.Objects),
-    ("/state/places?x=5&y=5&radius=100", None, models.Places),
-    ("/state/objects?x=5&y=5&radius=100&limit=5", None, models.Objects),
-    ("/state/objects?x=5000&y=5", None, models.Objects),
+    ("/relocalize", {"crops": CROPS}, models.AnswerShape),
+    ("/relocalize?method=plain", {"crops": CROPS}, models.AnswerShape),
+    ("/relocalize?session=a", {"crops": CROPS}, models.AnswerShape),
+    ("/relocalize?top=1", CLASS, models.AnswerShape),
+    ("/relocalize", [{"embedding": [1.0] * 512}], models.AnswerShape),
+    ("/state/places", None, models.PlacesShape),
+    ("/state/objects?limit=3", None, models.ObjectsShape),
+    ("/state/objects", None, models.ObjectsShape),
+    ("/state/places?x=5&y=5&radius=100", None, models.PlacesShape),
+    ("/state/objects?x=5&y=5&radius=100&limit=5", None, models.ObjectsShape),
+    ("/state/objects?x=5000&y=5", None, models.ObjectsShape),
     ("/health", None, models.Health),
 )
 
@@ -48,7 +48,8 @@ def test_every_answer_has_the_shape_described_and_every_described_key_is_sent(
         TypeAdapter(model).validate_json(content, strict=True, extra="forbid")
         _keys(json.loads(content), model.__name__, sent)
     for name, keys in sent.items():
-        wanted = set(get_type_hints(getattr(models, name)))
+        shape = getattr(models, f"{name}Shape", None) or getattr(models, name)
+        wanted = set(get_type_hints(shape))
         assert keys == wanted, (name, wanted ^ keys)
     assert set(sent) >= {"Answer", "RankedPlace", "Evidence", "Pose", "Track", "Place", "MapObject"}
 
@@ -74,7 +75,13 @@ def _keys(document: Any, name: str, sent: dict[str, set[str]]) -> None:
 
 def test_the_description_is_made_of_these_models(described: Any) -> None:
     shapes = described["components"]["schemas"]
-    for model in (models.Answer, models.Places, models.Objects, models.Health, models.Refusal):
+    for model in (
+        models.AnswerShape,
+        models.PlacesShape,
+        models.ObjectsShape,
+        models.Health,
+        models.RefusalShape,
+    ):
         schema = TypeAdapter(model).json_schema(ref_template="#/components/schemas/{model}")
         parts = schema.pop("$defs", {})
         assert shapes[model.__name__] == schema
@@ -97,8 +104,8 @@ def test_the_examples_work(service: Service, described: Any) -> None:
         answer = service.document("/relocalize", each["value"])
         assert answer["places"]
     for path, model in (
-        ("/relocalize", models.Answer),
-        ("/state/{what}", models.Places),
+        ("/relocalize", models.AnswerShape),
+        ("/state/{what}", models.PlacesShape),
         ("/health", models.Health),
     ):
         (operation,) = described["paths"][path].values()

@@ -43,7 +43,7 @@ def test_every_refusal_has_the_one_shape(
 def _check_refusal(
     described: Any, path: str, code: int, fields: dict[str, str], content: bytes
 ) -> None:
-    TypeAdapter(models.Refusal).validate_json(content, strict=True, extra="forbid")
+    TypeAdapter(models.RefusalShape).validate_json(content, strict=True, extra="forbid")
     assert fields["x-content-type-options"] == "nosniff"
     template = "/state/{what}" if path.startswith("/state") else path.partition("?")[0]
     for operation in described["paths"][template].values():

@@ -17,7 +17,7 @@ from eventsrc.ros.derivation import topic_of
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.surfaces.cli.bridged import BridgeChoice, recording_of
+from projections.surfaces.cli.bridge_options import BridgeChoice, recording_of
 from tests.support import ros2dds
 from tests.support.fixtures_log import read_log
 from tests.support.fixtures_zenoh import DEADLINE_S

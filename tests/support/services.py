@@ -23,7 +23,7 @@ from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.guard import Guard, SafeHeaders
 from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
-from projections.surfaces.serve.metrics import CountedResponses, ServiceMetrics
+from projections.surfaces.serve.service_metrics import CountedResponses, ServiceMetrics
 from tests.support.http_attacks import ask, request, status
 from tests.support.logs import append_command, name_place, write_log
 

@@ -9,10 +9,10 @@ from projections.fold.settings import Settings
 from projections.map.view import MapView
 from projections.postgres import RebuildReport
 from projections.postgres.labels import LABELS, TABLE
-from projections.surfaces.demo import report
+from projections.surfaces.demo import story
 from projections.surfaces.demo.acts import Corrected, Explored, RoomMerge, RoomPart, most_telling
-from projections.surfaces.demo.recording import Followed, RecordedRun
-from projections.surfaces.demo.report import DemoResult, type_lines
+from projections.surfaces.demo.recorded_run import Followed, RecordedRun
+from projections.surfaces.demo.story import DemoResult, type_lines
 from projections.surfaces.python import Map
 from tests.support.envelopes import detection, envelope
 from tests.support.folds import fold
@@ -72,33 +72,33 @@ def test_a_merge_across_rooms_is_preferred_to_a_larger_one_within_a_room() -> No
 
 
 def test_no_merges() -> None:
-    assert list(report.merge_lines(())) == ["   no two places became one on this drive"]
+    assert list(story.merge_lines(())) == ["   no two places became one on this drive"]
 
 
 def test_a_merge_is_reported_with_its_numbers() -> None:
-    lines = "\n".join(report.merge_lines((_merge(7, "hall", "study", 12),)))
+    lines = "\n".join(story.merge_lines((_merge(7, "hall", "study", 12),)))
     for wanted in ("p0 (30 keyframes, hall)", "p1 (12 keyframes, study)", "event 7", "5 places"):
         assert wanted in lines
     assert "such moments" not in lines
 
 
 def test_an_incomplete_log_is_reported() -> None:
-    good = "\n".join(report.recording_lines(RECORDED, FOLLOWED, 5, 8, 30.0))
+    good = "\n".join(story.recording_lines(RECORDED, FOLLOWED, 5, 8, 30.0))
     assert "byte for byte" in good
     assert "NOT" not in good
     torn = replace(RECORDED, recorded=9, intact=False, lost=1)
-    lines = "\n".join(report.recording_lines(torn, FOLLOWED, 5, 8, 30.0))
+    lines = "\n".join(story.recording_lines(torn, FOLLOWED, 5, 8, 30.0))
     assert "9 of 10" in lines
     assert "NOT byte for byte; 0 rejected, 1 lost" in lines
 
 
 @pytest.mark.parametrize(("same", "says"), [(True, "the same rows as"), (False, "OTHER rows than")])
 def test_a_replay_with_other_rows_is_reported(same: bool, says: str) -> None:
-    assert says in "\n".join(report.replay_lines(REPLAYED, HOUSE, same))
+    assert says in "\n".join(story.replay_lines(REPLAYED, HOUSE, same))
 
 
 def test_a_replay_with_another_digest_is_reported() -> None:
-    lines = "\n".join(report.replay_lines(replace(REPLAYED, digest="0" * 64), HOUSE, True))
+    lines = "\n".join(story.replay_lines(replace(REPLAYED, digest="0" * 64), HOUSE, True))
     assert "ANOTHER digest" in lines
 
 
@@ -113,33 +113,33 @@ def test_a_demo_is_sound_only_if_everything_agrees() -> None:
 
 
 def test_corrections_are_reported_as_far_as_there_are_any() -> None:
-    lines = "\n".join(report.correction_lines(CORRECTED))
+    lines = "\n".join(story.correction_lines(CORRECTED))
     assert "p11 (345 keyframes, living room) and p12 (120 keyframes, dining room);" in lines
     assert 'p12 is called "dining room"' in lines
     assert "event 1300 of the log" in lines
     assert "event 1301" in lines
     without = replace(CORRECTED, commands=(), named=None, apart=())
-    assert len(list(report.correction_lines(without))) == 1
+    assert len(list(story.correction_lines(without))) == 1
     other = replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))
-    assert "ANOTHER digest" in "\n".join(report.correction_lines(other))
+    assert "ANOTHER digest" in "\n".join(story.correction_lines(other))
 
 
 def test_lines_fit_a_terminal() -> None:
     merges = (_merge(1234, "living room", "dining room", 120), _merge(7, "hall", "hall", 3))
     lines = [
-        *report.recording_lines(RECORDED, FOLLOWED, 12_345, 8, 30.0),
-        *report.replay_lines(REPLAYED, HOUSE, True),
-        *report.map_lines(HOUSE, Settings(), 1),
-        *report.merge_lines(merges),
-        *report.correction_lines(CORRECTED),
-        *report.correction_lines(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
+        *story.recording_lines(RECORDED, FOLLOWED, 12_345, 8, 30.0),
+        *story.replay_lines(REPLAYED, HOUSE, True),
+        *story.map_lines(HOUSE, Settings(), 1),
+        *story.merge_lines(merges),
+        *story.correction_lines(CORRECTED),
+        *story.correction_lines(replace(CORRECTED, replayed=replace(REPLAYED, digest="0" * 64))),
     ]
     assert max(map(len, lines)) <= 100
 
 
 def test_singular_forms() -> None:
     at_once = replace(FOLLOWED, batches=1)
-    lines = "\n".join(report.recording_lines(RECORDED, at_once, 1, 1, 30.0))
+    lines = "\n".join(story.recording_lines(RECORDED, at_once, 1, 1, 30.0))
     assert "through 1 room, " in lines
     assert "with 1 detection are in the log" in lines
     assert "in 1 transaction:" in lines

@@ -18,10 +18,10 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "simulate": "simulate:simulate",
     },
     "Record a log": {
-        "record": "recording:record",
-        "router": "recording:router",
+        "record": "record_command:record",
+        "router": "record_command:router",
         "detect": "detect:detect",
-        "spool": "spool:spool",
+        "spool": "spool_command:spool",
         "import": "import_:import_",
         "log": "log:log_commands",
     },
@@ -37,8 +37,8 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "draw": "maps:draw",
         "ui": "ui:ui",
         "query": "query:query",
-        "export": "export:export",
-        "foxglove": "export:foxglove",
+        "export": "export_command:export",
+        "foxglove": "export_command:foxglove",
     },
     "Find a robot": {
         "relocalize": "relocalize:relocalize",
@@ -49,7 +49,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "why": "time_travel:why",
         "diff": "time_travel:diff",
         "bisect": "time_travel:bisect",
-        "whatif": "whatif:whatif",
+        "whatif": "whatif_command:whatif",
     },
     "Correct and measure": {
         "edit": "edit:edit",

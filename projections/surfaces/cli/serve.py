@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they 
     import socket
     import ssl
 
-    from projections.surfaces.serve.metrics import ServiceMetrics
+    from projections.surfaces.serve.service_metrics import ServiceMetrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ class HttpEndpoint:
         from projections.surfaces.serve.guard import Guard, SafeHeaders
         from projections.surfaces.serve.http import create_app
         from projections.surfaces.serve.listening import serving
-        from projections.surfaces.serve.metrics import CountedResponses
+        from projections.surfaces.serve.service_metrics import CountedResponses
 
         app = create_app(answerer, queue, metrics, secured=self.token is not None)
         guarded = Guard(app, self.token, (self.host, *self.hosts), self.origins)
@@ -224,6 +224,6 @@ def serve(
 
 
 def _metrics(answerer: Answerer, queue: FairQueue) -> "ServiceMetrics":
-    from projections.surfaces.serve.metrics import ServiceMetrics
+    from projections.surfaces.serve.service_metrics import ServiceMetrics
 
     return ServiceMetrics(answerer, queue)

@@ -33,7 +33,7 @@ from projections.postgres.connection import Targets, open_targets
 from projections.postgres.embedded import EmbeddedServer
 from projections.surfaces.python import Map, Settings, fold
 
-from . import report
+from . import story
 from .acts import (
     SETTINGS,
     LostRun,
@@ -44,7 +44,7 @@ from .acts import (
     most_telling,
     place_rooms,
 )
-from .recording import record_run
+from .recorded_run import record_run
 
 MARKER: Final = ".mapfold-demo"
 _GENERATED: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
@@ -112,24 +112,24 @@ def run_demo(
                 writer.append(MAP_KEY, occupancy_map(house).encode())
             recorded, followed = record_run(explorer, speed, folder, targets, SETTINGS)
             rooms = len(house.plan.rooms)
-            clock.show(report.recording_lines(recorded, followed, detections, rooms, speed))
+            clock.show(story.recording_lines(recorded, followed, detections, rooms, speed))
         with clock.stage("The databases are thrown away and the log is replayed"):
             tailed = _have_rows(log, targets)
             replayed = rebuild(log, targets, SETTINGS)
             same_rows = tailed and _have_rows(log, targets)
             explored = explore(log, explorer)
-            clock.show(report.replay_lines(replayed, explored.house, same_rows))
+            clock.show(story.replay_lines(replayed, explored.house, same_rows))
         with clock.stage("The map"):
             default_places = len(fold(log, settings=Settings(), embeddings=False).places)
-            clock.show(report.map_lines(explored.house, Settings(), default_places))
-            clock.show(report.type_lines(explored.house))
-            clock.show(report.merge_lines(explored.merges))
+            clock.show(story.map_lines(explored.house, Settings(), default_places))
+            clock.show(story.type_lines(explored.house))
+            clock.show(story.merge_lines(explored.merges))
         with clock.stage("A person corrects the map"):
             corrected = correct(log, targets, explorer, explored)
-            clock.show(report.correction_lines(corrected))
+            clock.show(story.correction_lines(corrected))
         with clock.stage("Run B is lost and asks"):
             lost = ask_lost(corrected.house, lost_run, folder)
-            clock.show(report.question_lines(lost, place_rooms(corrected.house, explorer)))
+            clock.show(story.question_lines(lost, place_rooms(corrected.house, explorer)))
         with clock.stage("The map is drawn"):
             draw_map(
                 corrected.house.view,
@@ -142,10 +142,10 @@ def run_demo(
             clock.show([f"   {folder / 'map.png'}"])
     print_line(f"{clock.total:.1f} s in all. Go on with it:")
     clock.show(_next_commands(folder, most_telling(explored.merges), db, vector_db))
-    done = report.DemoResult(
+    done = story.DemoResult(
         seed, SETTINGS, recorded, followed, replayed, same_rows, explored, corrected, lost
     )
-    return report.result_document(done, clock.seconds, folder)
+    return story.result_document(done, clock.seconds, folder)
 
 
 class _Stages:

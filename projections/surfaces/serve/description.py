@@ -20,7 +20,7 @@ from fastapi.responses import Response
 from projections.localize.relocalize import Method, question_schema
 
 from .answering import MAX_TOP
-from .models import Refusal
+from .models import RefusalShape
 from .sessions import MAX_NAME
 
 _EMBEDDING: Final = base64.b64encode(struct.pack("<512f", 1.0, *[0.0] * 511)).decode()
@@ -185,7 +185,8 @@ def refusals(*, asking: bool = False) -> dict[int | str, dict[str, Any]]:
     """The refusals of a path; ``asking`` for a path that queries the database."""
     known = _EVERYWHERE + (_ASKING if asking else ())
     return {
-        status: {"model": Refusal, "description": text} | ({"headers": headers} if headers else {})
+        status: {"model": RefusalShape, "description": text}
+        | ({"headers": headers} if headers else {})
         for status, text, headers in sorted(known)
     }
 

@@ -28,8 +28,8 @@ from .answering import MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
 from .fair_queue import FairQueue
-from .metrics import ServiceMetrics
-from .models import Answer, Health, Objects, Places, StateQuery
+from .models import AnswerShape, Health, ObjectsShape, PlacesShape, StateQuery
+from .service_metrics import ServiceMetrics
 from .sessions import MAX_NAME
 from .states import State, refuse_unknown
 
@@ -80,7 +80,7 @@ def create_app(
         "/relocalize",
         summary="Ranked Places, a pose and a confidence",
         openapi_extra=QUESTION,
-        response_model=Answer,
+        response_model=AnswerShape,
         responses=refusals(asking=True),
         dependencies=[only(*OPTIONS)],
     )
@@ -109,7 +109,7 @@ def create_app(
         summary="Places or objects near a position, nearest first, or all of them",
         description="With `x` and `y` those near that position. Without, all of them by pages: ask"
         " again with `next` of the answer as `cursor` until it is null.",
-        response_model=Places | Objects,
+        response_model=PlacesShape | ObjectsShape,
         responses=refusals(asking=True),
         dependencies=[only(*StateQuery.model_fields)],
     )

@@ -15,7 +15,7 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 Metres = Annotated[float, Field(description="Metres in the map's frame.")]
 
 
-class Evidence(TypedDict):
+class EvidenceShape(TypedDict):
     """An observation in the map that supports a Place."""
 
     det_id: str
@@ -26,7 +26,7 @@ class Evidence(TypedDict):
     ]
 
 
-class RankedPlace(TypedDict):
+class RankedPlaceShape(TypedDict):
     """A Place where the robot may be."""
 
     place_id: str
@@ -39,12 +39,12 @@ class RankedPlace(TypedDict):
     ]
     centroid_x: Metres
     centroid_y: Metres
-    evidence: list[Evidence]
+    evidence: list[EvidenceShape]
     name: NotRequired[str]
     floor: NotRequired[str]
 
 
-class Pose(TypedDict):
+class PoseShape(TypedDict):
     """The robot's pose in the map frame."""
 
     x: Metres
@@ -58,19 +58,19 @@ class Pose(TypedDict):
     floor: NotRequired[str]
 
 
-class Track(TypedDict):
+class TrackShape(TypedDict):
     """The robot's pose by all questions of a session."""
 
-    pose: Pose | None
+    pose: PoseShape | None
     confidence: Probability
     questions: Annotated[int, Field(ge=1, description="Questions of the session so far.")]
 
 
-class Answer(TypedDict):
+class AnswerShape(TypedDict):
     """Where a robot that sees these things may be."""
 
-    places: Annotated[list[RankedPlace], Field(description="The likeliest first.")]
-    pose: Pose | None
+    places: Annotated[list[RankedPlaceShape], Field(description="The likeliest first.")]
+    pose: PoseShape | None
     confidence: Annotated[
         float, Field(ge=0, le=1, description="Probability that the pose is right within 1.5 m.")
     ]
@@ -81,7 +81,7 @@ class Answer(TypedDict):
     thin: Annotated[
         str | None, Field(description="What the map has too little of; null where it has enough.")
     ]
-    track: NotRequired[Annotated[Track, Field(description="Present if a session was given.")]]
+    track: NotRequired[Annotated[TrackShape, Field(description="Present if a session was given.")]]
 
 
 class Place(TypedDict):
@@ -140,14 +140,14 @@ Next = Annotated[
 ]
 
 
-class Places(TypedDict):
+class PlacesShape(TypedDict):
     """Places: nearest first, or in the order of their founding where no position was given."""
 
     places: list[Place]
     next: NotRequired[Next]
 
 
-class Objects(TypedDict):
+class ObjectsShape(TypedDict):
     """Objects: nearest first, or in the order of their founding where no position was given."""
 
     objects: list[MapObject]
@@ -173,10 +173,15 @@ class Error(TypedDict):
     message: Annotated[str, Field(description="For people: what is wrong, and what to send.")]
 
 
-class Refusal(TypedDict):
+class RefusalShape(TypedDict):
     """Every response with a status of 400 or more."""
 
     error: Error
+
+
+for _shape in [each for name, each in vars().items() if name.endswith("Shape")]:
+    # Clients know them by these names.
+    _shape.__name__ = _shape.__qualname__ = _shape.__name__.removesuffix("Shape")
 
 
 class StateQuery(BaseModel):

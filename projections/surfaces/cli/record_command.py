@@ -24,7 +24,7 @@ from eventsrc.ros.library import MessageTypes
 from projections.fold.corrections import check_settings
 
 from .bag_text import stream_lines
-from .bridged import (
+from .bridge_options import (
     BridgeChoice,
     Ros2ddsOption,
     check_unused,

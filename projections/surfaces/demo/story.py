@@ -26,7 +26,7 @@ from .acts import (
     RoomPart,
     most_telling,
 )
-from .recording import Followed, RecordedRun
+from .recorded_run import Followed, RecordedRun
 
 
 def recording_lines(
