@@ -54,9 +54,10 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """A function of a condition: what its arguments name, and its value for the map at one offset.
+    """A function of a condition: what its arguments name, and the type of its value.
 
-    Of a thing that is not in the map (yet) the place is None and counts are 0.
+    The facts of a map have a method of its name. Of a thing that is not in the map (yet) the place
+    is None and counts are 0.
     """
 
     name: str
@@ -73,11 +74,6 @@ class Function:
         """Name and parameters: ``object_count([class])``."""
         inner = ", ".join(p.value for p in self.parameters)
         return f"{self.name}([{inner}])" if self.optional else f"{self.name}({inner})"
-
-    def answer(self, facts: object, *names: str) -> Value:
-        """The value in a map; ``facts`` has a method of each function's name."""
-        value: Value = getattr(facts, self.name)(*names)
-        return value
 
 
 _NUMBER, _TEXT, _BOOLEAN = Type.NUMBER, Type.TEXT, Type.BOOLEAN

@@ -91,13 +91,11 @@ class Mention:
 class _Call:
     function: Function
     mentions: tuple[Mention, ...]
+    value: Callable[[object], Value]
 
     def __str__(self) -> str:
         arguments = ", ".join(repr(mention.text) for mention in self.mentions)
         return f"{self.function.name}({arguments})" if arguments else self.function.name
-
-    def value(self, facts: object) -> Value:
-        return self.function.answer(facts, *(mention.text for mention in self.mentions))
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,7 +344,8 @@ class _Parser:
             Mention(kind, text.text, text.column)
             for kind, text in zip(function.parameters, texts, strict=False)
         )
-        call = _Call(function, mentions)
+        names = (text.text for text in texts)
+        call = _Call(function, mentions, operator.methodcaller(function.name, *names))
         direction = Direction.RISING if function.rises else Direction.EITHER_WAY
         return _Term(token.column, function.result, call.value, direction, (call,))
 

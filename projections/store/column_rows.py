@@ -22,6 +22,8 @@ from .tables import Tables, last_rows
 
 SHORT_STRIPE_EVENTS: Final = 4_096
 """Events of a stripe that is joined with others before it is written."""
+_COMPARED: Final = frozenset({ObjectMoved, PlacesLinked, PlacesMerged})
+"""The deltas of which a merge of places says what was before."""
 
 
 class TableWriter:
@@ -51,9 +53,12 @@ class TableWriter:
         moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]] = []
         links: list[EdgeChange] = []
         for delta in deltas:
-            if (found := ROWS.get(type(delta))) is not None:
-                table, row_of = found
+            kind = type(delta)
+            if kind in ROWS:
+                table, row_of = ROWS[kind]
                 self._rows[table].append(row_of(delta))
+            if kind not in _COMPARED:
+                continue
             if isinstance(delta, ObjectMoved):
                 moves.append((delta.object, self._located.get(delta.object)))
                 self._located[delta.object] = delta.place

@@ -106,16 +106,14 @@ class _Field:
             self.columns = {self.name: kind}
         self.is_scalar = list(self.columns) == [self.name]
 
-    def parts(self, value: Any) -> Row:
-        """The columns of a value that is not a scalar."""
-        if self.model is not None:
-            if value is None:
-                return self._nothing
-            parts = msgspec.structs.astuple(value)
-            return (1, *parts) if self.optional else parts
-        if isinstance(value, tuple):
-            return value
-        return (None if value is None else crc32(value.data),)
+    def parts(self) -> Callable[[Any], Row]:
+        """The function that makes the columns of a value that is not a scalar."""
+        if self.model is None:
+            return _whole if len(self.columns) > 1 else _checksum
+        nothing, astuple = self._nothing, msgspec.structs.astuple
+        if not self.optional:
+            return astuple
+        return lambda value: nothing if value is None else (1, *astuple(value))
 
     def made(self, columns: list[list[Any]]) -> Iterable[Any]:
         """The values made of columns."""
@@ -126,6 +124,14 @@ class _Field:
         there, *parts = columns
         made = map(self.model, *parts)
         return (each if is_there else None for each, is_there in zip(made, there, strict=True))
+
+
+def _whole(value: Row) -> Row:
+    return value
+
+
+def _checksum(vector: Array | None) -> Row:
+    return (None if vector is None else crc32(vector.data),)
 
 
 def _table_of(fields: Iterable[_Field]) -> Table:
@@ -158,10 +164,12 @@ def _row_maker(fields: Sequence[_Field]) -> Callable[[Any], Row]:
     if not compound:
         return scalars
 
+    makers = [(attrgetter(field.name), field.parts()) for field in compound]
+
     def row(delta: Any) -> Row:
         found: Row = scalars(delta)
-        for field in compound:
-            found += field.parts(getattr(delta, field.name))
+        for value_of, parts_of in makers:
+            found += parts_of(value_of(delta))
         return found
 
     return row

@@ -84,6 +84,8 @@ class ObjectStates:
     def values(self) -> Mapping[str, Array]:
         """``obs_count``, ``sum_x_um``, ``sum_y_um``, ``first_seen`` and ``last_seen``."""
         seen = {name: self.of("seen", name) for name in _VALUES}
+        if not self._tables.count("fused"):
+            return seen
         fused = {name: self.of("fused", name) for name in _VALUES}
         is_fused = self.has("fused") & (fused["obs_count"] >= seen["obs_count"])
         return {name: np.where(is_fused, fused[name], seen[name]) for name in _VALUES}
@@ -128,42 +130,34 @@ class ObjectStates:
     def records(self, make: Callable[..., _Record]) -> list[_Record]:
         """Records, without observations and relocations; ``make`` takes what `ObjectRecord`
         does."""
-        places, misses, runs = (
+        numbers = (
             self.of("moved", "place", NONE),
             self.of("missing", "misses") * self.is_looked_for,
             np.where(self.is_missing, self.of("missing", "run"), NONE),
         )
-        return [
-            make(
-                ordinal=ordinal,
-                object_id=object_id,
-                class_name=class_name,
-                place=None if place == NONE else place,
-                estimate=estimate,
-                misses=missed,
-                missing_in=None if run == NONE else run,
-                **dict(zip(_VALUES, values, strict=True)),
-            )
-            for ordinal, object_id, class_name, place, estimate, missed, run, *values in zip(
+        places, misses, runs = (values.tolist() for values in numbers)
+        return list(
+            map(
+                make,
                 self.objects.tolist(),
                 self._found("object_id"),
                 self.class_names,
-                places.tolist(),
-                self._estimates(),
-                misses.tolist(),
-                runs.tolist(),
                 *(self.values[name].tolist() for name in _VALUES),
-                strict=True,
+                [None if place == NONE else place for place in places],
+                ([] for _ in places),
+                self._estimates(),
+                misses,
+                [None if run == NONE else run for run in runs],
             )
-        ]
+        )
 
     def _estimates(self) -> list[EstimatedPosition | None]:
-        has = self.has("estimated").tolist()
-        columns = (self.of("estimated", name).tolist() for name in _ESTIMATE)
-        return [
-            EstimatedPosition(*row) if is_there else None
-            for is_there, *row in zip(has, *columns, strict=True)
-        ]
+        found: list[EstimatedPosition | None] = [None] * len(self.objects)
+        estimated = np.flatnonzero(self.has("estimated"))
+        columns = [self.of("estimated", name)[estimated].tolist() for name in _ESTIMATE]
+        for index, *values in zip(estimated.tolist(), *columns, strict=True):
+            found[index] = EstimatedPosition(*values)
+        return found
 
     def _found(self, column: str) -> list[str]:
         """A text of the rows that found them."""
