@@ -10,7 +10,8 @@ import pytest
 from eventsrc.log import LogReader
 from projections.fold.map_errors import ProjectionMismatch, ProjectionMissing, QuestionError
 from projections.fold.settings import Settings
-from projections.localize.relocalize import ExactIndex, QuestionCrop, Track, rank, read_question
+from projections.localize.relocalize import ExactIndex, QuestionCrop, rank, read_question
+from projections.localize.relocalize.track import Track
 from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild

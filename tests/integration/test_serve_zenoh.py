@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from eventsrc.record.transport.session import Session
-from projections.localize.relocalize import Track, parse_question
+from projections.localize.relocalize import parse_question
+from projections.localize.relocalize.track import Track
 from projections.postgres.connection import Targets, connect
 from projections.postgres.queries.candidate_search import relocalize
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService

@@ -9,19 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.localize.relocalize import (
-    Answer,
-    PoseHypothesis,
-    Question,
-    QuestionView,
-    Track,
-    movement_of,
-    rank,
-)
+from projections.localize.relocalize import Answer, PoseHypothesis, Question, QuestionView, rank
 from projections.localize.relocalize.layout import Hypotheses
 from projections.localize.relocalize.question import MAX_CROPS, Movement
 from projections.localize.relocalize.reading import MAX_MOVED_M, MAX_TURNED_RAD
-from projections.localize.relocalize.track import PARTICLES, _resampled
+from projections.localize.relocalize.track import PARTICLES, Track, _resampled, movement_of
 from tests.support.buildings import Building, Keyframe, drive
 from tests.support.scenes import RoomMap, crops_of
 from tests.support.thorough import examples, mostly_slow

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from projections.fold.map_errors import QuestionError
-from projections.localize.relocalize import Answer, PoseHypothesis, Track
+from projections.localize.relocalize import Answer, PoseHypothesis
 from projections.localize.relocalize.layout import Hypotheses
+from projections.localize.relocalize.track import Track
 from projections.surfaces.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name
 
 STILL = (0.0, 0.0, 0.0)

@@ -25,7 +25,6 @@ from .reading import (
     read_moved,
     read_question,
 )
-from .track import Track, Tracked, movement_of
 
 __all__ = [
     "MAX_QUESTION_BYTES",
@@ -45,11 +44,8 @@ __all__ = [
     "QuestionCrop",
     "QuestionView",
     "RankedPlace",
-    "Track",
-    "Tracked",
     "WallMap",
     "describe_value",
-    "movement_of",
     "parse_json",
     "parse_question",
     "question_schema",

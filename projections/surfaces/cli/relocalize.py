@@ -28,13 +28,12 @@ from projections.localize.relocalize import (
     Question,
     QuestionCrop,
     RankedPlace,
-    Track,
-    movement_of,
     parse_json,
     rank,
     read_moved,
     read_question,
 )
+from projections.localize.relocalize.track import Track, movement_of
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 

@@ -27,13 +27,13 @@ from projections.localize.relocalize import (
     Method,
     Question,
     describe_value,
-    movement_of,
     parse_json,
     rank,
     read_moved,
     read_question,
 )
 from projections.localize.relocalize.question import Movement
+from projections.localize.relocalize.track import movement_of
 
 from .pools import Pools
 from .sessions import Sessions, session_name

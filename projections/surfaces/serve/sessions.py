@@ -12,8 +12,9 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from projections.fold.map_errors import QuestionError
-from projections.localize.relocalize import Answer, Track, describe_value
+from projections.localize.relocalize import Answer, describe_value
 from projections.localize.relocalize.question import Movement
+from projections.localize.relocalize.track import Track
 
 MOST: Final = 256
 SILENT_S: Final = 600.0
