@@ -19,7 +19,7 @@ from projections.postgres.connection import connect
 from scripts.programs.attack.arena import Arena
 from scripts.programs.attack.attacked_command import AttackedCommand
 from scripts.programs.attack.honest_client import question
-from scripts.programs.bench.fleet.killing import processes_under
+from scripts.programs.bench.fleet.killing import is_worker, processes_under
 from scripts.programs.bench.fleet.speed import RunningCluster, dask_cluster
 from tests.support.fleets import extend, write_sites, wrong_rows
 from tests.support.logs import walk, write_log
@@ -152,7 +152,7 @@ def _scheduler(running: RunningCluster) -> Choose:
 
 def _of_cluster(arena: Arena, begun: AttackedCommand) -> Sequence[int]:
     itself = begun.process.pid
-    workers = [pid for pid, args in processes_under(os.getpid()).items() if "spawn_main" in args]
+    workers = [pid for pid, args in processes_under(os.getpid()).items() if is_worker(args)]
     return [itself] if arena.rng.random() < 0.5 else workers
 
 

@@ -109,8 +109,13 @@ class _Killer:
 
 
 def _workers_under(parent: int) -> list[int]:
-    """Those that multiprocessing has spawned, of this process or of Dask's worker programs."""
-    return [pid for pid, args in processes_under(parent).items() if "spawn_main" in args]
+    """Those that this process runs calls in, or that multiprocessing has spawned for Dask."""
+    return [pid for pid, args in processes_under(parent).items() if is_worker(args)]
+
+
+def is_worker(arguments: str) -> bool:
+    """Whether a command line is that of a pool's worker, or of one of Dask's."""
+    return "worker_process:_make_calls" in arguments or "spawn_main" in arguments
 
 
 def processes_under(parent: int) -> dict[int, str]:
