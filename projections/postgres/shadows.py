@@ -19,11 +19,11 @@ of the other.
 """
 
 import contextlib
-import queue
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -57,20 +57,21 @@ would add up, as a COPY asks for it with every 128 kB."""
 
 
 class LoadingThread:
-    """Use as a context manager; leaving it ends the thread.
+    """A thread that writes to the database while the fold goes on; use as a context manager.
 
-    An error inside drops the jobs that have not begun and calls ``cancel`` to interrupt the one
-    that has.
+    The fold keeps one core busy and PostgreSQL another; without a thread their times would add up.
+    Jobs run one after the other on one connection, which nothing else may use before `flush`. At
+    most `WAITING_JOBS` wait, so memory stays bounded: `put` blocks while there are more. An error
+    inside drops the jobs that have not begun and calls ``cancel`` to interrupt the one that has.
     """
 
     def __init__(self, cancel: Callable[[], None] = lambda: None) -> None:
         self._cancel = cancel
-        self._jobs: queue.Queue[Job | None] = queue.Queue(WAITING_JOBS)
+        self._thread = ThreadPoolExecutor(1, "loading")
+        self._free = threading.BoundedSemaphore(WAITING_JOBS + 1)
         self._failed: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="loading", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
         return self
 
     def __exit__(
@@ -81,32 +82,31 @@ class LoadingThread:
                 self._failed = error
                 self._cancel()
         finally:
-            self._jobs.put(None)
-            self._thread.join()
+            self._thread.shutdown()
 
     def put(self, job: Job) -> None:
         """Run ``job`` in the thread. Raises what an earlier one raised."""
         self._raise()
-        self._jobs.put(job)
+        self._free.acquire()
+        self._thread.submit(self._run, job)
 
     def flush(self) -> None:
         """Wait until all jobs are done. Raises what one raised."""
-        self._jobs.join()
+        self._thread.submit(lambda: None).result()
         self._raise()
 
     def _raise(self) -> None:
         if self._failed is not None:
             raise self._failed
 
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                if self._failed is None:
-                    job()
-            except BaseException as error:  # noqa: BLE001 - raised by `put` and `flush`
-                self._failed = self._failed or error
-            finally:
-                self._jobs.task_done()
+    def _run(self, job: Job) -> None:
+        try:
+            if self._failed is None:
+                job()
+        except BaseException as error:  # noqa: BLE001 - raised by `put` and `flush`
+            self._failed = self._failed or error
+        finally:
+            self._free.release()
 
 
 @contextmanager

@@ -54,10 +54,16 @@ def _fail() -> None:
 
 
 def test_a_failed_job_is_raised_by_flush_and_put_and_ends_the_work() -> None:
-    done: list[int] = []
+    done, gate = list[int](), threading.Event()
+
+    def fail() -> None:
+        gate.wait(60)
+        _fail()
+
     with LoadingThread() as loading:
-        loading.put(_fail)
+        loading.put(fail)
         loading.put(lambda: done.append(1))
+        gate.set()
         with pytest.raises(LookupError, match="went away"):
             loading.flush()
         with pytest.raises(LookupError, match="went away"):

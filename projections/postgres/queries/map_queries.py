@@ -1,13 +1,14 @@
 """Queries of the map for `mapfold query`, as documents for JSON: of the live databases or a fold.
 
-A `MapSource` has the data they need: `LiveMap` in the graph's database, `FoldedMap` in a view.
+A `MapSource` has the data they need: `LiveMap` in the graph's database, `FoldedMap` in a view; both
+have the same methods.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from eventsrc.base.text import advised
-from projections.fold.deltas import PlaceOrdinal
 from projections.fold.map_errors import QuestionError
 from projections.fold.place_types import type_of_name
 from projections.localize.relocalize import CandidatePlace, MapCandidates, QuestionCrop
@@ -44,22 +45,6 @@ in a Place that has a name has the last one; only fusion by evidence gives ``est
 ``missing``."""
 
 
-class MapSource(Protocol):
-    """The data of a map."""
-
-    def place_graph(self) -> PlaceGraph:
-        """All Places and their adjacency."""
-
-    def count_objects(self, class_name: str) -> dict[int, int]:
-        """Number of Objects of a class, by Place ordinal; only Places that have one."""
-
-    def find_object(self, object_id: str) -> dict[str, Any] | None:
-        """An Object with its place_id."""
-
-    def objects_in(self, place_id: str) -> list[dict[str, Any]]:
-        """The Objects of a Place."""
-
-
 class LiveMap:
     """The graph's database; ``connection`` was set up by `prepare_graph`."""
 
@@ -85,7 +70,7 @@ class LiveMap:
 
 
 class FoldedMap:
-    """A folded map."""
+    """A folded map, with the methods of `LiveMap`."""
 
     def __init__(self, view: MapView) -> None:
         self._view = view
@@ -96,56 +81,39 @@ class FoldedMap:
 
     def count_objects(self, class_name: str) -> dict[int, int]:
         """Number of Objects of a class, by Place ordinal; only Places that have one."""
-        counts: dict[int, int] = {}
-        for thing in self._view.objects.values():
-            if thing.class_name == class_name and thing.place is not None:
-                counts[thing.place] = counts.get(thing.place, 0) + 1
-        return counts
+        objects = self._view.objects.values()
+        return Counter(
+            each.place
+            for each in objects
+            if each.class_name == class_name and each.place is not None
+        )
 
     def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
-        return next(
-            (
-                self._document(o.ordinal)
-                for o in self._view.objects.values()
-                if o.object_id == object_id
-            ),
-            None,
-        )
+        objects = self._view.objects.values()
+        return next((self._document(o) for o in objects if o.object_id == object_id), None)
 
     def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
+        view = self._view
         return [
-            self._document(o.ordinal)
-            for o in self._view.objects.values()
-            if self._view.place_id(o.place) == place_id
+            self._document(o) for o in view.objects.values() if view.place_id(o.place) == place_id
         ]
 
-    def _document(self, ordinal: int) -> dict[str, Any]:
-        thing = self._view.all_objects[ordinal]
+    def _document(self, thing: ObjectRecord) -> dict[str, Any]:
+        view, at = self._view, thing.estimate
+        by_evidence = view.settings.fusion == "evidence"
+        place_name = None if thing.place is None else view.all_places[thing.place].name
         return {
-            "object_id": thing.object_id,
-            "class_name": thing.class_name,
-            "mean_x": thing.mean_x,
-            "mean_y": thing.mean_y,
-            "obs_count": thing.obs_count,
-            "first_seen": thing.first_seen,
-            "last_seen": thing.last_seen,
-            **self._evidence(thing),
-            "place_id": self._view.place_id(thing.place),
-        } | self._place_name(thing.place)
+            **{name: getattr(thing, name) for name in _OBJECT_FIELDS[:7]},
+            **{name: getattr(at, name) for name in _OBJECT_FIELDS[7:10] if by_evidence and at},
+            **({"missing": thing.missing_in is not None} if by_evidence else {}),
+            "place_id": view.place_id(thing.place),
+            **({} if place_name is None else {"place_name": place_name}),
+        }
 
-    def _evidence(self, thing: ObjectRecord) -> dict[str, Any]:
-        if self._view.settings.fusion != "evidence":
-            return {}
-        at, missing = thing.estimate, {"missing": thing.missing_in is not None}
-        if at is None:
-            return missing
-        return {"est_x": at.est_x, "est_y": at.est_y, "est_sigma_m": at.est_sigma_m} | missing
 
-    def _place_name(self, place: PlaceOrdinal | None) -> dict[str, str]:
-        name = None if place is None else self._view.all_places[place].name
-        return {} if name is None else {"place_name": name}
+MapSource: TypeAlias = LiveMap | FoldedMap
 
 
 def _ordered(thing: dict[str, Any]) -> dict[str, Any]:
