@@ -138,8 +138,15 @@ def _sink_status(
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, heartbeat = checkpoints.ages(connection, sink)
     refolded = checkpoints.refold(connection, sink)
-    working = _Writer(writer, heartbeat, refolded is not None)
-    condition, note = _condition(found, sink, where, reader, inputs, working)
+    is_silent = heartbeat is None or heartbeat > STALLED_S
+    condition, note = _condition(found, sink, where, reader, inputs)
+    if condition != "other" and writer is not None:
+        condition, note = _working(writer), None
+        if writer == "mapfold tail" and is_silent:
+            condition = "stalled"
+            note = "a tail holds it but sends no heartbeat; look at that process"
+        elif writer == "mapfold tail" and refolded is not None:
+            condition = "refolding"
     done, total = refolded if refolded and condition == "refolding" else (None, None)
     is_of_log = found.log_id == reader.log_id and found.next_offset <= end
     return SinkStatus(
@@ -161,23 +168,10 @@ def _sink_status(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Writer:
-    """The holder of a sink's lock, None if it is free; seconds since its tail's heartbeat."""
-
-    name: str | None
-    heartbeat: float | None
-    refolds: bool
-
-
 def _condition(
-    found: Checkpoint,
-    sink: SinkName,
-    where: str,
-    reader: LogReader,
-    inputs: LogInputs,
-    writer: _Writer,
+    found: Checkpoint, sink: SinkName, where: str, reader: LogReader, inputs: LogInputs
 ) -> tuple[Condition, str | None]:
+    """The condition of a sink that no process writes, and why."""
     advice, end = replay_advice(reader.path, inputs.latest), reader.next_offset
     try:
         refuse_other_origin(found, sink, where, reader.log_id, inputs.at(found.known_to), advice)
@@ -185,12 +179,6 @@ def _condition(
         return "other", str(error)
     if found.next_offset > end:
         return "other", f"the log has only {end:,} events; {advice}"
-    if writer.name == "mapfold tail" and (writer.heartbeat is None or writer.heartbeat > STALLED_S):
-        return "stalled", "a tail holds it but sends no heartbeat; look at that process"
-    if writer.name == "mapfold tail" and writer.refolds:
-        return "refolding", None
-    if writer.name is not None:
-        return _working(writer.name), None
     unknown = inputs.since(found.known_to)
     if found.next_offset == end and not unknown:
         return "idle", None
