@@ -24,7 +24,6 @@ from projections.fold.map_errors import (
     DatabaseError,
     ExtensionMissing,
     ProjectionMismatch,
-    ProjectionMissing,
     QuestionError,
 )
 from projections.fold.settings import CameraConstants
@@ -58,6 +57,7 @@ from projections.postgres.map_table import read_with_key
 from projections.postgres.statements import statements, tables
 
 from .candidate_rows import NO_LINKS, ConstantsMemory, KnownConstants, Linked, Rows, assemble
+from .graph_reads import map_errors
 
 _NEAR: Final = 12
 """Number of columns of the statement ``near``."""
@@ -249,15 +249,10 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
 
 @contextlib.contextmanager
 def _query_errors(url: str) -> Iterator[None]:
-    """Translate errors of a question that does not fit the map, and of a database without a map."""
-    with database_errors(url):
+    """As `map_errors`, and raises QuestionError for a question that does not fit the map."""
+    with map_errors(url):
         try:
             yield
-        except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
-            raise ProjectionMissing(
-                f"{describe_target(url)}: nothing has been projected there yet; run"
-                f" `{advised('replay')}`"
-            ) from None
         except psycopg.errors.DataException as error:
             raise QuestionError(
                 f"the question does not fit the map: {error.diag.message_primary}; ask with the"

@@ -3,10 +3,11 @@
 Ids and class names are bind parameters, encoded as agtype strings; they may hold any characters.
 """
 
+import contextlib
 import json
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import psycopg
 from eventsrc.base.text import advised
 from projections.fold.map_errors import ProjectionMissing, QuestionError
 from projections.map.view import MapView
-from projections.postgres.connection import Connection, database_errors, describe_connection
+from projections.postgres.connection import Connection, database_errors, describe_target
 from projections.postgres.graph_rows import text
 from projections.postgres.labels import graphid_base, number_of
 from projections.postgres.statements import statements, tables
@@ -170,12 +171,19 @@ def _ordinal(graphid: str) -> int:
 
 def _rows(connection: Connection, name: str, **values: Any) -> list[Any]:
     statement = statements("objects")[name].format(**tables())
-    with database_errors(connection.info.dsn):
+    with map_errors(connection.info.dsn):
+        return connection.execute(statement, values).fetchall()
+
+
+@contextlib.contextmanager
+def map_errors(url: str) -> Iterator[None]:
+    """As `database_errors`, and raises ProjectionMissing for a database without a map."""
+    with database_errors(url):
         try:
-            return connection.execute(statement, values).fetchall()
+            yield
         except (psycopg.errors.UndefinedTable, psycopg.errors.InvalidSchemaName):
             raise ProjectionMissing(
-                f"{describe_connection(connection)}: nothing has been projected there yet; run"
+                f"{describe_target(url)}: nothing has been projected there yet; run"
                 f" `{advised('replay')}`"
             ) from None
 
