@@ -1,4 +1,9 @@
-"""The rules of the map: reducers, pure, without clock, chance, disk, network or database."""
+"""The rules of the map: reducers, pure, without clock, chance, disk, network or database.
+
+What decides that two places merge: `Places._cluster` for places by DBSCAN, `Rooms._merge_all` for
+places by rooms; under ``join`` and ``keep-apart`` also `ConstrainedPlaces`. That an observation is
+of an Object: `Objects.fold`, or `Matching.choose` by evidence. `semantic_map` runs them all.
+"""
 
 from array import array
 from collections.abc import MutableSequence

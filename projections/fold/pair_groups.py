@@ -1,12 +1,59 @@
-"""Groups of things that commands make one, and groups that commands keep apart.
+"""Things that became one: survivors of merges, groups that commands make one, and groups that they
+keep apart.
 
-This is transitive: if a and b are one and b and c are one, so are a and c; and a thing kept apart
-from a is kept apart from all of them.
+What commands say is transitive: if a and b are one and b and c are one, so are a and c; and a thing
+kept apart from a is kept apart from all of them.
 """
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator
 from itertools import chain
 from typing import Generic, TypeVar
+
+from .deltas import ObjectOrdinal, PlaceOrdinal
+
+_Ordinal = TypeVar("_Ordinal", bound=Hashable)
+
+
+class Survivors(Generic[_Ordinal]):
+    """Absorbed things and their survivors: union-find with path halving. `merge` is called for
+    every merge, in order.
+
+    ``absorbed_by`` maps each absorbed thing to its absorber, which may have been absorbed itself;
+    `find` shortens these chains.
+    """
+
+    __slots__ = ("absorbed_by",)
+
+    def __init__(self) -> None:
+        self.absorbed_by: dict[_Ordinal, _Ordinal] = {}
+
+    def merge(self, survivor: _Ordinal, absorbed: Iterable[_Ordinal]) -> None:
+        """Record that ``survivor`` absorbed each of ``absorbed``."""
+        for each in absorbed:
+            self.absorbed_by[each] = survivor
+
+    def find(self, each: _Ordinal) -> _Ordinal:
+        """The survivor of ``each``; itself unless it was absorbed."""
+        absorbed_by = self.absorbed_by
+        while (parent := absorbed_by.get(each)) is not None:
+            grandparent = absorbed_by.get(parent)
+            if grandparent is None:
+                return parent
+            absorbed_by[each] = each = grandparent
+        return each
+
+
+class PlaceSurvivors(Survivors[PlaceOrdinal]):
+    """Survivors of places."""
+
+    __slots__ = ()
+
+
+class ObjectSurvivors(Survivors[ObjectOrdinal]):
+    """Survivors of Objects."""
+
+    __slots__ = ()
+
 
 _Thing = TypeVar("_Thing", bound=tuple[object, ...] | str)
 
@@ -113,9 +160,11 @@ class PairGroups(Generic[_Thing]):
 
     def __init__(self, same: Iterable[tuple[_Thing, _Thing]], apart: ApartPairs[_Thing]) -> None:
         same = list(same)
-        roots = _Roots[_Thing]()
+        roots = Survivors[_Thing]()
         for a, b in same:
-            roots.unite(a, b)
+            one, other = roots.find(a), roots.find(b)
+            if one != other:
+                roots.merge(one, (other,))
         numbers: dict[_Thing, int] = {}
         self.group_of: dict[_Thing, int] = {}
         for thing in dict.fromkeys(chain(*same, apart.in_order_of_pairs())):
@@ -157,7 +206,7 @@ def without_contradictions(
 
     A pair of a statement that contradicts later statements, one or several together, is left out.
     """
-    roots = _Roots[_Thing]()
+    roots = Survivors[_Thing]()
     # What is one is never made one with what it is kept apart from: then every root is in a set of
     # things kept apart once, and two that share such a set are apart.
     sets_of: dict[_Thing, set[int]] = {}
@@ -178,7 +227,7 @@ def without_contradictions(
         if a == b or sets_of.get(a, _NONE).isdisjoint(sets_of.get(b, _NONE)):
             same.add((first, second))
             if a != b:
-                roots.unite(a, b)
+                roots.merge(a, (b,))
                 less, more = sorted((sets_of.pop(a, set()), sets_of.pop(b, set())), key=len)
                 more |= less
                 sets_of[a] = more
@@ -186,24 +235,3 @@ def without_contradictions(
 
 
 _NONE: frozenset[int] = frozenset()
-
-
-class _Roots(Generic[_Thing]):
-    """Union-find: the root of ``unite(a, b)`` is that of a."""
-
-    def __init__(self) -> None:
-        self._parents: dict[_Thing, _Thing] = {}
-
-    def find(self, thing: _Thing) -> _Thing:
-        path = []
-        while (parent := self._parents.get(thing)) is not None:
-            path.append(thing)
-            thing = parent
-        for passed in path:
-            self._parents[passed] = thing
-        return thing
-
-    def unite(self, a: _Thing, b: _Thing) -> None:
-        one, other = self.find(a), self.find(b)
-        if one != other:
-            self._parents[other] = one

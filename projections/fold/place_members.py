@@ -20,8 +20,7 @@ from eventsrc.envelope.model import Offset, RunId
 from . import State, packed
 from .corrections import Keyframe
 from .deltas import KeyframeOrdinal, PlaceChanged, PlaceFormed, PlaceOrdinal, RunOrdinal
-from .pair_groups import PairGroups
-from .survivors import PlaceSurvivors
+from .pair_groups import PairGroups, PlaceSurvivors
 
 NOISE = PlaceOrdinal(-1)
 """The value for a point in no place, in the packed array of places."""

@@ -42,7 +42,7 @@ from .deltas import (
     PlacesMerged,
     RunOrdinal,
 )
-from .survivors import ObjectSurvivors, PlaceSurvivors
+from .pair_groups import ObjectSurvivors, PlaceSurvivors
 
 
 class PlaceNames:
@@ -263,10 +263,16 @@ class SortedKeys:
         if not blocks:
             self._firsts.append(key)
             blocks.append((array("q"), packed("i")))
+        keys, labels = blocks[-1]
+        if keys and key > keys[-1] and len(keys) < _BLOCK:  # nearly always
+            before = labels[-1]
+            keys.append(key)
+            labels.append(label)
+            return before, None
         block = max(bisect_right(self._firsts, key) - 1, 0)
         keys, labels = blocks[block]
         at = bisect_right(keys, key)
-        before = labels[at - 1] if at else blocks[block - 1][1][-1] if block else None
+        earlier = labels[at - 1] if at else blocks[block - 1][1][-1] if block else None
         after: PlaceOrdinal | None = None
         if at < len(keys):
             after = labels[at]
@@ -279,7 +285,7 @@ class SortedKeys:
             cut = _BLOCK if key == keys[-1] else _BLOCK // 2
             blocks[block : block + 1] = (keys[:cut], labels[:cut]), (keys[cut:], labels[cut:])
             self._firsts.insert(block + 1, keys[cut])
-        return before, after
+        return earlier, after
 
     def items(self) -> Iterator[tuple[int, PlaceOrdinal]]:
         """All keys, ascending, and their labels."""

@@ -27,6 +27,7 @@ from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
 from .constrained_places import ConstrainedPlaces
+from .core_index import CoreIndex
 from .corrections import NO_CORRECTIONS, Corrections, Keyframe
 from .deltas import (
     Delta,
@@ -49,7 +50,7 @@ from .deltas import (
 )
 from .edited_events import EventEdits, Reembedded, Space
 from .evidence_fusion import EvidenceFusion
-from .exact import Units, unit_vectors
+from .exact import Units, metres_to_um, unit_vectors
 from .floors import CurrentMap, Floors
 from .folded_ids import FoldedIds, content_digest
 from .objects import ConstrainedObjects, FusibleObservation, Objects
@@ -58,7 +59,6 @@ from .place_members import PosedKeyframe
 from .places import Places
 from .relations import Adjacency, LocatedIn, PlaceNames
 from .rooms import Rooms
-from .rules import objects_by, places_by
 from .settings import Settings
 from .sights import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
 
@@ -191,7 +191,16 @@ class SemanticMap:
                 self._locate(fused, keyframe, place)
                 deltas += fused
             else:
-                self._fuse(objects, offset, keyframe, place, pose, fusible, timestamp, deltas)
+                x_um, y_um = pose.x_um, pose.y_um
+                for seen in fusible:
+                    if isinstance(objects, ConstrainedObjects):
+                        named = objects.fold_named(offset, seen, timestamp, x_um, y_um)
+                        self._locate(named, keyframe, place)
+                        deltas += named
+                    else:
+                        one = objects.fold(offset, seen, timestamp, x_um, y_um)
+                        self.located_in.object_seen(one[-1].object, keyframe, place)
+                        deltas += one
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
         return self.floors.put_back(deltas)
@@ -357,30 +366,6 @@ class SemanticMap:
             deltas += self.names.fold(offset, changes)
         return place
 
-    def _fuse(
-        self,
-        objects: Objects,
-        offset: Offset,
-        keyframe: KeyframeOrdinal,
-        place: PlaceOrdinal | None,
-        pose: Pose,
-        fusible: list[FusibleObservation],
-        timestamp: float,
-        deltas: list[Delta],
-    ) -> None:
-        """Run `fusion = "page"` and report the sightings to located-in."""
-        x_um, y_um = pose.x_um, pose.y_um
-        if isinstance(objects, ConstrainedObjects):
-            for seen in fusible:
-                more = objects.fold_named(offset, seen, timestamp, x_um, y_um)
-                deltas += more
-                self._locate(more, keyframe, place)
-            return
-        for seen in fusible:
-            fused = objects.fold(offset, seen, timestamp, x_um, y_um)
-            deltas += fused
-            self.located_in.object_seen(fused[-1].object, keyframe, place)
-
     def _locate(
         self, fused: Sequence[Delta], keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
     ) -> None:
@@ -393,3 +378,21 @@ class SemanticMap:
                 if type(following) is ObjectRelocated and following.object == delta.survivor:
                     self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
+
+
+def places_by(settings: Settings, groups: PairGroups[Keyframe]) -> Places | Rooms:
+    """The reducer of places; ``groups`` are the keyframes that commands name."""
+    if settings.places == "rooms":
+        rooms = settings.rooms
+        return Rooms(metres_to_um(rooms.cell_m), metres_to_um(rooms.drive_m), groups)
+    core_index = CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
+    return ConstrainedPlaces(core_index, groups) if groups.group_of else Places(core_index)
+
+
+def objects_by(settings: Settings, named: PairGroups[DetId]) -> Objects | EvidenceFusion:
+    """The reducer of Objects; ``named`` are the detections that commands name."""
+    groups = named if named.group_of else None
+    if settings.fusion == "evidence":
+        return EvidenceFusion(settings.evidence, groups)
+    limits = settings.fusion_radius_m, settings.fusion_similarity
+    return Objects(*limits) if groups is None else ConstrainedObjects(*limits, groups)

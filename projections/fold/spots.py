@@ -14,7 +14,7 @@ the camera. At the distance a from a spot,
     its centre  a · slope = e                    (SLOPE · a)² + (2 cm)²; a level camera
     measured    a = depth                        that of the depth or position
 
-z and e have their class's priors (`class_heights`). On a drive towards a thing, its growing box
+z and e have their class's priors (`thing_index`). On a drive towards a thing, its growing box
 determines the distance, as a change of bearing does. Gauss-Newton in information form; z and e are
 eliminated (Schur's complement). A residual beyond about two standard errors weighs less (Cauchy).
 
@@ -29,7 +29,6 @@ out: `COMMON_M2` is added to the variance of the estimate.
 import math
 from typing import NamedTuple
 
-from .class_heights import HeightPrior
 from .exact import log
 from .sights import Sight
 
@@ -60,6 +59,15 @@ Part = list[float]
 measured; the same of the range prior at weight 1; weight, gradient x, y and sum of the log size;
 of the elevation."""
 PART_SIZE = 18
+
+
+class HeightPrior(NamedTuple):
+    """Mean and precision (1 / variance) of a class's log size, and of its elevation in metres."""
+
+    log_size: float
+    log_size_weight: float
+    elevation: float
+    elevation_weight: float
 
 
 class Estimate(NamedTuple):

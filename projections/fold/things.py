@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from . import State
 from .agreement import log_of
-from .class_heights import Given
 from .deltas import ObjectOrdinal
 from .looks import Exemplar
 from .spots import Estimate, Spots
@@ -26,6 +25,9 @@ INVERSE, SIDE_COS, SIDE_SIN, RUN = range(4)
 KIND: Final = 4
 ROW: Final = 5
 """Fields of an exemplar in ``marks``."""
+
+Given = tuple[str, int, int]
+"""The values that a thing added: class name, log size and elevation in units of 2⁻¹⁶."""
 
 
 @dataclass(slots=True, eq=False)

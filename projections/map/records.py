@@ -23,8 +23,8 @@ from projections.fold.deltas import (
     UnitVector,
 )
 from projections.fold.exact import UM_PER_M, mean_m
+from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.place_types import ONCE
-from projections.fold.survivors import PlaceSurvivors
 
 _UM2_PER_M2 = UM_PER_M * UM_PER_M
 

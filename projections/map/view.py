@@ -19,9 +19,9 @@ from projections.fold import deltas
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.deltas import Delta, ObjectOrdinal, PlaceOrdinal, SkipKind
 from projections.fold.floors import map_in_force
+from projections.fold.pair_groups import ObjectSurvivors, PlaceSurvivors
 from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
-from projections.fold.survivors import ObjectSurvivors, PlaceSurvivors
 
 from .records import (
     EstimatedPosition,
@@ -234,9 +234,6 @@ class MapView:
         place = self.all_places[delta.place]
         place.name, place.name_offset = delta.name, delta.command
 
-    def _merge_refused(self, delta: deltas.MergeRefused) -> None:
-        """The places stay as they are."""
-
     def _object_found(self, delta: deltas.ObjectFound) -> None:
         if delta.object == len(self.all_objects):
             found = ObjectRecord(delta.object, delta.object_id, delta.class_name)
@@ -335,7 +332,7 @@ class MapView:
         deltas.EventSkipped: _event_skipped,
         deltas.PlaceFormed: _place_formed,
         deltas.PlacesMerged: _places_merged,
-        deltas.MergeRefused: _merge_refused,
+        deltas.MergeRefused: lambda *_: None,  # the places stay as they are
         deltas.KeyframePlaced: _keyframe_placed,
         deltas.PlaceChanged: _place_changed,
         deltas.PlaceNamed: _place_named,

@@ -23,7 +23,7 @@ from projections.fold.deltas import (
     PlaceOrdinal,
     SkipKind,
 )
-from projections.fold.survivors import PlaceSurvivors
+from projections.fold.pair_groups import PlaceSurvivors
 from projections.map.records import (
     KeyframeRecord,
     ObjectRecord,

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.fold.class_heights import UNKNOWN_CLASS, HeightPrior
 from projections.fold.sights import Sight
 from projections.fold.spots import (
     COMMON_M2,
@@ -16,9 +15,11 @@ from projections.fold.spots import (
     SIZE,
     SLOPE,
     Estimate,
+    HeightPrior,
     Solver,
     Spots,
 )
+from projections.fold.thing_index import UNKNOWN_CLASS
 from tests.support.thorough import examples
 
 RANGE_M, RANGE_SPREAD = 3.0, 0.55

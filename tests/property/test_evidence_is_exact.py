@@ -55,7 +55,6 @@ def test_no_float_is_raised_to_a_power() -> None:
 
     from projections.fold import (
         agreement,
-        class_heights,
         evidence_fusion,
         evidence_matching,
         evidence_merging,
@@ -70,7 +69,7 @@ def test_no_float_is_raised_to_a_power() -> None:
     )
 
     modules = (
-        *(agreement, class_heights, evidence_fusion, evidence_matching, evidence_merging),
+        *(agreement, evidence_fusion, evidence_matching, evidence_merging),
         *(evidence_objects, exact, looks, presence, sights, spots, thing_index, things),
     )
     for module in modules:

@@ -21,8 +21,8 @@ from msgspec.structs import replace
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
+from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.settings import Settings
-from projections.fold.survivors import PlaceSurvivors
 from projections.history import LogTimeline
 from projections.history.diff import difference_of, rows_of
 from projections.history.known import KnownHistory
