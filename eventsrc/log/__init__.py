@@ -7,7 +7,6 @@ names is.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .active_segment import SegmentFault
 from .durable_files import ALWAYS, GROUP_COMMIT, NEVER, FsyncPolicy, parse_fsync
 from .event import Event, MessageFormat, NewEvent, VerbatimEvent, event_hash
 from .log_identity import (
@@ -19,12 +18,12 @@ from .log_identity import (
     segment_signatures,
     write_cache_file,
 )
-from .reader import LogReader
+from .reader import LogReader, follow
 from .segment import Unreadable
 
 if TYPE_CHECKING:
+    from .active_segment import SegmentFault
     from .recover import RecoveryReport, SegmentRecovery, recover_log
-    from .tail import follow
     from .verify import Verification, verify_log
     from .verify_events import Finding
     from .writer import LogWriter, Sealing
@@ -66,9 +65,9 @@ _MODULES = {
     "LogWriter": "writer",
     "RecoveryReport": "recover",
     "Sealing": "writer",
+    "SegmentFault": "active_segment",
     "SegmentRecovery": "recover",
     "Verification": "verify",
-    "follow": "tail",
     "recover_log": "recover",
     "verify_log": "verify",
 }

@@ -4,6 +4,12 @@ A reader yields durable events only: of the growing segment, the chunks with a c
 no lock and can read while a writer writes, rotates and seals. At damage it yields every event
 before it and raises LogDamaged; with ``on_gap`` it reports what is missing and continues. A log
 whose last segment cannot be opened is read up to there, and raises when its end is asked for.
+
+`follow` polls the commit marks of the file: while nothing comes, one `pread` of some 80 bytes and
+five `stat` for the next segment every 5 ms. That costs one to two percent of a core (58 to 86 µs a
+poll, most of it waking up), needs nothing from the platform, and works across processes. A chunk
+damaged before it was read looks like one that is being written, so it checks once a second whether
+recorded events come after it.
 """
 
 import contextlib
@@ -23,7 +29,7 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from .log_identity import mixed_logs_message
-from .sealed_end import SealedEnd, sealed_end, sealed_end_of
+from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_of
 from .sealed_segment import SealedFile
 from .segment import ActiveFile, Unreadable, chunk_events
 
@@ -310,40 +316,6 @@ class LogReader:
         self.close()
 
 
-def segments_of(path: Path) -> list[SegmentPath]:
-    """The segments of a log; LogNotFound, NotALog or LogDamaged when there are none, LogError when
-    the folder may not be read."""
-    try:
-        return _segments_of(path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise LogError(f"{path}: {reason}; check the folder's rights and its disk") from error
-
-
-def segments_left(path: Path) -> list[SegmentPath]:
-    """`segments_of`, and none, instead of LogDamaged, where all of a log are missing."""
-    try:
-        return segments_of(path)
-    except LogDamaged:
-        return []
-
-
-def _segments_of(path: Path) -> list[SegmentPath]:
-    if not path.exists():
-        raise LogNotFound(f"no log at {path}; record or import one, or check the path")
-    if not path.is_dir():
-        raise NotALog(
-            f"{path} is a file; a log is a directory. `{advised('import', 'LOG', path)}` imports it"
-        )
-    end = sealed_end(path)
-    segments = list_growing(path)
-    if not segments:
-        if end is not None:
-            end.require(path, FIRST_OFFSET)
-        raise NotALog(f"{path} holds no log segment (….mcap); check the path")
-    return segments
-
-
 def _open_last(
     log: Path, segments: list[SegmentPath], sealed: SealedEnd | None
 ) -> tuple[_Found, _UnreadableEnd | None]:
@@ -393,3 +365,35 @@ def _wanted_channels(segment: OpenSegment, keys: Collection[str] | None) -> set[
     if keys is None or not isinstance(segment, SealedFile):
         return None
     return {id_ for id_, channel in segment.channels.items() if channel.topic in keys}
+
+
+POLL_S = 0.005
+_CHECK_EVERY = 200
+"""Idle polls between two checks: one second."""
+
+
+def follow(
+    path: Path, start: Offset, *, stop: threading.Event, poll_s: float = POLL_S
+) -> Iterator[Event | None]:
+    """Follow a log as it grows: events from ``start`` on, each once, across rotations, milliseconds
+    after its commit, until ``stop`` is set.
+
+    Yields None after each poll, when every durable event has been yielded, so that the caller can
+    finish a batch. Raises LogDamaged where events cannot be read, and LogNotFound when the log is
+    gone.
+    """
+    with LogReader(path) as reader:
+        at = start
+        idle_polls = 0
+        while not stop.is_set():
+            end = reader.refresh()
+            idle_polls = 0 if at < end else idle_polls + 1
+            if idle_polls % _CHECK_EVERY == _CHECK_EVERY - 1:
+                reader.check_end()
+            for event in reader.read(at, end):
+                yield event
+                if stop.is_set():
+                    return
+            at = max(at, end)
+            yield None
+            stop.wait(poll_s)

@@ -39,12 +39,11 @@ from .format import (
 )
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
-from .reader import segments_left
 from .rebuild_segment import adjacent_times, rebuild_segment, slice_scan
 from .rename_segments import Moved, quarantine, rename_segments
 from .scan import scan_active, scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
-from .sealed_end import SealedEnd, sealed_end, sealed_end_of, write_sealed_end
+from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_left, write_sealed_end
 from .sealed_segment import check_sealed
 from .segment import Scan
 

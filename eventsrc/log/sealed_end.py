@@ -6,7 +6,8 @@ does. It names the log id, base and end of the last sealed segment, with a CRC a
 
 It says what the log has at least. It may be missing (in copies of the segments alone) or older than
 the segments (a crash between the two); one that is damaged, or of another log, is ignored, reported
-by `log verify` and replaced by `log recover`.
+by `log verify` and replaced by `log recover`. It also tells a log that has lost all its segments
+from a folder that is no log (`segments_of`).
 """
 
 import contextlib
@@ -16,13 +17,22 @@ import stat
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from eventsrc.base.errors import LogDamaged
+from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
 from eventsrc.base.text import advised
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
 from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
-from .format import DAMAGED, SEALED, SEALED_END, free_name, read_number, segment_path
+from .format import (
+    DAMAGED,
+    SEALED,
+    SEALED_END,
+    SegmentPath,
+    free_name,
+    list_growing,
+    read_number,
+    segment_path,
+)
 from .mcap_records import Metadata
 
 _MAX_BYTES: Final = 4096
@@ -138,3 +148,37 @@ def write_sealed_end(log: Path, end: SealedEnd) -> None:
     except OSError:
         unlink_quietly(temporary)
         raise
+
+
+def segments_of(path: Path) -> list[SegmentPath]:
+    """The segments of a log; LogNotFound, NotALog or LogDamaged when there are none, LogError when
+    the folder may not be read."""
+    try:
+        return _segments_of(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise LogError(f"{path}: {reason}; check the folder's rights and its disk") from error
+
+
+def segments_left(path: Path) -> list[SegmentPath]:
+    """`segments_of`, and none, instead of LogDamaged, where all of a log are missing."""
+    try:
+        return segments_of(path)
+    except LogDamaged:
+        return []
+
+
+def _segments_of(path: Path) -> list[SegmentPath]:
+    if not path.exists():
+        raise LogNotFound(f"no log at {path}; record or import one, or check the path")
+    if not path.is_dir():
+        raise NotALog(
+            f"{path} is a file; a log is a directory. `{advised('import', 'LOG', path)}` imports it"
+        )
+    end = sealed_end(path)
+    segments = list_growing(path)
+    if not segments:
+        if end is not None:
+            end.require(path, FIRST_OFFSET)
+        raise NotALog(f"{path} holds no log segment (….mcap); check the path")
+    return segments

@@ -27,10 +27,9 @@ from .format import (
 )
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
-from .reader import segments_left
 from .scan import scan_active, scan_sealed, scanned_events
 from .seal import NO_PREVIOUS, REPLACES
-from .sealed_end import InvalidSealedEnd, SealedEnd, read_sealed_end, sealed_end
+from .sealed_end import InvalidSealedEnd, SealedEnd, read_sealed_end, sealed_end, segments_left
 from .sealed_segment import check_sealed
 from .segment import Scan
 from .verify_events import EventFindings, Finding, Kind

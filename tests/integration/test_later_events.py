@@ -17,7 +17,7 @@ from eventsrc.envelope.commands import Reembed, UseSettings
 from eventsrc.envelope.model import DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter, Unreadable
-from eventsrc.log.tail import follow
+from eventsrc.log.reader import follow
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.postgres import rebuild

@@ -9,7 +9,7 @@ from typing import Final
 from eventsrc.base.errors import LogError, LogNotFound, MisuseError, NotALog
 from eventsrc.base.text import counted, visible
 from eventsrc.base.user_files import FileFault, read_file
-from eventsrc.log.reader import segments_of
+from eventsrc.log.sealed_end import segments_of
 
 MAX_LIST_BYTES: Final = 16 * 1024 * 1024
 MAX_NAME_BYTES: Final = 255

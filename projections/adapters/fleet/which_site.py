@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.text import advised
-from eventsrc.log.reader import segments_of
+from eventsrc.log.sealed_end import segments_of
 from projections.fold.exact import exp
 from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import Answer, Question, rank
