@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 from eventsrc.base.text import visible
 
+from .cdr import CdrFault, CdrFields
 from .model import MAX_ID_LENGTH, DetId
 
 CROP_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
@@ -79,25 +80,14 @@ def _padded(body: bytes) -> bytes:
 
 def decode_crop(payload: bytes) -> Crop:
     """The crop that `encode_crop` made. Raises InvalidCrop."""
-    body = payload[len(_HEAD) :]
+    if payload[: len(_HEAD)] != _HEAD:
+        raise InvalidCrop("it is no message in CDR of little endian")
+    fields = CdrFields(payload)
     try:
-        if payload[: len(_HEAD)] != _HEAD:
-            raise InvalidCrop("it is no message in CDR of little endian")
-        frame_id, at = _text(body, 8)
-        _, at = _text(body, at)
-        (length,) = struct.unpack_from("<I", body, at)
-        jpeg = body[at + 4 : at + 4 + length]
-        if len(jpeg) != length or len(body) - at - 4 - length > 3:
-            raise InvalidCrop(f"its data of {length:,} bytes do not fit its {len(payload):,}")
-        return Crop(DetId(frame_id.decode()), jpeg)
-    except (struct.error, UnicodeDecodeError) as error:
+        fields.numbers("iI", "header.stamp")
+        det_id = fields.text("header.frame_id").decode()
+        fields.text("format")
+        (length,) = fields.numbers("I", "the length of data")
+        return Crop(DetId(det_id), bytes(fields.last(length, "data")))
+    except (CdrFault, UnicodeDecodeError) as error:
         raise InvalidCrop(f"it is no sensor_msgs/CompressedImage: {error}") from None
-
-
-def _text(body: bytes, at: int) -> tuple[bytes, int]:
-    """The text at ``at``, and the aligned position behind it. Raises InvalidCrop."""
-    (length,) = struct.unpack_from("<I", body, at)
-    end = at + 4 + length
-    if not 0 < length <= len(body) - at - 4 or body[end - 1]:
-        raise InvalidCrop("a text in it does not end where it says")
-    return body[at + 4 : end - 1], end + -end % 4

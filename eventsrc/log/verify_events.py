@@ -20,12 +20,12 @@ import hashlib
 from array import array
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from eventsrc.base.text import visible
 from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
@@ -174,7 +174,22 @@ class Finding:
     count: int = 1
 
 
-Model = TypeVar("Model", bound=BaseModel)
+T = TypeVar("T")
+
+
+def _read_recording(payload: bytes) -> object:
+    from eventsrc.ros.derivation import read_recording  # here: few logs have messages of ROS
+
+    return read_recording(payload)
+
+
+_READERS: Final[dict[str, Callable[[bytes], object]]] = {
+    REJECTED_KEY: RejectedPayload.model_validate_json,
+    MAP_KEY: decode_map,
+    ROS_KEY: _read_recording,
+    EMBEDDINGS_KEY: decode_embeddings,
+}
+"""By key, what reads events that need no further check."""
 
 _BACKWARDS = (
     "logged_ns runs backwards: the clock was set back, or a file was imported that is not in order"
@@ -217,25 +232,16 @@ class EventFindings:
             self._logged_ns = event.logged_ns
         if event.key == LOSS_KEY:
             self._check_loss(event)
-        elif event.key == REJECTED_KEY:
-            self._parse(RejectedPayload, event)
         elif event.key == COMMAND_KEY:
             self._check_command(event)
-        elif event.key == MAP_KEY:
-            self._check_map(event)
-        elif event.key == ROS_KEY:
-            self._check_recording(event)
-        elif event.key == EMBEDDINGS_KEY:
-            self._check_embeddings(event)
+        elif event.key in _READERS:
+            self._read(_READERS[event.key], event)
         elif event.is_envelope:
             self._check_envelope(event)
 
     def _check_command(self, event: Event) -> None:
-        try:
-            command = parse_command(event.payload)
-        except InvalidCommand as error:
-            what = f"{event.key} event cannot be read: {error}"
-            self._add("schema", what, event.offset, what)
+        command = self._read(parse_command, event)
+        if command is None:
             return
         digest = hashlib.sha256(encode_command(command)).digest()
         command_id = command.command_id
@@ -247,31 +253,8 @@ class EventFindings:
             )
             self._add("schema", what, event.offset, what)
 
-    def _check_map(self, event: Event) -> None:
-        try:
-            decode_map(event.payload)
-        except InvalidMap as error:
-            what = f"{event.key} event cannot be read: {error}"
-            self._add("schema", what, event.offset, what)
-
-    def _check_recording(self, event: Event) -> None:
-        from eventsrc.ros.derivation import read_recording  # here: few logs have messages of ROS
-
-        try:
-            read_recording(event.payload)
-        except ValidationError as error:
-            what = f"{event.key} event cannot be read: {error.errors()[0]['msg']}"
-            self._add("schema", what, event.offset, what)
-
-    def _check_embeddings(self, event: Event) -> None:
-        try:
-            decode_embeddings(event.payload)
-        except InvalidEmbeddings as error:
-            what = f"{event.key} event cannot be read: {error}"
-            self._add("schema", what, event.offset, what)
-
     def _check_loss(self, event: Event) -> None:
-        loss = self._parse(Loss, event)
+        loss = self._read(Loss.model_validate_json, event)
         gap = None if loss is None else gap_of(loss)
         if gap is not None:
             self._gaps.add_report(event.offset, gap)
@@ -279,13 +262,17 @@ class EventFindings:
             what = _LOST[loss.cause].format(loss.publisher)
             self._add("loss", what, event.offset, what, loss.count)
 
-    def _parse(self, model: type[Model], event: Event) -> Model | None:
+    def _read(self, read: Callable[[bytes], T], event: Event) -> T | None:
+        """What ``read`` makes of the payload; None, and a finding, if it cannot."""
         try:
-            return model.model_validate_json(event.payload)
+            return read(event.payload)
         except ValidationError as error:
-            what = f"{event.key} event cannot be read: {error.errors()[0]['msg']}"
-            self._add("schema", what, event.offset, what)
-            return None
+            reason = error.errors()[0]["msg"]
+        except (InvalidCommand, InvalidEmbeddings, InvalidMap) as error:
+            reason = str(error)
+        what = f"{event.key} event cannot be read: {reason}"
+        self._add("schema", what, event.offset, what)
+        return None
 
     def _check_envelope(self, event: Event) -> None:
         outcome = read_envelope(event)
