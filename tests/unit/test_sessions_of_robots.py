@@ -9,7 +9,7 @@ from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Answer, PoseHypothesis
 from projections.localize.relocalize.layout import Hypotheses
 from projections.localize.relocalize.track import Track
-from projections.surfaces.serve.sessions import MAX_NAME, SILENT_S, Sessions, session_name
+from projections.surfaces.serve.answering import MAX_NAME, SILENT_S, Sessions, session_name
 
 STILL = (0.0, 0.0, 0.0)
 

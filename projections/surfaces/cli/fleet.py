@@ -4,6 +4,7 @@ A site that fails does not stop the others. A command ends with exit 3 when a si
 something was found at one.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -17,6 +18,7 @@ from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
 
 from .databases import LoaderOption, Loaders, loader_of
+from .event_text import iso_time
 from .fleet_options import (
     EngineOption,
     FleetDatabases,
@@ -27,20 +29,26 @@ from .fleet_options import (
     ended_sites,
     sites_of,
 )
-from .fleet_text import status_table, which_site_text
 from .folded_log import FoldSettings, settings_from
 from .options import CameraOptions, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
-    from projections.adapters.fleet.site_tasks import ChosenSettings
+    from projections.adapters.fleet.site_tasks import ChosenSettings, SiteStatus
+    from projections.adapters.fleet.which_site import WhichSite
+    from projections.postgres.status import SinkStatus
 
 fleet = typer.Typer(
     help="Rebuild, check and ask many sites, each with a log and a database of its own.",
     no_args_is_help=True,
 )
 
-_NAMED: Final = 10
+_HEADS: Final = (
+    "site", "state", "events", "MB", "keys", "last keyframe", "rejected", "lost", "graph", "vectors"
+)  # fmt: skip
+_NUMBERS: Final = frozenset({2, 3, 4, 6, 7})
+_MB: Final = 1_000_000
+_LISTED: Final = 10
 
 
 def _chosen(given: FoldSettings) -> "ChosenSettings":
@@ -302,8 +310,79 @@ def url(
     """
     sites = sites_of(place)
     if site not in {each.name for each in sites}:
-        names = ", ".join(visible(each.name) for each in sites[:_NAMED])
-        more = f" and {len(sites) - _NAMED:,} more" if len(sites) > _NAMED else ""
+        names = ", ".join(visible(each.name) for each in sites[:_LISTED])
+        more = f" and {len(sites) - _LISTED:,} more" if len(sites) > _LISTED else ""
         raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
     with FleetDatabases(db=db).opened(sites) as databases:
         display(databases[site].graph_url)
+
+
+def status_table(sites: Sequence[Site], found: "Sequence[SiteStatus]") -> str:
+    """One line a site."""
+    rows = [list(_HEADS)]
+    rows += [_row(site, each) for site, each in zip(sites, found, strict=True)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
+    return "".join(_line(row, widths) for row in rows)
+
+
+def _line(row: Sequence[str], widths: Sequence[int]) -> str:
+    cells = (
+        cell.rjust(width) if column in _NUMBERS else cell.ljust(width)
+        for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+    )
+    return "  ".join(cells).rstrip() + "\n"
+
+
+def _row(site: Site, found: "SiteStatus") -> list[str]:
+    info, databases = found.info, found.databases
+    if info is None or databases is None:
+        return [visible(site.name), "failed", *"------", "-", "-"]
+    last = "-" if info.last_stamp_ns is None else iso_time(info.last_stamp_ns)[:19] + "Z"
+    published = [key for key in info.keys if not key.startswith("mapfold/")]
+    return [
+        visible(site.name),
+        "ok" if found.healthy else "findings",
+        f"{info.events:,}",
+        f"{info.size_bytes / _MB:,.1f}",
+        f"{len(published):,}",
+        last,
+        f"{info.rejected:,}",
+        f"{info.lost:,}",
+        *map(_sink_cell, databases.sinks),
+    ]
+
+
+def _sink_cell(sink: "SinkStatus") -> str:
+    """The condition, the number of events behind, and that of parked events."""
+    cell: str = sink.condition
+    if sink.lag:
+        cell = f"behind by {sink.lag:,}" if cell == "behind" else f"{cell}, behind by {sink.lag:,}"
+    if sink.dead_letters:
+        cell += f", {len(sink.dead_letters):,} parked"
+    return cell
+
+
+def which_site_text(which: "WhichSite") -> str:
+    """The likeliest site, then all of them with place and probabilities."""
+    if not which.sites:
+        return "no site could be asked\n"
+    best = which.best
+    if best is None:
+        first = f"none of these sites (probability {which.none:.2f})"
+    else:
+        first = f"{visible(best.name)} (probability {best.probability:.2f})"
+    lines = [first]
+    for number, each in enumerate(which.sites[:_LISTED], start=1):
+        answer = each.answer
+        place = visible(answer.places[0].name or answer.places[0].place_id) if answer.places else ""
+        at = "" if answer.pose is None else f" at ({answer.pose.x:.2f}, {answer.pose.y:.2f}) m"
+        lines.append(
+            f"{number}. {visible(each.name)}  {each.probability:.3f}"
+            f"  known {answer.known:.2f}, confidence {answer.confidence:.2f}"
+            f"  {place}{at}".rstrip()
+            + (f"  (thin map: {answer.thin})" if answer.thin is not None else "")
+        )
+    if len(which.sites) > _LISTED:
+        lines.append(f"and {len(which.sites) - _LISTED:,} more")
+    lines.append(f"none of them  {which.none:.3f}")
+    return "\n".join(lines) + "\n"

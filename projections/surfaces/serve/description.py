@@ -19,9 +19,8 @@ from fastapi.responses import Response
 
 from projections.localize.relocalize import Method, question_schema
 
-from .answering import MAX_TOP
+from .answering import MAX_NAME, MAX_TOP
 from .models import RefusalShape
-from .sessions import MAX_NAME
 
 _EMBEDDING: Final = base64.b64encode(struct.pack("<512f", 1.0, *[0.0] * 511)).decode()
 _CROP: Final = {

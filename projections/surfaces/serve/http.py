@@ -24,13 +24,12 @@ from eventsrc.record.metrics import METRICS_TYPE
 from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Method, describe_value
 
-from .answering import MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
+from .answering import MAX_NAME, MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
 from .connections import peer_of
 from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
 from .fair_queue import FairQueue
 from .models import AnswerShape, Health, ObjectsShape, PlacesShape, StateQuery
 from .service_metrics import ServiceMetrics
-from .sessions import MAX_NAME
 from .states import State, refuse_unknown
 
 _DRAIN_FACTOR: Final = 8
