@@ -219,8 +219,8 @@ class CameraOptions:
             return CameraConstants.model_validate(given) if given else None
         except ValueError:
             raise QuestionError(
-                "no such camera: write --image as 640x400, in pixels, and --hfov as 1 to 170, in"
-                " degrees"
+                "no such camera: write --image as 640x400, in pixels, and --hfov, the horizontal"
+                " field of view, as 1 to 170, in degrees"
             ) from None
 
 
