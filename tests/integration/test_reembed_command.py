@@ -26,7 +26,7 @@ from eventsrc.envelope.model import DetId
 from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import MessageTypes
-from projections.surfaces.cli.reembed import CropEncoder, weight_files
+from projections.surfaces.cli.reembed import OnnxCropEncoder, weight_files
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.fixtures_zenoh import Program
@@ -58,16 +58,16 @@ def test_a_crop_is_a_compressed_image_of_ros(det_id: str, size: int) -> None:
 def test_weights_in_a_file_beside_the_model_are_a_part_of_it(tmp_path: Path) -> None:
     path = mean_colour_encoder(tmp_path / "clip.onnx")
     assert weight_files(path.read_bytes()) == []
-    whole = CropEncoder(path, "cpu", None).sha256
+    whole = OnnxCropEncoder(path, "cpu", None).sha256
     onnx.save_model(
         onnx.load(path), path, save_as_external_data=True, location=WEIGHTS, size_threshold=0
     )
     assert weight_files(path.read_bytes()) == [WEIGHTS]
-    apart = CropEncoder(path, "cpu", None).sha256
+    apart = OnnxCropEncoder(path, "cpu", None).sha256
     weights = bytearray((tmp_path / WEIGHTS).read_bytes())
     weights[40] ^= 1
     (tmp_path / WEIGHTS).write_bytes(weights)
-    assert len({whole, apart, CropEncoder(path, "cpu", None).sha256}) == 3
+    assert len({whole, apart, OnnxCropEncoder(path, "cpu", None).sha256}) == 3
 
 
 def test_it_is_read_by_the_types_of_ros() -> None:

@@ -27,7 +27,7 @@ from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say
 
 
-class CropEncoder:
+class OnnxCropEncoder:
     """An ONNX encoder and the JSON file beside it, for `eventsrc.adapters.reembedding`."""
 
     def __init__(self, path: Path, device: Device, threads: int | None) -> None:
@@ -115,7 +115,7 @@ def reembed_log(
     They are appended; `--space NAME` then maps the log in their space. Run an interrupted command
     again to continue it. Exit 3 when crops cannot be decoded or encoded.
     """
-    model = CropEncoder(encoder, device_of(device), threads)
+    model = OnnxCropEncoder(encoder, device_of(device), threads)
     with stop_on_signals() as stop, Bar() as bar:
         done = reembed(
             log,
