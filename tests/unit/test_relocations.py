@@ -19,7 +19,7 @@ from projections.fold.deltas import (
     Pose,
     RunOrdinal,
 )
-from projections.fold.evidence_fusion import Moved, Relocations
+from projections.fold.evidence_fusion import MovedObject, Relocations
 from projections.fold.presence import Presence
 from projections.fold.settings import CameraConstants
 
@@ -54,9 +54,9 @@ class Story:
 
     def see(
         self, ordinal: int, run: int, times: int = 1, name: str = "chair", variance_m2: int = 0
-    ) -> list[Moved]:
+    ) -> list[MovedObject]:
         """Pairs told while an Object was seen so often."""
-        told: list[Moved] = []
+        told: list[MovedObject] = []
         for _ in range(times):
             count = self.table.counts[ordinal] = self.table.counts.get(ordinal, 0) + 1
             thing, observation = ObjectOrdinal(ordinal), ObservationOrdinal(self.offset)
@@ -71,11 +71,11 @@ class Story:
             told += self.fold(run, 10_000_000 * ordinal, deltas)
         return told
 
-    def miss(self, ordinal: int, run: int, times: int = 1) -> list[Moved]:
+    def miss(self, ordinal: int, run: int, times: int = 1) -> list[MovedObject]:
         """Pairs reported while no Object was found."""
         return [p for _ in range(times) for p in self.fold(run, 10_000_000 * ordinal, [])]
 
-    def fold(self, run: int, x_um: int, deltas: list[Delta]) -> list[Moved]:
+    def fold(self, run: int, x_um: int, deltas: list[Delta]) -> list[MovedObject]:
         self.offset += 1
         pose = Pose(x_um, 0, 0.0)
         self.presence.fold(Offset(self.offset), RunOrdinal(run), pose, CameraConstants(), deltas)
@@ -97,7 +97,7 @@ def story() -> Story:
 def test_the_best_candidate_is_the_newcomer_at_its_third_observation(story):
     story.table.looks |= {(0, 3): 4.5, (1, 3): 2.3, (2, 3): 9.0}
     assert story.see(3, 1, 2) == []
-    assert story.see(3, 1) == [Moved(0, 3, 15, 4.5)]
+    assert story.see(3, 1) == [MovedObject(0, 3, 15, 4.5)]
     assert story.see(0, 1, 60) == []  # it is told once
 
 
@@ -154,7 +154,7 @@ def test_misses_of_the_older_one_add_to_evidence_of_looks(story, look, is_told):
     story.table.looks |= {(0, 3): look, (1, 3): 1.5}
     assert story.see(3, 1, 30) == []
     told = story.miss(0, 1, 16)
-    assert told == ([Moved(0, 3, 15, look)] if is_told else [])
+    assert told == ([MovedObject(0, 3, 15, look)] if is_told else [])
 
 
 def test_what_was_seen_in_the_run_needs_more_evidence(story):
@@ -191,7 +191,7 @@ def test_a_class_by_vote_counts(story):
     assert story.see(3, 1, 4) == []
     story.table.classes[3] = "table"
     story.fold(1, 30_000_000, [ObjectClassified(1, ObjectOrdinal(3), "table")])
-    assert story.see(3, 1, 2) == [Moved(2, 3, 15, 6.0)]
+    assert story.see(3, 1, 2) == [MovedObject(2, 3, 15, 6.0)]
 
 
 def test_an_absorbed_object_is_no_candidate(story):
@@ -229,4 +229,4 @@ def test_a_snapshot_goes_on_where_it_was_taken(story):
     again.load(state)
     assert again.dump() == state
     story.relocations = again
-    assert story.see(3, 1) == [Moved(0, 3, 15, 2.5)]
+    assert story.see(3, 1) == [MovedObject(0, 3, 15, 2.5)]
