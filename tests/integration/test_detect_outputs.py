@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from eventsrc.adapters.detector.keyframes import CropJpeg, Keyframe
+from eventsrc.adapters.detector.keyframes import CropJpeg, DetectedKeyframe
 from eventsrc.adapters.detector.service import CropSender, ZenohOutput
 from eventsrc.envelope.model import DetId
 from eventsrc.record.robot.publisher import EnvelopePublisher
@@ -13,9 +13,9 @@ from eventsrc.record.transport.session import Received, Session, ZenohOptions
 NOBODY = ZenohOptions(connect=("tcp/127.0.0.1:9",))
 
 
-def _keyframe(number: int) -> Keyframe:
+def _keyframe(number: int) -> DetectedKeyframe:
     envelope = {"run_id": "r", "keyframe_id": number, "timestamp": 1.0, "detections": []}
-    return Keyframe(envelope, [])
+    return DetectedKeyframe(envelope, [])
 
 
 def test_a_full_spool_costs_a_camera_the_newest_keyframes(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
 
 from .picture import Picture, PictureError, Pixels
-from .poses import Pose, Poses
+from .poses import Poses, TrajectoryPose
 from .vision import encode_jpeg, shrunk
 from .vision_models import Encoder, Finder, Found
 
@@ -44,14 +44,14 @@ class KeyframeGate:
     def __init__(self, limits: GateLimits) -> None:
         self._limits = limits
         self._stamp_s: float | None = None
-        self._pose: Pose | None = None
+        self._pose: TrajectoryPose | None = None
 
-    def set_last(self, stamp_s: float, pose: Pose | None) -> None:
+    def set_last(self, stamp_s: float, pose: TrajectoryPose | None) -> None:
         """Set the last keyframe."""
         self._stamp_s = stamp_s
         self._pose = pose or self._pose
 
-    def is_due(self, stamp_s: float, pose: Pose | None) -> bool:
+    def is_due(self, stamp_s: float, pose: TrajectoryPose | None) -> bool:
         """Whether this picture should be a keyframe."""
         if self._stamp_s is None or (pose is not None and self._pose is None):
             return True
@@ -107,7 +107,7 @@ class CropJpeg(NamedTuple):
     jpeg: bytes
 
 
-class Keyframe(NamedTuple):
+class DetectedKeyframe(NamedTuple):
     """The JSON document of an envelope, and the crops of its detections if they are kept."""
 
     envelope: dict[str, Any]
@@ -135,7 +135,7 @@ class Keyframes:
         self._noted: dict[str, int] = {}
         self.counts = PictureCounts()
 
-    def process(self, picture: Picture) -> Keyframe | None:
+    def process(self, picture: Picture) -> DetectedKeyframe | None:
         """The keyframe of a picture; None if it is left out. Raises ModelError."""
         counts = self.counts
         counts.pictures += 1
@@ -182,8 +182,8 @@ class Keyframes:
             )
 
     def _keyframe(
-        self, picture: Picture, pixels: Pixels, pose: Pose | None, found: Found
-    ) -> Keyframe:
+        self, picture: Picture, pixels: Pixels, pose: TrajectoryPose | None, found: Found
+    ) -> DetectedKeyframe:
         number = KeyframeId(FIRST_KEYFRAME + self.counts.keyframes - 1)
         cut_out = [_cut_out(pixels, box) for box in found.boxes]
         vectors = self._encoder.encode(cut_out) if cut_out else []
@@ -212,7 +212,7 @@ class Keyframes:
         if self._keep_crops:
             jpegs = [encode_jpeg(shrunk(pixels, CROP_SIDE)) for pixels in cut_out]
             crops = [CropJpeg(*each) for each in zip(ids, jpegs, strict=True)]
-        return Keyframe(envelope, crops)
+        return DetectedKeyframe(envelope, crops)
 
     def _detection(
         self,
@@ -249,7 +249,7 @@ class Keyframes:
             self._note(text + last)
 
 
-def _pose_fields(pose: Pose | None) -> dict[str, float]:
+def _pose_fields(pose: TrajectoryPose | None) -> dict[str, float]:
     if pose is None:
         return {}
     yaw = math.remainder(pose.yaw, math.tau)

@@ -17,7 +17,7 @@ from eventsrc.base.user_files import written_whole
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session
 
-from .keyframes import CropJpeg, Keyframe, Keyframes, PictureCounts
+from .keyframes import CropJpeg, DetectedKeyframe, Keyframes, PictureCounts
 from .picture import Picture
 from .picture_sources import LivePictures
 
@@ -52,7 +52,7 @@ class FileOutput:
         self._path, self._stack = path, ExitStack()
         self._file = self._stack.enter_context(written_whole(path))
 
-    def send(self, keyframe: Keyframe) -> None:
+    def send(self, keyframe: DetectedKeyframe) -> None:
         """Write its envelope."""
         whole = self._file.tell() if self._file.seekable() else None
         try:
@@ -97,7 +97,7 @@ class ZenohOutput:
         spooled = self._publisher
         return replace(self._counts, waiting=spooled.unacknowledged, refused=spooled.refused_count)
 
-    def send(self, keyframe: Keyframe) -> None:
+    def send(self, keyframe: DetectedKeyframe) -> None:
         """Spool its envelope and send its crops."""
         payload = _encode(keyframe.envelope)
         while True:

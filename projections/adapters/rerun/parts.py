@@ -46,7 +46,7 @@ _GOLDEN_ANGLE: Final = math.pi * (3.0 - math.sqrt(5.0))
 
 
 @dataclass(frozen=True, slots=True)
-class Spots:
+class Dots:
     """Spots in metres, with a colour each, #rrggbb, and a label each or none."""
 
     spots: tuple[Point, ...]
@@ -83,7 +83,7 @@ class Graph:
     edges: tuple[tuple[str, str], ...]
 
 
-Part = Spots | Lines | Arrow | Graph
+Part = Dots | Lines | Arrow | Graph
 
 
 def map_parts(view: MapView) -> dict[Path, Part]:
@@ -135,7 +135,7 @@ def _floor(
     )
     yield (
         ("places",),
-        Spots(
+        Dots(
             tuple(p.centroid for p in places),
             tuple(p.colour for p in places),
             tuple(p.label for p in places),
@@ -145,7 +145,7 @@ def _floor(
     objects = [o for o in all_objects if o.floor == floor]
     yield (
         ("objects",),
-        Spots(
+        Dots(
             tuple(o.record.spot for o in objects),
             tuple(_object_colour(o) for o in objects),
             tuple(o.label for o in objects),
@@ -165,7 +165,7 @@ def _floor(
     shown = thinned(posed)
     yield (
         ("keyframes",),
-        Spots(
+        Dots(
             tuple(_spots(shown)),
             tuple(
                 palette.FAINT if k.place is None else palette.place_colour(k.place) for k in shown

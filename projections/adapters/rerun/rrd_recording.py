@@ -34,7 +34,7 @@ from projections.map.phrases import change_lines
 from projections.map.scenes import RecordedFold
 from projections.map.view import MapView
 
-from .parts import Arrow, Graph, Lines, Part, Path, Spots, map_parts, robot_parts
+from .parts import Arrow, Dots, Graph, Lines, Part, Path, map_parts, robot_parts
 
 APPLICATION: Final = "mapfold"
 _MARGIN_M: Final = 1.0
@@ -149,7 +149,7 @@ class _Shown:
 
 def _shapes(part: Part) -> Iterator[rerun.AsComponents]:
     match part:
-        case Spots():
+        case Dots():
             yield rerun.Points2D(
                 part.spots,
                 colors=_colours(part.colours),
