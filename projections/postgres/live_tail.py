@@ -6,7 +6,7 @@ state is kept nowhere else), and writes to each sink from its own checkpoint on.
 flushed: then the fold is ahead of the databases, and another pass begins at their checkpoints.
 
 A batch has the events since the last one: a single event at a low rate, up to `BATCH_EVENTS` when
-the tail is behind. Each batch is one transaction per database (`writer`).
+the tail is behind. Each batch is one transaction per database (`batch_writer`).
 
 An event that cannot be folded is parked: its offset and the reason go to the dead letters in the
 same transaction that moves past it. Parked events are left out at every later start too, so that

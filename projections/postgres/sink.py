@@ -1,9 +1,9 @@
 """The interface (port) between the fold and the places to which the map is written.
 
-Each implements `Sink`. For each batch of events that a tail follows, `live_tail` calls `prepare`
-with the ids that the batch changed and the view; `batch_writer` opens a transaction, calls ``send``
-of the prepared write, moves the sink's checkpoint and commits: both are written or none. After a
-lost connection it calls `ensure` and, if the batch was not committed, the same ``send`` again.
+Each implements `Sink`. For each batch of events that a tail follows, `batch_writer` calls `prepare`
+with the ids that the batch changed and the view, opens a transaction, calls ``send`` of the
+prepared write, moves the sink's checkpoint and commits: both are written or none. After a lost
+connection it calls `ensure` and, if the batch was not committed, the same ``send`` again.
 
 For a rebuild from the start of a log `shadows` calls, in this order:
 

@@ -251,8 +251,8 @@ class Program(TyperGroup):
         """Write the list of commands for ``--help``, by section."""
         longest = max(map(len, self.commands), default=0)
         width = formatter.width - 6 - longest
-        for title, modules in SECTIONS.items():
-            commands = [(name, self.commands[name]) for name in modules if name in self.commands]
+        for title, names in SECTIONS.items():
+            commands = [(name, self.commands[name]) for name in names if name in self.commands]
             if commands:
                 with formatter.section(title):
                     formatter.write_dl(
