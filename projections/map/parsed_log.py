@@ -20,7 +20,6 @@ product and no sum.
 
 import gc
 import mmap
-import os
 import struct
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -35,6 +34,7 @@ import numpy as np
 from msgspec.structs import force_setattr
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.machine import usable_processors
 from eventsrc.base.worker_process import ProcessGone, WorkerProcess, unnamed_memory
 from eventsrc.envelope.ingest import Accepted, Rejected, Vector
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Envelope, Offset
@@ -292,11 +292,7 @@ _RANGE_BYTES: Final = 768 * 1024
 
 def default_workers() -> int:
     """One process for each further processor that this one may use, at most `DEFAULT_WORKERS`."""
-    if hasattr(os, "sched_getaffinity"):
-        processors = len(os.sched_getaffinity(0))
-    else:
-        processors = os.cpu_count() or 1
-    return min(processors - 1, DEFAULT_WORKERS)
+    return min(usable_processors() - 1, DEFAULT_WORKERS)
 
 
 class ParsedLog:
