@@ -155,17 +155,7 @@ def foreign_messages(file: BinaryIO) -> Iterator[ForeignMessage]:
     messages. Raises ForeignDamage after the last good one."""
     source = _CrcReader(file)
     with _raising_foreign_damage(source):
-        yield from _messages(_records(source, _MESSAGE_OPCODES, MAX_FOREIGN_BYTES, excerpts=True))
-
-
-def foreign_records(
-    file: BinaryIO, opcodes: Collection[int], max_bytes: int
-) -> Iterator[ForeignRecord]:
-    """Every record of these opcodes, in chunks or not, of at most ``max_bytes`` like its chunk;
-    CRCs are checked. Raises ForeignDamage after the last good one."""
-    source = _CrcReader(file)
-    with _raising_foreign_damage(source):
-        yield from _records(source, opcodes, max_bytes)
+        yield from _messages(_records(source, _MESSAGE_OPCODES, MAX_FOREIGN_BYTES))
 
 
 @contextmanager
@@ -216,7 +206,7 @@ class _Readable(Protocol):
 
 
 def _records(
-    source: _CrcReader, opcodes: Collection[int], max_bytes: int, *, excerpts: bool = False
+    source: _CrcReader, opcodes: Collection[int], max_bytes: int
 ) -> Iterator[ForeignRecord]:
     _check_magic(source)
     while True:
@@ -230,10 +220,10 @@ def _records(
             if opcode == Opcode.FOOTER:
                 return _check_magic(source)
             continue
-        if excerpts and opcode == Opcode.MESSAGE and length > max_bytes + _MESSAGE.size:
+        if opcode == Opcode.MESSAGE and length > max_bytes + _MESSAGE.size:
             yield _large_message(source, length, source.record_at)
             continue
-        if excerpts and opcode == Opcode.CHUNK and length >= _HEAD.size:
+        if opcode == Opcode.CHUNK and length >= _HEAD.size:
             head = source.read(_HEAD.size)
             size = _HEAD.unpack(head)[2]
             if max(size, length) > max_bytes:
