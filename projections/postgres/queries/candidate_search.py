@@ -1,4 +1,4 @@
-"""MapCandidates from the live databases, in one round trip to each for crops with embeddings.
+"""Candidates from the live databases, in one round trip to each for crops with embeddings.
 
 Crops without one are answered with observations of Objects of their class, which takes three more.
 
