@@ -39,12 +39,12 @@ def mapfold(tmp_path: Path) -> Commands:
     return Commands.in_folder(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["map", "past_maps", "mapfold"])
+@pytest.mark.parametrize("name", ["python.map", "python.past_maps", "mapfold"])
 def test_examples_of_docstrings_give_what_they_show(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    module = import_module(f"projections.surfaces.python.{name}")
+    module = import_module(f"projections.surfaces.{name}")
     names = {each: getattr(api, each) for each in api.__all__}
     found = doctest.testmod(module, extraglobs=names)
     assert (found.failed, found.attempted > 0) == (0, True)

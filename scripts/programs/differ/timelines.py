@@ -155,11 +155,11 @@ class TimelineWays:
         asked = [self._rng.choice(ends) for _ in range(2 * _THREADS)]
         given = self._settings.otherwise if self._rng.random() < 0.5 else None
         with (
-            api.LogTimeline(self._log, given, cache=self._rng.random() < 0.5) as timeline,
+            api.Timeline(self._log, given, cache=self._rng.random() < 0.5) as timeline,
             ThreadPoolExecutor(_THREADS) as pool,
         ):
             digests = [*pool.map(lambda w: outcome(lambda: timeline.at(w).digest), asked)]
-        with api.LogTimeline(self._log, given, cache=False) as timeline:
+        with api.Timeline(self._log, given, cache=False) as timeline:
             alone = {w: outcome(lambda: timeline.at(w).digest) for w in {*asked}}  # noqa: B023
         self._tally.compare("threads", digests, [alone[end] for end in asked], asked)
 
