@@ -11,7 +11,9 @@ import pytest
 from eventsrc.envelope.ingest import Accepted
 from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
-from projections.localize.evaluate import evaluate, parallel, read_truth
+from projections.localize.evaluate import parallel
+from projections.localize.evaluate.evaluation import evaluate
+from projections.localize.evaluate.truth import read_truth
 from projections.surfaces.cli.evaluate import CameraOptions, FoldSettings
 from projections.surfaces.cli.evaluate import evaluate as command
 from tests.integration.test_evaluate_command import save

@@ -35,7 +35,7 @@ def demo(
     Exit 3 when log, databases and fold do not agree.
     """
     # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
-    from projections.surfaces.demo import run_demo
+    from projections.surfaces.demo.play import run_demo
 
     numbers = run_demo(out, seed, speed, databases.db, databases.vector_db, say)
     if json_:

@@ -8,10 +8,10 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
-from projections.localize.evaluate import evaluate as score
-from projections.localize.evaluate import read_truth
 from projections.localize.evaluate.evaluation import draw_failures
+from projections.localize.evaluate.evaluation import evaluate as score
 from projections.localize.evaluate.questions import DEFAULT_SEED
+from projections.localize.evaluate.truth import read_truth
 from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 
