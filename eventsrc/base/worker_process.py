@@ -175,6 +175,7 @@ def call_in_processes(
         while waiting or running:
             while waiting and len(running) < workers:
                 number = waiting.popleft()
+                idle = [each for each in idle if not each.has_answer()]  # the end of one that died
                 process = idle.pop() if idle else stack.enter_context(_CallingProcess())
                 running[process.connection] = process, number
                 made[number] += 1
@@ -258,16 +259,17 @@ def _made(request: bytes, connection: "Connection") -> bytes:
     try:
         result = pickle.loads(request)(report)  # noqa: S301 (from the process that started this)
         return pickle.dumps(_Answer(reported, is_end=True, result=result))
-    except Exception as error:  # noqa: BLE001 (raised by whoever asked)
+    except BaseException as error:  # noqa: BLE001 (raised by whoever asked)
         return pickle.dumps(_Answer(reported, is_end=True, error=_portable(error)))
 
 
-def _portable(error: Exception) -> Exception:
-    """The error, or one with its text if it cannot be sent."""
+def _portable(error: BaseException) -> Exception:
+    """The error, or one with its text if it cannot be sent or ends programs (SystemExit, a panic of
+    Rust)."""
     import pickle
 
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 (made here)
-    except Exception:  # noqa: BLE001 (whatever its own methods raise)
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
+    if isinstance(error, Exception):
+        with contextlib.suppress(Exception):  # whatever its own methods raise
+            pickle.loads(pickle.dumps(error))  # noqa: S301 (made here)
+            return error
+    return RuntimeError(f"{type(error).__name__}: {error}")

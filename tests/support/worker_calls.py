@@ -29,6 +29,16 @@ def fails(number: int, _: Report) -> NoReturn:
     raise ValueError(f"no {number}")
 
 
+def quits(_: Report) -> NoReturn:
+    """End the program."""
+    raise SystemExit("enough")
+
+
+def process_id(_: Report) -> int:
+    """The worker's id."""
+    return os.getpid()
+
+
 class Unportable(Exception):
     """An error that cannot be unpickled."""
 

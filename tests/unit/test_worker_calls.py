@@ -1,6 +1,7 @@
 """Calls in worker processes: outcomes, killed workers, errors, progress, no process left behind."""
 
 import os
+import signal
 import sys
 from contextlib import closing
 from functools import partial
@@ -15,6 +16,8 @@ from tests.support.worker_calls import (
     fails,
     fails_unportably,
     killed,
+    process_id,
+    quits,
     wait,
 )
 
@@ -41,14 +44,27 @@ def test_progress_is_the_sum_of_what_calls_report() -> None:
 
 @pytest.mark.seconds
 def test_an_error_is_the_outcome_of_its_call_alone() -> None:
-    calls = [partial(fails, 3), fails_unportably, answers_unportably, partial(double, 1)]
+    calls = [partial(fails, 3), fails_unportably, answers_unportably, quits, partial(double, 1)]
     errors = [(each.result, repr(each.error)) for each in call_in_processes(calls, 1)]
     assert errors == [
         (None, "ValueError('no 3')"),
         (None, "RuntimeError('Unportable: 1 and 2')"),
         (None, "TypeError(\"cannot pickle '_thread.lock' object\")"),
+        (None, "RuntimeError('SystemExit: enough')"),
         (2, "None"),
     ]
+
+
+@pytest.mark.seconds
+def test_a_worker_killed_between_two_calls_costs_none_of_them_an_attempt() -> None:
+    ended = call_in_processes([process_id] * 2, 1)
+    first = next(ended).result
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    os.waitid(os.P_PID, first, os.WEXITED | os.WNOWAIT)
+    (second,) = ended
+    assert second.error is None
+    assert second.result != first
 
 
 @pytest.mark.seconds
