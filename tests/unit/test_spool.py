@@ -116,6 +116,13 @@ def test_quarantined_bytes_are_dropped_for_new_envelopes_and_their_reason_stays(
             again.add("run-a", 5, b"x")
 
 
+def test_it_is_full_where_a_wrong_count_promises_quarantined_bytes(spool: Spool) -> None:
+    spool.add("run-a", 0, b"0" * 60)
+    spool._refused_bytes = 60  # as after an error in the middle of `refuse`
+    with pytest.raises(SpoolFull):
+        spool.add("run-a", 1, b"1" * 30)
+
+
 def test_spooled_envelopes_survive_the_process(tmp_path: Path) -> None:
     code = (
         "import os, sys; from pathlib import Path; from eventsrc.record.robot.spool import Spool\n"

@@ -132,12 +132,14 @@ class Spool:
         if self._bytes + size > self.max_bytes:
             return False
         while self._bytes + self._refused_bytes + size > self.max_bytes:
-            oldest, freed = self._db.execute(
+            oldest = self._db.execute(
                 "select seq, length(payload) from refused where payload is not null "
                 "order by seq limit 1"
             ).fetchone()
-            self._db.execute("update refused set payload = null where seq = ?", (oldest,))
-            self._refused_bytes -= int(freed)
+            if oldest is None:  # after an error the count may be wrong; see `_transaction`
+                return False
+            self._db.execute("update refused set payload = null where seq = ?", oldest[:1])
+            self._refused_bytes -= int(oldest[1])
         return True
 
     def after(self, seq: int, limit: int) -> list[Spooled]:
