@@ -19,11 +19,11 @@ of the other.
 """
 
 import contextlib
+import queue
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -62,16 +62,18 @@ class LoadingThread:
     The fold keeps one core busy and PostgreSQL another; without a thread their times would add up.
     Jobs run one after the other on one connection, which nothing else may use before `flush`. At
     most `WAITING_JOBS` wait, so memory stays bounded: `put` blocks while there are more. An error
-    inside drops the jobs that have not begun and calls ``cancel`` to interrupt the one that has.
+    inside drops the jobs that have not begun and calls ``cancel`` to interrupt the one that has. A
+    daemon: where a second Ctrl-C ends the wait for that one, the program does not wait for it.
     """
 
     def __init__(self, cancel: Callable[[], None] = lambda: None) -> None:
         self._cancel = cancel
-        self._thread = ThreadPoolExecutor(1, "loading")
-        self._free = threading.BoundedSemaphore(WAITING_JOBS + 1)
+        self._jobs: queue.Queue[Job | None] = queue.Queue(WAITING_JOBS)
         self._failed: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="loading", daemon=True)
 
     def __enter__(self) -> Self:
+        self._thread.start()
         return self
 
     def __exit__(
@@ -82,31 +84,32 @@ class LoadingThread:
                 self._failed = error
                 self._cancel()
         finally:
-            self._thread.shutdown()
+            self._jobs.put(None)
+            self._thread.join()
 
     def put(self, job: Job) -> None:
         """Run ``job`` in the thread. Raises what an earlier one raised."""
         self._raise()
-        self._free.acquire()
-        self._thread.submit(self._run, job)
+        self._jobs.put(job)
 
     def flush(self) -> None:
         """Wait until all jobs are done. Raises what one raised."""
-        self._thread.submit(lambda: None).result()
+        self._jobs.join()
         self._raise()
 
     def _raise(self) -> None:
         if self._failed is not None:
             raise self._failed
 
-    def _run(self, job: Job) -> None:
-        try:
-            if self._failed is None:
-                job()
-        except BaseException as error:  # noqa: BLE001 - raised by `put` and `flush`
-            self._failed = self._failed or error
-        finally:
-            self._free.release()
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                if self._failed is None:
+                    job()
+            except BaseException as error:  # noqa: BLE001 - raised by `put` and `flush`
+                self._failed = self._failed or error
+            finally:
+                self._jobs.task_done()
 
 
 @contextmanager

@@ -12,11 +12,13 @@ from projections.postgres.shadows import WAITING_JOBS, LoadingThread, short_turn
 def test_jobs_run_in_order_in_one_other_thread() -> None:
     done: list[int] = []
     threads: set[int] = set()
+    daemons: set[bool] = set()
 
     def job(number: int) -> Callable[[], None]:
         def work() -> None:
             done.append(number)
             threads.add(threading.get_ident())
+            daemons.add(threading.current_thread().daemon)
 
         return work
 
@@ -26,6 +28,7 @@ def test_jobs_run_in_order_in_one_other_thread() -> None:
         loading.flush()
         assert done == list(range(20))
     assert len(threads) == 1
+    assert daemons == {True}  # a second Ctrl-C need not wait for a job
     assert threading.get_ident() not in threads
 
 
