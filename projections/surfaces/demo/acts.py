@@ -1,5 +1,6 @@
-"""What the demo does with the map, through the public Python interface: fold the log and note which
-rooms merged, correct it as ``mapfold edit`` does, and ask it where a lost robot is.
+"""What the demo does with the map: fold the log and note which rooms merged, both through the
+public Python interface, correct it as ``mapfold edit`` does, and ask the databases, as ``mapfold
+relocalize`` does, where a lost robot is.
 
 The map knows no rooms; the truth beside a run does. A place's room is the one most of its keyframes
 were truly taken in.
@@ -22,9 +23,11 @@ from eventsrc.record.transport.session import ZenohOptions, open_session
 from projections.edit.make import Stamp, name_place, undo_merge
 from projections.edit.record import MakeCommand, record_command
 from projections.fold.settings import PRESETS
+from projections.localize.relocalize import rank, read_question
 from projections.postgres import RebuildReport, rebuild
 from projections.postgres.connection import Targets
-from projections.surfaces.python import Answer, Map, Settings, Timeline, fold, relocalize
+from projections.postgres.queries.candidate_search import CandidateReader
+from projections.surfaces.python import Answer, Map, Settings, Timeline, fold
 
 SETTINGS: Final = Settings().with_assignments(PRESETS["rooms"])
 """With the default settings the whole house becomes one place."""
@@ -225,8 +228,8 @@ class LostRun:
     everywhere: RunSummary
 
 
-def ask_lost(house: Map, run: SimulatedRun, folder: Path) -> LostRun:
-    """Ask the map where run B is, by questions of a few crops without a pose.
+def ask_lost(targets: Targets, run: SimulatedRun, folder: Path) -> LostRun:
+    """Ask the databases where run B is, by questions of a few crops without a pose.
 
     The first question is chosen regardless of the answer: the picture near the start with the most
     detections, counting at most three; of several the first. It is asked with the most confident of
@@ -236,10 +239,12 @@ def ask_lost(house: Map, run: SimulatedRun, folder: Path) -> LostRun:
     index = _first_question(run)
     best = _most_confident(run.envelopes[index])
     asked = []
-    for count in range(1, len(best) + 1):
-        text = json.dumps({"crops": best[:count]}) + "\n"
-        write_files({folder / f"question-{count}.json": text.encode()})
-        asked.append(_ask(house, run, index, best[:count]))
+    with CandidateReader(targets) as reader:
+        for count in range(1, len(best) + 1):
+            text = json.dumps({"crops": best[:count]}) + "\n"
+            write_files({folder / f"question-{count}.json": text.encode()})
+            asked.append(_ask(reader, run, index, best[:count]))
+        everywhere = _ask_whole_run(reader, run)
     pose, truth = run.true_poses[index], run.truth[index]
     return LostRun(
         run.run_id,
@@ -247,7 +252,7 @@ def ask_lost(house: Map, run: SimulatedRun, folder: Path) -> LostRun:
         truth["room"],
         {"x": pose.x, "y": pose.y, "yaw_rad": pose.yaw_rad},
         tuple(asked),
-        _ask_whole_run(house, run),
+        everywhere,
     )
 
 
@@ -273,20 +278,21 @@ def _most_confident(envelope: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _ask(
-    house: Map, run: SimulatedRun, index: int, crops: Sequence[dict[str, Any]]
+    reader: CandidateReader, run: SimulatedRun, index: int, crops: Sequence[dict[str, Any]]
 ) -> AskedQuestion:
     started = time.monotonic()
-    answer = relocalize(house, {"crops": crops})
+    question = read_question({"crops": crops})
+    answer = rank(question, reader.candidates(question.crops))
     seconds = time.monotonic() - started
     true, pose = run.true_poses[index], answer.pose
     error = None if pose is None else math.dist((pose.x, pose.y), (true.x, true.y))
     return AskedQuestion(tuple(d["class"] for d in crops), answer, error, seconds)
 
 
-def _ask_whole_run(house: Map, run: SimulatedRun) -> RunSummary:
+def _ask_whole_run(reader: CandidateReader, run: SimulatedRun) -> RunSummary:
     started = time.monotonic()
     asked = [
-        _ask(house, run, index, _most_confident(envelope))
+        _ask(reader, run, index, _most_confident(envelope))
         for index, envelope in enumerate(run.envelopes)
         if envelope["detections"]
     ]

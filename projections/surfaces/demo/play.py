@@ -128,7 +128,7 @@ def run_demo(
             corrected = correct(log, targets, explorer, explored)
             clock.show(story.correction_lines(corrected))
         with clock.stage("Run B is lost and asks"):
-            lost = ask_lost(corrected.house, lost_run, folder)
+            lost = ask_lost(targets, lost_run, folder)
             clock.show(story.question_lines(lost, place_rooms(corrected.house, explorer)))
         with clock.stage("The map is drawn"):
             draw_map(
