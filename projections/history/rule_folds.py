@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.machine import gc_paused, usable_processors
-from eventsrc.base.worker_process import ProcessGone, Report, call_in_processes
+from eventsrc.base.worker_process import Called, ProcessGone, Report, call_in_processes
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
@@ -269,18 +269,21 @@ def _in_processes(
         if progress is not None:
             progress(folded, total)
 
-    results: dict[int, list[FoldResult]] = {}
+    ended: dict[int, Called[list[FoldResult]]] = {}
     try:
         for called in call_in_processes(calls, len(calls), report):
-            if called.error is not None:
+            if isinstance(called.error, ProcessGone):
                 raise called.error
-            results[called.number] = called.result or []
+            ended[called.number] = called
     except ProcessGone:
         raise MapfoldError(
             f"{log}: a process that folded it was killed, perhaps for lack of memory; "
             "try fewer --processes"
         ) from None
-    return [results[number] for number in range(len(calls))]
+    for _, called in sorted(ended.items()):  # of several errors always the same one
+        if called.error is not None:
+            raise called.error
+    return [ended[number].result or [] for number in range(len(calls))]
 
 
 def _fold_share(

@@ -56,6 +56,15 @@ def answers_unportably(_: Report) -> threading.Lock:
     return threading.Lock()
 
 
+def fails_in_turn(folder: Path, names: list[str], _: int, report: Report, **__: object) -> NoReturn:
+    """Raise an error of the first name; ``first`` waits until a file ``go`` is in the folder."""
+    report(1)
+    report(2)
+    while names[0] == "first" and not (folder / "go").exists():
+        threading.Event().wait(0.01)
+    raise ValueError(names[0])
+
+
 def wait(folder: Path, report: Report) -> None:
     """Write the process's id, then wait forever."""
     report(7)
