@@ -66,7 +66,7 @@ def test_results_are_in_the_order_of_the_calls_whichever_process_makes_them(
 def test_a_killed_process_costs_nothing_but_time(
     started: list[Any], killed: int, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    take = parallel._CallingProcess.take_answers
+    take = parallel._SharingProcess.take_answers
 
     def killing(self: Any, results: dict[int, Any]) -> None:
         take(self, results)
@@ -75,7 +75,7 @@ def test_a_killed_process_costs_nothing_but_time(
                 process._process.kill()
                 process._process.wait()
 
-    monkeypatch.setattr(parallel._CallingProcess, "take_answers", killing)
+    monkeypatch.setattr(parallel._SharingProcess, "take_answers", killing)
     said: list[str] = []
     assert asked(POWERS, 2, said) == RESULTS
     (line,) = said
@@ -111,7 +111,7 @@ def test_where_no_process_can_be_started_this_one_makes_all_calls(
     def refuse(memory: int) -> None:
         raise error
 
-    monkeypatch.setattr(parallel, "_CallingProcess", {int: refuse, parallel.T: refuse})
+    monkeypatch.setattr(parallel, "_SharingProcess", {int: refuse, parallel.T: refuse})
     assert asked(POWERS, 2) == RESULTS
 
 
@@ -126,14 +126,14 @@ def test_a_process_that_stands_still_is_not_waited_for(
     started: list[Any], monkeypatch: Any
 ) -> None:
     """At the end this process makes the calls that another was given and has not answered."""
-    take = parallel._CallingProcess.take_answers
+    take = parallel._SharingProcess.take_answers
 
     def stopping(self: Any, results: dict[int, Any]) -> None:
         if not results:
             os.kill(self._process.pid, signal.SIGSTOP)
         take(self, results)
 
-    monkeypatch.setattr(parallel._CallingProcess, "take_answers", stopping)
+    monkeypatch.setattr(parallel._SharingProcess, "take_answers", stopping)
     said: list[str] = []
     assert asked(POWERS, 1, said) == RESULTS
     assert len(started[0].given) == parallel._AHEAD

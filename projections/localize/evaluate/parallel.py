@@ -77,8 +77,9 @@ def call_all(
     return [results[number] for number in range(len(calls))]
 
 
-class _CallingProcess(WorkerProcess, Generic[T]):
-    """A process that makes calls; ``given`` are the numbers of its unanswered calls, in order."""
+class _SharingProcess(WorkerProcess, Generic[T]):
+    """A process that makes a share of the calls; ``given`` are the numbers of the unanswered ones,
+    in order."""
 
     def __init__(self, memory: int) -> None:
         super().__init__(_make_calls, memory=memory)
@@ -102,9 +103,9 @@ class _CallingProcess(WorkerProcess, Generic[T]):
 
 def _start(
     calls: Sequence[Callable[[], T]], count: int, stack: ExitStack
-) -> list[_CallingProcess[T]]:
+) -> list[_SharingProcess[T]]:
     """Processes that can make the calls; as many as can be started."""
-    found: list[_CallingProcess[T]] = []
+    found: list[_SharingProcess[T]] = []
     if count <= 0:
         return found
     pickled = pickle.dumps(calls, protocol=pickle.HIGHEST_PROTOCOL)
@@ -115,7 +116,7 @@ def _start(
         with mmap.mmap(memory, len(pickled)) as shared:
             shared[:] = pickled
         while len(found) < count:
-            found.append(stack.enter_context(_CallingProcess[T](memory)))
+            found.append(stack.enter_context(_SharingProcess[T](memory)))
     return found
 
 
