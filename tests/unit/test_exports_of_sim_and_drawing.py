@@ -5,7 +5,6 @@ import sys
 
 import eventsrc.adapters.sim
 import projections.adapters.drawing
-import projections.surfaces.demo
 
 
 def test_sim() -> None:
@@ -22,10 +21,6 @@ def test_sim() -> None:
 def test_drawing() -> None:
     names = ["Floor", "LostRobot", "MergeMark", "Spot", "draw_map", "floor_of", "map_png"]
     assert projections.adapters.drawing.__all__ == names
-
-
-def test_demo() -> None:
-    assert projections.surfaces.demo.__all__ == ["run_demo"]
 
 
 def test_the_command_line_loads_no_matplotlib_until_something_is_drawn() -> None:
