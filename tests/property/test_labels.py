@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.adapters.drawing.canvas import Extent, LabelRequest, place_labels
+from projections.adapters.drawing.sheet import Extent, LabelRequest, place_labels
 
 BOUNDS = (0.0, 0.0, 10.0, 8.0)
 RINGS = (0.1, 0.4, 1.2)

@@ -10,8 +10,8 @@ import pytest
 from eventsrc.adapters.sim import build_house
 from eventsrc.base.errors import MisuseError
 from projections.adapters.drawing import Floor, LostRobot, MergeMark, Spot, draw_map, floor_of
-from projections.adapters.drawing.canvas import Sheet
 from projections.adapters.drawing.map_picture import compose, legend_lines
+from projections.adapters.drawing.sheet import Sheet
 from projections.adapters.palette import place_colour
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
@@ -52,8 +52,8 @@ def _two_places() -> MapView:
     return view
 
 
-def _texts(canvas: Sheet) -> list[str]:
-    return [text.get_text() for text in (*canvas.axes.texts, *canvas.figure.texts)]
+def _texts(sheet: Sheet) -> list[str]:
+    return [text.get_text() for text in (*sheet.axes.texts, *sheet.figure.texts)]
 
 
 def test_the_picture_names_places_objects_and_transitions() -> None:
@@ -116,14 +116,14 @@ def test_objects_of_one_class_in_one_place_share_a_label() -> None:
 
 def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     house = build_house(7)
-    canvas = compose(
+    sheet = compose(
         _two_places(),
         "",
         floor_of(house),
         LostRobot(Spot(2, 1, 0.3), Spot(3, 1), 0.5),
         [MergeMark(5.0, 0.5, "p0 took in p2")],
     )
-    texts = _texts(canvas)
+    texts = _texts(sheet)
     assert {room.name for room in house.plan.rooms} | {"p0 took in p2"} <= set(texts)
     assert any("lost robot" in text for text in texts)
 

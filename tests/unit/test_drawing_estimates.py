@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from matplotlib.patches import Ellipse
 
 from projections.adapters.drawing import Floor, draw_map
-from projections.adapters.drawing.canvas import Sheet
 from projections.adapters.drawing.map_picture import EVIDENCE_LEGEND, LEGEND, compose
+from projections.adapters.drawing.sheet import Sheet
 from projections.adapters.scene import two_sigma
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
@@ -58,32 +58,32 @@ CUP = d.ObjectEstimated(3, 0, 1_000_000, 1_500_000, 90_000_000_000, 0, 40_000_00
 VASE = d.ObjectEstimated(3, 1, 3_000_000, 9_000_000, 10_000_000_000, 0, 40_000_000_000, 2)
 
 
-def texts(canvas: Sheet) -> list[str]:
-    return [text.get_text() for text in (*canvas.axes.texts, *canvas.figure.texts)]
+def texts(sheet: Sheet) -> list[str]:
+    return [text.get_text() for text in (*sheet.axes.texts, *sheet.figure.texts)]
 
 
-def ellipses(canvas: Sheet) -> list[Ellipse]:
-    return [patch for patch in canvas.axes.patches if isinstance(patch, Ellipse)]
+def ellipses(sheet: Sheet) -> list[Ellipse]:
+    return [patch for patch in sheet.axes.patches if isinstance(patch, Ellipse)]
 
 
-def diamonds(canvas: Sheet) -> list[tuple[float, float]]:
+def diamonds(sheet: Sheet) -> list[tuple[float, float]]:
     """Where points that are 15 square points large are, which only objects are."""
     return [
         (float(x), float(y))
-        for found in canvas.axes.collections
+        for found in sheet.axes.collections
         if list(getattr(found, "get_sizes", list)()) == [15]
         for x, y in found.get_offsets()
     ]
 
 
 def test_objects_are_where_they_stand_with_their_ellipse() -> None:
-    canvas = compose(view_with(EVIDENCE, CUP, VASE), "", Floor())
-    assert sorted(diamonds(canvas)) == [(1.0, 1.5), (3.0, 9.0)]
-    shapes = {tuple(e.get_center()): (e.get_width(), e.get_height()) for e in ellipses(canvas)}
+    sheet = compose(view_with(EVIDENCE, CUP, VASE), "", Floor())
+    assert sorted(diamonds(sheet)) == [(1.0, 1.5), (3.0, 9.0)]
+    shapes = {tuple(e.get_center()): (e.get_width(), e.get_height()) for e in ellipses(sheet)}
     assert shapes[1.0, 1.5] == pytest.approx((4 * 0.3, 4 * 0.2))
     assert sorted(shapes[3.0, 9.0]) == pytest.approx([4 * 0.1, 4 * 0.2])
-    assert all(e.get_linestyle() in ("-", "solid") for e in ellipses(canvas))
-    assert EVIDENCE_LEGEND in texts(canvas)
+    assert all(e.get_linestyle() in ("-", "solid") for e in ellipses(sheet))
+    assert EVIDENCE_LEGEND in texts(sheet)
 
 
 def test_the_canvas_reaches_to_objects_beyond_the_drive() -> None:
@@ -94,24 +94,24 @@ def test_the_canvas_reaches_to_objects_beyond_the_drive() -> None:
 
 
 def test_objects_without_an_estimate_are_where_the_robot_saw_them_from() -> None:
-    canvas = compose(view_with(EVIDENCE), "", Floor())
-    assert diamonds(canvas) == [(2.0, 0.0), (2.0, 0.0)]
-    assert ellipses(canvas) == []
+    sheet = compose(view_with(EVIDENCE), "", Floor())
+    assert diamonds(sheet) == [(2.0, 0.0), (2.0, 0.0)]
+    assert ellipses(sheet) == []
 
 
 def test_the_picture_of_the_page_has_no_ellipse() -> None:
-    canvas = compose(view_with(Settings()), "", Floor())
-    assert diamonds(canvas) == [(2.0, 0.0), (2.0, 0.0)]
-    assert ellipses(canvas) == []
-    assert LEGEND in texts(canvas)
-    assert EVIDENCE_LEGEND not in texts(canvas)
+    sheet = compose(view_with(Settings()), "", Floor())
+    assert diamonds(sheet) == [(2.0, 0.0), (2.0, 0.0)]
+    assert ellipses(sheet) == []
+    assert LEGEND in texts(sheet)
+    assert EVIDENCE_LEGEND not in texts(sheet)
 
 
 def test_a_missing_object_is_hollow_and_dashed() -> None:
     view = view_with(EVIDENCE, CUP, VASE, d.ObjectMissing(4, 1, 0, 6, True))
-    canvas = compose(view, "", Floor())
-    assert {"cup", "vase (missing)"} <= set(texts(canvas))
-    lines = {tuple(e.get_center()): e.get_linestyle() for e in ellipses(canvas)}
+    sheet = compose(view, "", Floor())
+    assert {"cup", "vase (missing)"} <= set(texts(sheet))
+    lines = {tuple(e.get_center()): e.get_linestyle() for e in ellipses(sheet)}
     assert lines[1.0, 1.5] in ("-", "solid")
     assert lines[3.0, 9.0] not in ("-", "solid")
     found = compose(view_with(EVIDENCE, CUP, VASE), "", Floor())
@@ -148,8 +148,8 @@ def test_the_name_of_a_room_keeps_clear_of_the_objects_in_its_corners() -> None:
 
 def test_an_arrow_leads_from_where_a_moved_object_stood() -> None:
     moved = d.ObjectRelocated(4, 0, 0, 3_000_000, -500_000, 1_000_000, 1_500_000)
-    canvas = compose(view_with(EVIDENCE, CUP, moved), "", Floor())
-    arrows = [a for a in canvas.axes.texts if getattr(a, "arrow_patch", None) is not None]
+    sheet = compose(view_with(EVIDENCE, CUP, moved), "", Floor())
+    arrows = [a for a in sheet.axes.texts if getattr(a, "arrow_patch", None) is not None]
     assert [(a.xy, a.get_position()) for a in arrows] == [((1.0, 1.5), (3.0, -0.5))]
 
 

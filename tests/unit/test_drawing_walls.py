@@ -25,17 +25,17 @@ def _view(given: OccupancyMap, *spots: tuple[float, float]) -> MapView:
 
 def _drawn_walls(view: MapView) -> tuple[np.ndarray, np.ndarray]:
     """Where the middles of the drawn wall cells lie, in metres, shape (n, 2); the area drawn."""
-    canvas = compose(view, "t", Floor())
-    _, walls = canvas.axes.get_images()
+    sheet = compose(view, "t", Floor())
+    _, walls = sheet.axes.get_images()
     alpha = np.asarray(walls.get_array())[..., 3]
     height, width = alpha.shape
     _, right, _, top = walls.get_extent()
     rows, columns = np.nonzero(alpha)
     middles = np.stack([(columns + 0.5) * right / width, (rows + 0.5) * top / height], axis=1)
     pixels = walls.get_transform().transform(middles)
-    bounds = np.array([*canvas.axes.get_xlim(), *canvas.axes.get_ylim()])
-    assert np.allclose(bounds[[0, 2, 1, 3]], canvas.bounds)
-    return canvas.axes.transData.inverted().transform(pixels), bounds
+    bounds = np.array([*sheet.axes.get_xlim(), *sheet.axes.get_ylim()])
+    assert np.allclose(bounds[[0, 2, 1, 3]], sheet.bounds)
+    return sheet.axes.transData.inverted().transform(pixels), bounds
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, -2.0])

@@ -3,7 +3,7 @@
 A place's region is all that lies within ``REACH_M`` of one of its keyframes and nearer to it than
 to any other place's. It is drawn from a raster of distances to the place's keyframes. Beyond
 ``REACH_M`` a point is in no region, so distances are computed only around each keyframe, and the
-cost of a keyframe does not grow with the canvas. They are exact up to two steps beyond, because the
+cost of a keyframe does not grow with the sheet. They are exact up to two steps beyond, because the
 outline is drawn between points on both of its sides.
 
 Of an occupancy map, which may be far larger than the drive, the part near the drive is drawn: floor
@@ -27,7 +27,7 @@ from projections.adapters.scene import Box, Floor, drives, place_spots
 from projections.fold.occupancy import pooled
 from projections.map.view import MapView
 
-from .canvas import Extent, Sheet
+from .sheet import Extent, Sheet
 
 REACH_M = 0.55
 """A place's region reaches this far around its keyframes."""
@@ -49,7 +49,7 @@ class DistancePatch:
 
 
 class Raster:
-    """Points ``xs`` by ``ys`` of the canvas ``bounds`` (x0, y0, x1, y1), in metres."""
+    """Points ``xs`` by ``ys`` of the sheet ``bounds`` (x0, y0, x1, y1), in metres."""
 
     def __init__(self, bounds: tuple[float, float, float, float]) -> None:
         x0, y0, x1, y1 = bounds
@@ -88,28 +88,28 @@ def _within(span: slice, whole: slice) -> slice:
     return slice(span.start - whole.start, span.stop - whole.start)
 
 
-def draw_floor(canvas: Sheet, floor: Floor) -> None:
+def draw_floor(sheet: Sheet, floor: Floor) -> None:
     """Rooms and the furniture in them."""
     for _, box in floor.rooms:
-        _rectangle(canvas, box, palette.FLOOR, palette.FLOOR, 0)
+        _rectangle(sheet, box, palette.FLOOR, palette.FLOOR, 0)
     for box in floor.furniture:
-        _rectangle(canvas, box, palette.FURNITURE, palette.FURNITURE_EDGE, 1)
+        _rectangle(sheet, box, palette.FURNITURE, palette.FURNITURE_EDGE, 1)
 
 
-def draw_walls(canvas: Sheet, floor: Floor) -> None:
+def draw_walls(sheet: Sheet, floor: Floor) -> None:
     """Walls, on top of the regions, which may reach a little through them."""
     for x0, y0, x1, y1 in floor.walls:
-        canvas.axes.plot(
+        sheet.axes.plot(
             (x0, x1), (y0, y1), color=palette.WALL, lw=3.2, solid_capstyle="projecting", zorder=7
         )
         if x0 == x1 or y0 == y1:  # labels keep off upright walls; a slanted one's box is too large
             half_x, half_y = abs(x1 - x0) / 2 + 0.03, abs(y1 - y0) / 2 + 0.03
-            canvas.occupied.append(Extent((x0 + x1) / 2, (y0 + y1) / 2, half_x, half_y))
+            sheet.occupied.append(Extent((x0 + x1) / 2, (y0 + y1) / 2, half_x, half_y))
 
 
-def draw_regions(canvas: Sheet, view: MapView) -> None:
+def draw_regions(sheet: Sheet, view: MapView) -> None:
     """Each place's region, in its colour."""
-    raster = Raster(canvas.bounds)
+    raster = Raster(sheet.bounds)
     patches = {p: raster.distances(spots) for p, spots in place_spots(view).items()}
     nearest = np.full((len(raster.ys), len(raster.xs)), np.inf)
     for patch in patches.values():
@@ -121,28 +121,28 @@ def draw_regions(canvas: Sheet, view: MapView) -> None:
         field = np.where(patch.field <= nearest[patch.rows, patch.columns], patch.field, FAR_M)
         grid = raster.xs[patch.columns], raster.ys[patch.rows], field
         colours = [palette.place_colour(place)]
-        canvas.axes.contourf(*grid, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
-        canvas.axes.contour(*grid, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
+        sheet.axes.contourf(*grid, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
+        sheet.axes.contour(*grid, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
 
 
-def draw_drives(canvas: Sheet, view: MapView) -> None:
+def draw_drives(sheet: Sheet, view: MapView) -> None:
     """Each run's path, where it started, and its keyframes in their places' colours."""
     for _, spots in drives(view):
         if spots:
             xs, ys = zip(*spots, strict=True)
-            canvas.axes.plot(xs, ys, color=palette.FAINT, lw=0.8, alpha=0.8, zorder=4)
-            canvas.axes.plot(xs[0], ys[0], marker="s", markersize=5.5, color=palette.INK, zorder=6)
+            sheet.axes.plot(xs, ys, color=palette.FAINT, lw=0.8, alpha=0.8, zorder=4)
+            sheet.axes.plot(xs[0], ys[0], marker="s", markersize=5.5, color=palette.INK, zorder=6)
     for place, spots in place_spots(view).items():
         if spots:
             xs, ys = zip(*spots, strict=True)
-            canvas.axes.scatter(xs, ys, s=6, color=palette.place_colour(place), zorder=5)
+            sheet.axes.scatter(xs, ys, s=6, color=palette.place_colour(place), zorder=5)
 
 
-def _rectangle(canvas: Sheet, box: Box, fill: str, edge: str, zorder: int) -> None:
+def _rectangle(sheet: Sheet, box: Box, fill: str, edge: str, zorder: int) -> None:
     x0, y0, x1, y1 = box
     patch = Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=fill, edgecolor=edge, lw=0.6)
     patch.set_zorder(zorder)
-    canvas.axes.add_patch(patch)
+    sheet.axes.add_patch(patch)
 
 
 _AROUND_M: Final = 1.5
@@ -171,12 +171,12 @@ def wall_spots(view: MapView) -> Spots:
     return [(corner[0], corner[1]) for corner in (at.min(axis=0).tolist(), at.max(axis=0).tolist())]
 
 
-def draw_map_walls(canvas: Sheet, view: MapView) -> None:
+def draw_map_walls(sheet: Sheet, view: MapView) -> None:
     """Free floor below the places' regions, walls above them."""
     if view.map is None:
         return
     given = view.map.map
-    first_row, first_column, cells = _visible(given, canvas.bounds)
+    first_row, first_column, cells = _visible(given, sheet.bounds)
     if not cells.size:
         return
     step = max(1, -(-max(cells.shape) // _MOST_CELLS))
@@ -184,10 +184,10 @@ def draw_map_walls(canvas: Sheet, view: MapView) -> None:
     height, width = (side * step for side in walls.shape)
     x, y, yaw = given.origin
     placed = Affine2D().translate(first_column, first_row).scale(given.resolution)
-    to_map = placed.rotate(yaw).translate(x, y) + canvas.axes.transData
-    limits = canvas.axes.get_xlim(), canvas.axes.get_ylim()
+    to_map = placed.rotate(yaw).translate(x, y) + sheet.axes.transData
+    limits = sheet.axes.get_xlim(), sheet.axes.get_ylim()
     for drawn, colour, zorder in ((free & ~walls, palette.FLOOR, 0.5), (walls, palette.WALL, 7)):
-        image = canvas.axes.imshow(
+        image = sheet.axes.imshow(
             _image(drawn, colour),
             extent=(0.0, width, 0.0, height),
             origin="lower",
@@ -195,8 +195,8 @@ def draw_map_walls(canvas: Sheet, view: MapView) -> None:
             zorder=zorder,
         )
         image.set_transform(to_map)
-    canvas.axes.set_xlim(limits[0])
-    canvas.axes.set_ylim(limits[1])
+    sheet.axes.set_xlim(limits[0])
+    sheet.axes.set_ylim(limits[1])
 
 
 def _is_wall(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:

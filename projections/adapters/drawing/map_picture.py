@@ -29,16 +29,16 @@ from .base_layers import (
     draw_walls,
     wall_spots,
 )
-from .canvas import Extent, Sheet, check_suffix, new_canvas
 from .overlays import (
     DOT_M,
     draw_adjacency,
-    draw_bridges,
     draw_lost,
+    draw_merge_marks,
     draw_objects,
     draw_place_names,
     draw_room_names,
 )
+from .sheet import Extent, Sheet, check_suffix, new_sheet
 
 LEGEND = (
     "■ start    ● keyframe, in its place's colour    ◆ object, drawn where the robot saw it from "
@@ -58,7 +58,7 @@ def draw_map(
     title: str,
     floor: Floor | None = None,
     lost: LostRobot | None = None,
-    bridges: Sequence[MergeMark] = (),
+    marks: Sequence[MergeMark] = (),
     min_observations: int = 2,
 ) -> None:
     """Draw ``view`` to ``out``, in the format of its suffix (.png, .svg, .pdf).
@@ -67,7 +67,7 @@ def draw_map(
     cannot be written or has another suffix.
     """
     check_suffix(out)
-    compose(view, title, floor or Floor(), lost, bridges, min_observations).save(out)
+    compose(view, title, floor or Floor(), lost, marks, min_observations).save(out)
 
 
 def map_png(view: MapView, title: str) -> bytes:
@@ -80,33 +80,33 @@ def compose(
     title: str,
     floor: Floor,
     lost: LostRobot | None = None,
-    bridges: Sequence[MergeMark] = (),
+    marks: Sequence[MergeMark] = (),
     min_observations: int = 2,
 ) -> Sheet:
-    """The finished canvas, not yet written to a file."""
+    """The finished sheet, not yet written to a file."""
     by_evidence = view.settings.fusion == "evidence"
     shown = shown_objects(view, min_observations) if by_evidence else []
     standing = [found.spot for found in shown]
-    canvas = new_canvas(view, floor, [*standing, *wall_spots(view)])
-    draw_floor(canvas, floor)
-    draw_map_walls(canvas, view)
-    draw_regions(canvas, view)
-    draw_drives(canvas, view)
-    draw_walls(canvas, floor)
-    draw_adjacency(canvas, view)
-    draw_place_names(canvas, view)
+    sheet = new_sheet(view, floor, [*standing, *wall_spots(view)])
+    draw_floor(sheet, floor)
+    draw_map_walls(sheet, view)
+    draw_regions(sheet, view)
+    draw_drives(sheet, view)
+    draw_walls(sheet, floor)
+    draw_adjacency(sheet, view)
+    draw_place_names(sheet, view)
     if lost is not None:
-        draw_lost(canvas, lost)
-    canvas.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
-    draw_room_names(canvas, floor)
-    draw_bridges(canvas, bridges)
-    left_out = draw_objects(canvas, view, min_observations)
-    canvas.header(0, title, 14, palette.INK, "bold")
-    canvas.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
-    legend = legend_lines(lost, bridges, left_out, by_evidence=by_evidence)
+        draw_lost(sheet, lost)
+    sheet.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
+    draw_room_names(sheet, floor)
+    draw_merge_marks(sheet, marks)
+    left_out = draw_objects(sheet, view, min_observations)
+    sheet.header(0, title, 14, palette.INK, "bold")
+    sheet.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
+    legend = legend_lines(lost, marks, left_out, by_evidence=by_evidence)
     for line, text in enumerate(legend):
-        canvas.footer(line, text, palette.SMALL_PRINT)
-    return canvas
+        sheet.footer(line, text, palette.SMALL_PRINT)
+    return sheet
 
 
 def _numbers(view: MapView, min_observations: int) -> str:
@@ -123,14 +123,14 @@ def _numbers(view: MapView, min_observations: int) -> str:
 
 def legend_lines(
     lost: LostRobot | None,
-    bridges: Sequence[MergeMark],
+    marks: Sequence[MergeMark],
     left_out: int,
     *,
     by_evidence: bool = False,
 ) -> list[str]:
     """The lines below the map; ``left_out`` counts labels without room."""
     parts = []
-    if bridges:
+    if marks:
         parts.append("○ keyframe that made two places one")
     if lost is not None:
         parts.append("✖ lost robot, true spot    ● (red) where the map puts it")
@@ -139,7 +139,7 @@ def legend_lines(
     return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
 
 
-def bridges_of(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[MergeMark]:
+def merge_marks(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[MergeMark]:
     """One mark for each merge, at the position of its bridging keyframe."""
     names = place_names(view)
     marks: list[MergeMark] = []

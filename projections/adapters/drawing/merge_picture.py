@@ -22,8 +22,8 @@ from projections.store.history import History
 from projections.store.history_records import Merge
 
 from .base_layers import draw_drives, draw_regions
-from .canvas import HALO, Bounds, Sheet, check_suffix
 from .overlays import draw_place_names
+from .sheet import HALO, Bounds, Sheet, check_suffix
 
 _PANEL_IN = 6.5
 _SMALL_PANEL_IN = 4.2

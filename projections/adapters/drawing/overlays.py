@@ -1,6 +1,6 @@
 """The upper layers of a picture: adjacency, names, objects, merges, the lost robot.
 
-Each text adds its box to the canvas' occupied ones, so that later and less important labels keep
+Each text adds its box to the sheet's occupied ones, so that later and less important labels keep
 clear of it.
 """
 
@@ -22,7 +22,7 @@ from projections.adapters.scene import (
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 
-from .canvas import HALO, Extent, LabelRequest, Sheet, place_labels
+from .sheet import HALO, Extent, LabelRequest, Sheet, place_labels
 
 DOT_M = 0.04
 """Half the size of the box that an object's dot occupies."""
@@ -32,7 +32,7 @@ _WIDE_M = 2.0
 _RINGS_M = tuple(0.07 * 1.28**step for step in range(15))
 
 
-def draw_adjacency(canvas: Sheet, view: MapView) -> None:
+def draw_adjacency(sheet: Sheet, view: MapView) -> None:
     """A dashed line between neighbouring places and the number of transitions on it; a dotted one
     between two floors."""
     for a, b, count in view.edges():
@@ -40,37 +40,35 @@ def draw_adjacency(canvas: Sheet, view: MapView) -> None:
         start, end = (one.centroid_x, one.centroid_y), (other.centroid_x, other.centroid_y)
         dashes = (1, 2) if view.is_between_floors(a, b) else (4, 3)
         line = {"arrowstyle": "-", "color": palette.INK, "lw": 1.2, "ls": (0, dashes)}
-        canvas.axes.annotate("", end, start, zorder=8, arrowprops=line)
+        sheet.axes.annotate("", end, start, zorder=8, arrowprops=line)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         _draw_badge(
-            canvas, middle, str(count), 7.5, ("white", palette.INK, palette.INK), "round,pad=0.2"
+            sheet, middle, str(count), 7.5, ("white", palette.INK, palette.INK), "round,pad=0.2"
         )
 
 
-def draw_place_names(canvas: Sheet, view: MapView) -> None:
+def draw_place_names(sheet: Sheet, view: MapView) -> None:
     """Each place's name on its centroid, in its colour, with its likely type."""
     names = place_badges(view)
     for ordinal, place in view.places.items():
         centroid = place.centroid_x, place.centroid_y
         colours = palette.place_colour(ordinal), "white", "white"
-        _draw_badge(
-            canvas, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9"
-        )
+        _draw_badge(sheet, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9")
 
 
-def draw_room_names(canvas: Sheet, floor: Floor) -> None:
+def draw_room_names(sheet: Sheet, floor: Floor) -> None:
     """Each room's name, in the first of its corners that is free."""
-    height = 12 * canvas.unit
+    height = 12 * sheet.unit
     for name, (x0, y0, x1, y1) in floor.rooms:
-        width = 5.6 * len(name) * canvas.unit
+        width = 5.6 * len(name) * sheet.unit
         dx, dy = width / 2 + 0.14, height / 2 + 0.1
         corners = ((x0 + dx, y1 - dy), (x1 - dx, y1 - dy), (x0 + dx, y0 + dy), (x1 - dx, y0 + dy))
         boxes = [Extent(x, y, width / 2, height / 2) for x, y in corners]
-        free = [box for box in boxes if not any(box.overlaps(other) for other in canvas.occupied)]
-        _draw_text(canvas, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
+        free = [box for box in boxes if not any(box.overlaps(other) for other in sheet.occupied)]
+        _draw_text(sheet, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
 
 
-def draw_objects(canvas: Sheet, view: MapView, min_observations: int) -> int:
+def draw_objects(sheet: Sheet, view: MapView, min_observations: int) -> int:
     """A dot for each object, a label for each group; returns how many labels did not fit."""
     groups = object_groups(view, min_observations)
     for group in groups:
@@ -78,22 +76,22 @@ def draw_objects(canvas: Sheet, view: MapView, min_observations: int) -> int:
         xs, ys = zip(*(member.spot for member in group.members), strict=True)
         face, edge = ("white", colour) if group.missing else (colour, "white")
         width = 1.1 if group.missing else 0.6
-        canvas.axes.scatter(
+        sheet.axes.scatter(
             xs, ys, s=15, marker="D", facecolor=face, edgecolor=edge, lw=width, zorder=10
         )
         for member in group.members:
-            _draw_evidence(canvas, member, colour)
-        canvas.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in zip(xs, ys, strict=True))
-    requests = [_label_request(canvas, group.label, group.spot) for group in groups]
-    boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
+            _draw_evidence(sheet, member, colour)
+        sheet.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in zip(xs, ys, strict=True))
+    requests = [_label_request(sheet, group.label, group.spot) for group in groups]
+    boxes = place_labels(requests, sheet.occupied, sheet.bounds, _RINGS_M)
     for group, box in zip(groups, boxes, strict=True):
         if box is not None:
-            _draw_leader(canvas, group.spot, box)
-            _draw_text(canvas, box, group.label, _LABEL_PT, palette.INK)
+            _draw_leader(sheet, group.spot, box)
+            _draw_text(sheet, box, group.label, _LABEL_PT, palette.INK)
     return sum(box is None for box in boxes)
 
 
-def _draw_evidence(canvas: Sheet, found: ObjectRecord, colour: str) -> None:
+def _draw_evidence(sheet: Sheet, found: ObjectRecord, colour: str) -> None:
     """An estimate's ellipse, and an arrow from where the object stood before it was moved."""
     if found.estimate is not None:
         width, height, angle = two_sigma(found.estimate)
@@ -102,60 +100,60 @@ def _draw_evidence(canvas: Sheet, found: ObjectRecord, colour: str) -> None:
             lw=0.7, alpha=0.75 if width < _WIDE_M else 0.35, zorder=8,
             linestyle="-" if found.missing_in is None else (0, (3, 2)),
         )  # fmt: skip
-        canvas.axes.add_patch(ellipse)
+        sheet.axes.add_patch(ellipse)
     if found.relocations:
         last = found.relocations[-1]
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 0.9, "ls": ":"}
         start = last.from_x_um / 1e6, last.from_y_um / 1e6
-        canvas.axes.annotate("", found.spot, start, zorder=9, arrowprops=arrow)
+        sheet.axes.annotate("", found.spot, start, zorder=9, arrowprops=arrow)
 
 
-def draw_bridges(canvas: Sheet, bridges: Sequence[MergeMark]) -> None:
+def draw_merge_marks(sheet: Sheet, marks: Sequence[MergeMark]) -> None:
     """A ring around each keyframe that merged places, with its text."""
-    for bridge in bridges:
-        canvas.axes.scatter(
-            [bridge.x], [bridge.y], s=110, marker="o", facecolor="none", edgecolor=palette.BRIDGE,
+    for mark in marks:
+        sheet.axes.scatter(
+            [mark.x], [mark.y], s=110, marker="o", facecolor="none", edgecolor=palette.BRIDGE,
             lw=1.8, zorder=13,
         )  # fmt: skip
-        canvas.occupied.append(Extent(bridge.x, bridge.y, 0.12, 0.12))
-    requests = [_label_request(canvas, bridge.text, (bridge.x, bridge.y)) for bridge in bridges]
-    boxes = place_labels(requests, canvas.occupied, canvas.bounds, _RINGS_M)
-    for bridge, box in zip(bridges, boxes, strict=True):
+        sheet.occupied.append(Extent(mark.x, mark.y, 0.12, 0.12))
+    requests = [_label_request(sheet, mark.text, (mark.x, mark.y)) for mark in marks]
+    boxes = place_labels(requests, sheet.occupied, sheet.bounds, _RINGS_M)
+    for mark, box in zip(marks, boxes, strict=True):
         if box is not None:
-            _draw_leader(canvas, (bridge.x, bridge.y), box)
-            _draw_text(canvas, box, bridge.text, _LABEL_PT, palette.BRIDGE, weight="bold")
+            _draw_leader(sheet, (mark.x, mark.y), box)
+            _draw_text(sheet, box, mark.text, _LABEL_PT, palette.BRIDGE, weight="bold")
 
 
-def draw_lost(canvas: Sheet, lost: LostRobot) -> None:
+def draw_lost(sheet: Sheet, lost: LostRobot) -> None:
     """The lost robot's true position, the estimate with its spread, and a line between them."""
     truth, estimate = lost.truth, lost.estimate
     if estimate is not None:
         if lost.spread_m:
             circle = Circle((estimate.x, estimate.y), lost.spread_m, alpha=0.12, zorder=12)
             circle.set_color(palette.ESTIMATE)
-            canvas.axes.add_patch(circle)
-        canvas.axes.plot(
+            sheet.axes.add_patch(circle)
+        sheet.axes.plot(
             (truth.x, estimate.x), (truth.y, estimate.y), color=palette.ESTIMATE, lw=1.6, ls=":",
             zorder=13,
         )  # fmt: skip
-        _draw_robot(canvas, estimate, palette.ESTIMATE, "o")
-    _draw_robot(canvas, truth, palette.TRUTH, "X")
+        _draw_robot(sheet, estimate, palette.ESTIMATE, "o")
+    _draw_robot(sheet, truth, palette.TRUTH, "X")
 
 
-def _draw_robot(canvas: Sheet, spot: Spot, colour: str, marker: str) -> None:
-    canvas.axes.scatter(
+def _draw_robot(sheet: Sheet, spot: Spot, colour: str, marker: str) -> None:
+    sheet.axes.scatter(
         [spot.x], [spot.y], s=120, marker=marker, facecolor=colour, edgecolor="white", lw=1.2,
         zorder=16,
     )  # fmt: skip
     if spot.yaw_rad is not None:
         tip = spot.x + 0.5 * math.cos(spot.yaw_rad), spot.y + 0.5 * math.sin(spot.yaw_rad)
         arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.8}
-        canvas.axes.annotate("", tip, (spot.x, spot.y), zorder=15, arrowprops=arrow)
-    canvas.occupied.append(Extent(spot.x, spot.y, 0.15, 0.15))
+        sheet.axes.annotate("", tip, (spot.x, spot.y), zorder=15, arrowprops=arrow)
+    sheet.occupied.append(Extent(spot.x, spot.y, 0.15, 0.15))
 
 
 def _draw_badge(
-    canvas: Sheet,
+    sheet: Sheet,
     spot: tuple[float, float],
     text: str,
     size: float,
@@ -165,27 +163,27 @@ def _draw_badge(
     """Text in a box; ``colours`` are the box's fill and edge, and the text's."""
     fill, edge, ink = colours
     box = {"boxstyle": shape, "facecolor": fill, "edgecolor": edge, "lw": 0.9}
-    canvas.axes.text(
+    sheet.axes.text(
         *spot, text, ha="center", va="center", size=size, weight="bold", color=ink, bbox=box,
         zorder=14,
     )  # fmt: skip
     lines = text.splitlines()
-    half_width = (0.36 * size * max(map(len, lines), default=0) + 0.45 * size) * canvas.unit
-    half_height = (0.25 + 0.65 * max(len(lines), 1)) * size * canvas.unit
-    canvas.occupied.append(Extent(*spot, half_width, half_height))
+    half_width = (0.36 * size * max(map(len, lines), default=0) + 0.45 * size) * sheet.unit
+    half_height = (0.25 + 0.65 * max(len(lines), 1)) * size * sheet.unit
+    sheet.occupied.append(Extent(*spot, half_width, half_height))
 
 
-def _label_request(canvas: Sheet, text: str, spot: tuple[float, float]) -> LabelRequest:
-    width = (0.58 * len(text) * _LABEL_PT + 3) * canvas.unit
-    return LabelRequest(*spot, width, 1.3 * _LABEL_PT * canvas.unit)
+def _label_request(sheet: Sheet, text: str, spot: tuple[float, float]) -> LabelRequest:
+    width = (0.58 * len(text) * _LABEL_PT + 3) * sheet.unit
+    return LabelRequest(*spot, width, 1.3 * _LABEL_PT * sheet.unit)
 
 
-def _draw_leader(canvas: Sheet, anchor: tuple[float, float], box: Extent) -> None:
-    canvas.axes.plot((anchor[0], box.x), (anchor[1], box.y), color=palette.LEADER, lw=0.5, zorder=9)
+def _draw_leader(sheet: Sheet, anchor: tuple[float, float], box: Extent) -> None:
+    sheet.axes.plot((anchor[0], box.x), (anchor[1], box.y), color=palette.LEADER, lw=0.5, zorder=9)
 
 
 def _draw_text(
-    canvas: Sheet,
+    sheet: Sheet,
     box: Extent,
     text: str,
     size: float,
@@ -194,8 +192,8 @@ def _draw_text(
     style: str = "normal",
     weight: str = "normal",
 ) -> None:
-    canvas.occupied.append(box)
-    canvas.axes.text(
+    sheet.occupied.append(box)
+    sheet.axes.text(
         box.x, box.y, text, ha="center", va="center", size=size, color=colour, style=style,
         weight=weight, path_effects=HALO, zorder=11,
     )  # fmt: skip

@@ -93,7 +93,7 @@ def draw(
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.adapters.sim import build_house
     from projections.adapters.drawing import draw_map, floor_of
-    from projections.adapters.drawing.map_picture import bridges_of
+    from projections.adapters.drawing.map_picture import merge_marks
     from projections.map.one_floor import view_of_floor
 
     check_picture(out)
@@ -113,7 +113,7 @@ def draw(
             out,
             title=title,
             floor=None if house is None else floor_of(build_house(house)),
-            bridges=bridges_of(view, merged) if merges else (),
+            marks=merge_marks(view, merged) if merges else (),
             min_observations=min_observations,
         )
     places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")

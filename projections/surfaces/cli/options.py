@@ -231,6 +231,6 @@ def check_picture(out: Path | None) -> None:
     """Raises MisuseError when ``out`` is not the name of a picture; None is no picture."""
     if out is None:
         return
-    from projections.adapters.drawing.canvas import check_suffix
+    from projections.adapters.drawing.sheet import check_suffix
 
     check_suffix(out)

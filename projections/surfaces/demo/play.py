@@ -26,7 +26,7 @@ from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections import history
 from projections.adapters.drawing import LostRobot, MergeMark, Spot, draw_map, floor_of
-from projections.adapters.drawing.map_picture import bridges_of
+from projections.adapters.drawing.map_picture import merge_marks
 from projections.postgres import rebuild
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, open_targets
@@ -137,7 +137,7 @@ def run_demo(
                 title=f"House {seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
                 floor=floor_of(house),
                 lost=_where_lost(lost),
-                bridges=_bridges(log, corrected.house),
+                marks=_merge_marks(log, corrected.house),
             )
             clock.show([f"   {folder / 'map.png'}"])
     print_line(f"{clock.total:.1f} s in all. Go on with it:")
@@ -197,11 +197,11 @@ def _where_lost(lost: LostRun) -> LostRobot:
     return LostRobot(truth, Spot(pose.x, pose.y, pose.yaw), pose.spread_m)
 
 
-def _bridges(log: Path, house: Map) -> list[MergeMark]:
+def _merge_marks(log: Path, house: Map) -> list[MergeMark]:
     """A mark for each merge that the corrections left."""
     with history.LogTimeline(log, lambda _: SETTINGS, cache=False) as timeline:
         merges = timeline.knowing(timeline.end).merges(timeline.end)
-    return bridges_of(house.view, merges)
+    return merge_marks(house.view, merges)
 
 
 def _next_commands(

@@ -220,8 +220,8 @@ def check_suffix(out: Path) -> None:
         raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
 
 
-def new_canvas(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] = ()) -> Sheet:
-    """An empty canvas that fits every pose of ``view``, wall of ``floor`` and spot of ``more``."""
+def new_sheet(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] = ()) -> Sheet:
+    """An empty sheet that fits every pose of ``view``, wall of ``floor`` and spot of ``more``."""
     x0, y0, x1, y1 = bounds = _bounds(view, floor, more)
     height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
