@@ -90,12 +90,12 @@ def send_command(
         try:
             if good:
                 return Recorded.decode(payload)
-            refused = Declined.decode(payload)
+            declined = Declined.decode(payload)
         except ValidationError:
             continue  # Zenoh's own error, such as a timeout
-        if refused.newer is not None:
-            raise NewerCommand(refused.newer)
-        raise CommandRefused(refused.error)
+        if declined.newer is not None:
+            raise NewerCommand(declined.newer)
+        raise CommandRefused(declined.error)
     raise NoAnswer("no recorder answered")
 
 

@@ -57,16 +57,16 @@ def _name_place(
     *,
     place: PlaceArgument,
     name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Give a place a name."""
-    new.record(lambda current, stamp: make.name_place(current, stamp, place, name))
+    options.record(lambda current, stamp: make.name_place(current, stamp, place, name))
 
 
 @edit.command("keep-apart")
-def _keep_apart(*, first: PlaceArgument, second: OtherPlaceArgument, new: EditOptions) -> None:
+def _keep_apart(*, first: PlaceArgument, second: OtherPlaceArgument, options: EditOptions) -> None:
     """Keep two places apart, whatever joins them later."""
-    new.record(lambda current, stamp: make.keep_apart(current, stamp, first, second))
+    options.record(lambda current, stamp: make.keep_apart(current, stamp, first, second))
 
 
 @edit.command("undo-merge")
@@ -78,65 +78,67 @@ def _undo_merge(
             metavar="OFFSET", help="The offset of the merge, from `mapfold merges LOG`."
         ),
     ],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Undo a merge of places and keep them apart."""
-    new.record(lambda current, stamp: make.undo_merge(current, stamp, offset))
+    options.record(lambda current, stamp: make.undo_merge(current, stamp, offset))
 
 
 @edit.command("join")
-def _join(*, first: PlaceArgument, second: OtherPlaceArgument, new: EditOptions) -> None:
+def _join(*, first: PlaceArgument, second: OtherPlaceArgument, options: EditOptions) -> None:
     """Join two places into one.
 
     Also where no chain of poses connects them.
     """
-    new.record(lambda current, stamp: make.join(current, stamp, first, second))
+    options.record(lambda current, stamp: make.join(current, stamp, first, second))
 
 
 @edit.command("same-object")
-def _same_object(*, first: ObjectArgument, second: OtherObjectArgument, new: EditOptions) -> None:
+def _same_object(
+    *, first: ObjectArgument, second: OtherObjectArgument, options: EditOptions
+) -> None:
     """Fuse two objects into one."""
-    new.record(lambda current, stamp: make.same_object(current, stamp, first, second))
+    options.record(lambda current, stamp: make.same_object(current, stamp, first, second))
 
 
 @edit.command("different-objects")
 def _different_objects(
-    *, first: ObjectArgument, second: OtherObjectArgument, new: EditOptions
+    *, first: ObjectArgument, second: OtherObjectArgument, options: EditOptions
 ) -> None:
     """Keep two objects apart.
 
     Two observations of one object, named by their det_ids, become two objects.
     """
-    new.record(lambda current, stamp: make.different_objects(current, stamp, first, second))
+    options.record(lambda current, stamp: make.different_objects(current, stamp, first, second))
 
 
 @edit.command("drop-object")
 def _drop_object(
     *,
     thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Drop an object from the map, with the observations that it has now.
 
     The log keeps them.
     """
-    new.record(lambda current, stamp: make.drop_object(current, stamp, thing))
+    options.record(lambda current, stamp: make.drop_object(current, stamp, thing))
 
 
 @edit.command("drop-detection")
 def _drop_detection(
     *,
     det_ids: Annotated[list[str], typer.Argument(metavar="DET_ID", help="The det_id of each.")],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Drop detections from the map; the log keeps them."""
-    new.record(lambda current, stamp: make.drop_detection(current, stamp, det_ids))
+    options.record(lambda current, stamp: make.drop_detection(current, stamp, det_ids))
 
 
 @edit.command("forget-run")
-def _forget_run(*, run: RunArgument, new: EditOptions) -> None:
+def _forget_run(*, run: RunArgument, options: EditOptions) -> None:
     """Drop all keyframes of a run from the map; the log keeps them."""
-    new.record(lambda current, stamp: make.forget_run(current, stamp, run))
+    options.record(lambda current, stamp: make.forget_run(current, stamp, run))
 
 
 @edit.command("forget-keyframes")
@@ -146,10 +148,10 @@ def _forget_keyframes(
     span: Annotated[
         str, typer.Argument(metavar="A..B", help="From keyframe A to keyframe B, both included.")
     ],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Drop some keyframes of a run from the map; the log keeps them."""
-    new.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
+    options.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
 
 
 _FromOption = Annotated[
@@ -190,7 +192,7 @@ def _correct_poses(
             "--ignore-missing", help="Skip poses of keyframes that the run does not have."
         ),
     ] = False,
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Correct the poses of a run.
 
@@ -203,10 +205,10 @@ def _correct_poses(
     span = Span(_keyframe_id(first), _keyframe_id(last))
     if file is None:
         moves = (dx or 0.0, dy or 0.0, dyaw or 0.0)
-        new.record(lambda current, stamp: by_transform(current, stamp, run, span, *moves))
+        options.record(lambda current, stamp: by_transform(current, stamp, run, span, *moves))
         return
     trajectory = read_trajectory(file)
-    new.record(
+    options.record(
         lambda current, stamp: by_trajectory(
             current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
         )
@@ -224,7 +226,7 @@ def _use_settings(
         Path | None, typer.Argument(metavar="FILE", help="JSON object of settings.")
     ] = None,
     chosen: AssignedSettings,
-    new: NewCommand,
+    options: NewCommand,
 ) -> None:
     """Change the settings of the map.
 
@@ -238,20 +240,20 @@ def _use_settings(
             current, stamp, settings_from(file, chosen.assignments, current.corrections)
         )
 
-    new.record(command)
+    options.record(command)
 
 
 @edit.command("undo")
 def _undo(
     *,
     undone: Annotated[str, typer.Argument(metavar="COMMAND_ID", help="From `mapfold edits LOG`.")],
-    new: EditOptions,
+    options: EditOptions,
 ) -> None:
     """Undo a command, as if it had never been given.
 
     Undoing an undo restores the command.
     """
-    new.record(lambda current, stamp: make.undo(current, stamp, undone))
+    options.record(lambda current, stamp: make.undo(current, stamp, undone))
 
 
 def edits(

@@ -52,17 +52,17 @@ def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """When ``condition`` became true between ``from`` (default: the start) and ``to`` (default: the
     end); with ``scan=1`` every turn."""
     expression = Expression(text_of(query, "condition"))
-    moment = AskedPoint.of(shown, query, "to")
+    asked = AskedPoint.of(shown, query, "to")
     start = shown.point(text_of(query, "from", "0"))
     scan = query.get("scan", "") in _FLAGS
-    found = moment.known.bisect(expression, start, moment.end, scan=scan)
+    found = asked.known.bisect(expression, start, asked.end, scan=scan)
     words = [expression.source, *(["--from", str(start)] if start else [])]
-    words += ["--to", str(moment.end), *(["--scan"] if scan else [])]
+    words += ["--to", str(asked.end), *(["--scan"] if scan else [])]
     return {
         **found.document(),
-        "known_at": moment.known_at,
+        "known_at": asked.known_at,
         "lines": visible_lines(search_text(found, most=MOST_LINES)).splitlines(),
-        "command": moment.command("bisect", *words, asked_at=False),
+        "command": asked.command("bisect", *words, asked_at=False),
     }
 
 
@@ -95,12 +95,12 @@ def _error(text: str) -> dict[str, Any] | None:
 
 def merges_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """Every merge of places up to W."""
-    moment = AskedPoint.of(shown, query)
-    known = moment.known
+    asked = AskedPoint.of(shown, query)
+    known = asked.known
     return {
-        **moment.document(),
-        "merges": [merge_document(known.history, merge) for merge in known.merges(moment.end)],
-        "command": moment.command("merges"),
+        **asked.document(),
+        "merges": [merge_document(known.history, merge) for merge in known.merges(asked.end)],
+        "command": asked.command("merges"),
     }
 
 

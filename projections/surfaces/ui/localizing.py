@@ -154,8 +154,8 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
     ``ask_at`` is a W at which the map lacks the keyframe's run, or the keyframe.
     """
-    moment = AskedPoint.of(shown, query)
-    history = moment.known.history
+    asked = AskedPoint.of(shown, query)
+    history = asked.known.history
     ordinal = keyframe_of(history, query)
     keyframe = history.keyframes[ordinal]
     pose = keyframe.pose
@@ -163,19 +163,19 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     event = next(shown.reader.read(keyframe.offset, Offset(keyframe.offset + 1)), None)
     if event is None:
         raise MapfoldError(f"the event at offset {keyframe.offset} cannot be read any more")
-    asked = _crops_of(event)
-    if not asked:
+    crops = _crops_of(event)
+    if not crops:
         raise QuestionError(
             f"keyframe {keyframe.run_id}:{keyframe.keyframe_id} has no detection with an embedding,"
             " so nothing can be asked with it; pick another"
         )
     return {
-        **moment.document(),
+        **asked.document(),
         "keyframe": f"{keyframe.run_id}/{keyframe.keyframe_id}",
         "number": ordinal,
         "offset": keyframe.offset,
         "ask_at": first or keyframe.offset,
-        "question": {"crops": asked},
+        "question": {"crops": crops},
         "truth": None if pose is None else [pose.x_m, pose.y_m, pose.yaw_rad],
         "command": command_line(
             shown.opened, "log", "cat", "--from", str(keyframe.offset), "--to",

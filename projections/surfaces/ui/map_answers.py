@@ -64,13 +64,13 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``, and
     the type of each place."""
-    moment = AskedPoint.of(shown, query)
-    view = moment.known.at(moment.end)
+    asked = AskedPoint.of(shown, query)
+    view = asked.known.at(asked.end)
     return {
-        **moment.document(),
+        **asked.document(),
         "digest": map_digest(view),
         "types": _types(view),
-        "command": moment.command("state", "--digest"),
+        "command": asked.command("state", "--digest"),
     }
 
 

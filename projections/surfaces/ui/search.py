@@ -32,56 +32,56 @@ def _rank(name: str, wanted: str) -> int:
     return 1 if tail == wanted or name.startswith(wanted) else 2 if name.endswith(wanted) else 3
 
 
-def _places(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
-    for place in moment.known.history.places:
+def _places(asked: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
+    for place in asked.known.history.places:
         called = [named.name for named in place.names if named.name is not None]
         yield {
             "kind": "place", "id": place.place_id, "number": place.formed.place,
-            "offset": place.formed.offset, "stands": place.stands(moment.end),
-            "text": place.name(moment.end) or "", "names": [place.place_id, *called],
+            "offset": place.formed.offset, "stands": place.stands(asked.end),
+            "text": place.name(asked.end) or "", "names": [place.place_id, *called],
         }  # fmt: skip
 
 
-def _objects(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
-    history = moment.known.history
-    classes = {each.ordinal: each.class_name for each in history.objects_at(moment.end)}
+def _objects(asked: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
+    history = asked.known.history
+    classes = {each.ordinal: each.class_name for each in history.objects_at(asked.end)}
     for each in history.objects:
         class_name = classes.get(each.found.object, each.found.class_name)
         yield {
             "kind": "object", "id": each.object_id, "number": each.found.object,
-            "offset": each.found.offset, "stands": each.stands(moment.end), "text": class_name,
+            "offset": each.found.offset, "stands": each.stands(asked.end), "text": class_name,
             "names": [each.object_id, class_name],
         }  # fmt: skip
 
 
-def _runs(moment: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
-    for number, seen in enumerate(moment.known.history.runs):
+def _runs(asked: AskedPoint, _: str) -> Iterator[dict[str, Any]]:
+    for number, seen in enumerate(asked.known.history.runs):
         yield {
             "kind": "run", "id": seen[0].run_id, "number": number, "offset": seen[0].offset,
-            "stands": seen[0].offset < moment.end, "text": "", "names": [seen[0].run_id],
+            "stands": seen[0].offset < asked.end, "text": "", "names": [seen[0].run_id],
         }  # fmt: skip
 
 
-def _keyframes(moment: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
-    history = moment.known.history
+def _keyframes(asked: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
+    history = asked.known.history
     for keyframe in history.keyframes:
         name = keyframe_name(history, keyframe.keyframe)
         if wanted in name.casefold():
             yield {
                 "kind": "keyframe", "id": f"{keyframe.run_id}/{keyframe.keyframe_id}",
                 "number": keyframe.keyframe, "offset": keyframe.offset,
-                "stands": keyframe.offset < moment.end, "text": "", "names": [name],
+                "stands": keyframe.offset < asked.end, "text": "", "names": [name],
             }  # fmt: skip
 
 
-def _detections(moment: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
-    history = moment.known.history
-    for seen in moment.known.latest.observations:
+def _detections(asked: AskedPoint, wanted: str) -> Iterator[dict[str, Any]]:
+    history = asked.known.history
+    for seen in asked.known.latest.observations:
         if wanted in seen.det_id.casefold():
             keyframe = history.keyframes[seen.keyframe]
             yield {
                 "kind": "detection", "id": seen.det_id, "number": seen.keyframe,
-                "offset": keyframe.offset, "stands": keyframe.offset < moment.end,
+                "offset": keyframe.offset, "stands": keyframe.offset < asked.end,
                 "text": f"{seen.class_name}, {keyframe_name(history, keyframe.keyframe)}",
                 "names": [seen.det_id],
             }  # fmt: skip
@@ -102,13 +102,13 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The things whose name matches ``q``, best first: equal names, then names that begin or end
     with it, then names that contain it. Letter case does not matter. ``kind`` asks for one kind
     only."""
-    moment = AskedPoint.of(shown, query)
+    asked = AskedPoint.of(shown, query)
     wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
     kind = query.get("kind")
     if kind is not None and kind not in _SOURCES:
         raise QuestionError(f"kind is {kind[:40]!r}; give one of {', '.join(_SOURCES)}")
     sources = _SOURCES.values() if kind is None else [_SOURCES[kind]]
-    named = chain.from_iterable(source(moment, wanted) for source in sources) if wanted else ()
+    named = chain.from_iterable(source(asked, wanted) for source in sources) if wanted else ()
     found: list[_Found] = []
     for number, each in enumerate(named):
         rank = min(_rank(name.casefold(), wanted) for name in each.pop("names"))
@@ -116,7 +116,7 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
             found.append((rank, number, each))
     found.sort(key=lambda item: item[:2])
     return {
-        **moment.document(),
+        **asked.document(),
         "found": [each for _, _, each in found[:MOST_FOUND]],
         "more": max(0, len(found) - MOST_FOUND),
     }
@@ -124,16 +124,16 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 def keyframe_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """A keyframe with its detections; `keyframe_of` reads which."""
-    moment = AskedPoint.of(shown, query)
-    history = moment.known.history
+    asked = AskedPoint.of(shown, query)
+    history = asked.known.history
     ordinal = keyframe_of(history, query)
-    view = moment.known.latest
+    view = asked.known.latest
     record = view.keyframes[ordinal]
     pose = record.pose
-    place = history.place_at(ordinal, moment.end)
-    objects = _objects_of(history, record.observations, moment.end)
+    place = history.place_at(ordinal, asked.end)
+    objects = _objects_of(history, record.observations, asked.end)
     return {
-        **moment.document(),
+        **asked.document(),
         "number": ordinal,
         "run_id": record.run_id,
         "keyframe_id": record.keyframe_id,

@@ -39,25 +39,25 @@ from .requests import AskedPoint, text_of
 _MOST_CORE: Final = 2000
 
 
-def merge_answer(moment: AskedPoint, name: str) -> dict[str, Any]:
+def merge_answer(asked: AskedPoint, name: str) -> dict[str, Any]:
     """The merges of the event at an offset: of places, refused, and of objects."""
     if not (name.isascii() and name.isdecimal() and len(name) <= 18):
         raise QuestionError(f"merge:{name[:40]} names no offset; write merge:348")
-    offset, known = int(name), moment.known
+    offset, known = int(name), asked.known
     history = known.history
-    merges = [m for m in known.merges(moment.end) if m.cause.offset == offset]
-    refusals = [r for r in known.refusals(moment.end) if r.cause.offset == offset]
-    objects = [m for m in known.object_merges(moment.end) if m.offset == offset]
+    merges = [m for m in known.merges(asked.end) if m.cause.offset == offset]
+    refusals = [r for r in known.refusals(asked.end) if r.cause.offset == offset]
+    objects = [m for m in known.object_merges(asked.end) if m.offset == offset]
     if not merges and not refusals and not objects:
-        every = {m.cause.offset for m in known.merges(moment.end)}
-        every |= {r.cause.offset for r in known.refusals(moment.end)}
-        every |= {m.offset for m in known.object_merges(moment.end)}
+        every = {m.cause.offset for m in known.merges(asked.end)}
+        every |= {r.cause.offset for r in known.refusals(asked.end)}
+        every |= {m.offset for m in known.object_merges(asked.end)}
         raise NoSuchThing("merge at offset", name, map(str, sorted(every)))
     texts = [merge_text(history, merge) for merge in merges]
     texts += [refusals_text(history, refusals)] if refusals else []
     texts += [object_merges_text(history, objects)] if objects else []
     return {
-        **moment.document(),
+        **asked.document(),
         "kind": "merge",
         "subject": name,
         "summary": visible(_summary(history, merges) or _other_summary(history, refusals, objects)),
@@ -75,14 +75,14 @@ def merge_answer(moment: AskedPoint, name: str) -> dict[str, Any]:
         "merges": [_bridge(history, merge) for merge in merges],
         "refused": [refusal_document(history, refusal) for refusal in refusals],
         "objects": [object_merge_document(history, merge) for merge in objects],
-        "command": _command(moment, merges, refused=bool(refusals)),
+        "command": _command(asked, merges, refused=bool(refusals)),
     }
 
 
-def _command(moment: AskedPoint, merges: list[Merge], *, refused: bool) -> str:
+def _command(asked: AskedPoint, merges: list[Merge], *, refused: bool) -> str:
     if merges:
-        return moment.command("merges", "--show", merges[0].number)
-    return moment.command("merges", "--refused" if refused else "--objects")
+        return asked.command("merges", "--show", merges[0].number)
+    return asked.command("merges", "--refused" if refused else "--objects")
 
 
 def _summary(history: History, merges: list[Merge]) -> str:
@@ -176,39 +176,39 @@ _MOST_REFS: Final = 50
 def why_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The explanation of the thing named by ``what``; with ``other``, a keyframe, since when both
     keyframes are in one place."""
-    moment = AskedPoint.of(shown, query)
+    asked = AskedPoint.of(shown, query)
     what = text_of(query, "what")
     kind, _, name = what.partition(":")
     if kind == "merge":
-        return merge_answer(moment, name)
+        return merge_answer(asked, name)
     if not name or kind not in ("place", "object", "keyframe"):
         raise QuestionError(f"what is {what[:80]!r}; write {_KINDS}")
-    return _keyframe_story(moment, name) if kind == "keyframe" else _story_of(moment, name)
+    return _keyframe_story(asked, name) if kind == "keyframe" else _story_of(asked, name)
 
 
-def _story_of(moment: AskedPoint, name: str) -> dict[str, Any]:
-    found = moment.known.why(name, moment.end)
-    return _document(moment, found, moment.command("why", name))
+def _story_of(asked: AskedPoint, name: str) -> dict[str, Any]:
+    found = asked.known.why(name, asked.end)
+    return _document(asked, found, asked.command("why", name))
 
 
-def _keyframe_story(moment: AskedPoint, name: str) -> dict[str, Any]:
-    history = moment.known.history
+def _keyframe_story(asked: AskedPoint, name: str) -> dict[str, Any]:
+    history = asked.known.history
     names = [_keyframe_name(name)]
-    if other := moment.query.get("other"):
+    if other := asked.query.get("other"):
         names.append(_keyframe_name(other.removeprefix("keyframe:")))
-        found = moment.known.why_same(names[0], names[1], moment.end)
-        return _document(moment, found, moment.command("why", "--same", *names))
+        found = asked.known.why_same(names[0], names[1], asked.end)
+        return _document(asked, found, asked.command("why", "--same", *names))
     keyframe = find_keyframe(history, names[0])
-    found = explain_same_place(history, keyframe, keyframe, moment.end)
-    place = history.place_at(keyframe, moment.end)
+    found = explain_same_place(history, keyframe, keyframe, asked.end)
+    place = history.place_at(keyframe, asked.end)
     came = history.keyframes[keyframe]
     where = "it has no pose" if came.pose is None else "it is in no place: noise"
     if place is not None:
         where = f"in {history.places[place].place_id}"
-    if came.offset >= moment.end:
+    if came.offset >= asked.end:
         where = f"not there yet: it comes at offset {came.offset}"
-    command = moment.command("why", "--same", names[0], names[0])
-    return _document(moment, found, command) | {
+    command = asked.command("why", "--same", names[0], names[0])
+    return _document(asked, found, command) | {
         "kind": "keyframe",
         "subject": names[0],
         "summary": visible(where),
@@ -226,15 +226,15 @@ def _line(entry: Entry) -> str:
     return visible(f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}")
 
 
-def _document(moment: AskedPoint, found: Explanation, command: str) -> dict[str, Any]:
+def _document(asked: AskedPoint, found: Explanation, command: str) -> dict[str, Any]:
     return {
-        **moment.document(),
+        **asked.document(),
         "kind": found.kind,
         "subject": found.subject,
         "summary": visible(found.summary),
         "facts": found.facts,
         "lines": visible_lines(explanation_text(found)).splitlines(),
-        "steps": [_step(moment.known.history, entry) for entry in found.entries],
+        "steps": [_step(asked.known.history, entry) for entry in found.entries],
         "command": command,
     }
 
