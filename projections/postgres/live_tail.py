@@ -1,9 +1,9 @@
 """Tail: keep the databases at the end of the log while it grows.
 
-A tail folds the log from its start, or from the last snapshot below the checkpoints (the fold's
-state is kept nowhere else), and writes to each sink from its own checkpoint on. One pass
-(`TailPass`) lasts until the tail is stopped, unless the server loses commits that it had not
-flushed: then the fold is ahead of the databases, and another pass begins at their checkpoints.
+A tail folds the log from its start, or from the latest fold that was kept below the checkpoints,
+and writes to each sink from its own checkpoint on. One pass (`TailPass`) lasts until the tail is
+stopped, unless the server loses commits that it had not flushed: then the fold is ahead of the
+databases, and another pass begins at their checkpoints.
 
 A batch has the events since the last one: a single event at a low rate, up to `BATCH_EVENTS` when
 the tail is behind. Each batch is one transaction per database (`batch_writer`).
@@ -78,9 +78,9 @@ def tail(
     ``settings`` may depend on the log's corrections. ``on_batch`` is called after each commit;
     ``on_fold`` is called with the number of events folded and written, at the start of a pass and
     after each batch of it; ``on_refold`` with the number of events that a refold has folded and the
-    number that it has to fold. ``note`` is called with a message for each snapshot that could not
-    be used or kept, which costs time and nothing else, and for a command that cannot be applied;
-    with ``once`` such a command is raised (ImpossibleCommand). Raises ProjectionMismatch when the
+    number that it has to fold. ``note`` is called with a message for each kept history that could
+    not be used or written, which costs only time, and for a command that cannot be applied; with
+    ``once`` such a command is raised (ImpossibleCommand). Raises ProjectionMismatch when the
     databases were made from another log or with other settings, ProjectionBusy, CheckpointMoved.
     """
     plan = TailPlan(
@@ -107,8 +107,7 @@ def tail(
         except LostCommits:
             report.restarts += 1
             # The database may be unreachable while the next pass begins.
-            at = describe_target(targets.graph_url)
-            outage = Backoff(at, plan)
+            outage = Backoff(describe_target(targets.graph_url), plan)
 
 
 def _run_pass(
@@ -264,12 +263,14 @@ class TailPass:
 
     def _resumed(self, reader: LogReader) -> LiveFold:
         """The fold to go on with, from the latest one that was kept below the checkpoints."""
-        of = reader, self.current.settings, self.current.corrections
-        self.recorder = HistoryRecorder(*of, TimelineCache(*of, self.plan.note), None)
-        found = resumed_under_other_names(*of, self._fold_limit(), self.plan.note)
+        settings, corrections = self.current.settings, self.current.corrections
+        limit, note = self._fold_limit(), self.plan.note
+        cache = TimelineCache(reader, settings, corrections, note)
+        self.recorder = HistoryRecorder(reader, settings, corrections, cache, None)
+        found = resumed_under_other_names(reader, settings, corrections, limit, note)
         is_kept = found is None or found[0].next_offset <= self.recorder.end  # under these names
         writer = self.recorder.writer() if is_kept else None
-        return LiveFold(of[1], found, corrections=of[2], reader=reader, writer=writer)
+        return LiveFold(settings, found, corrections=corrections, reader=reader, writer=writer)
 
     def _keep(self, fold: LiveFold) -> None:
         """Keep the history that was folded, to go on from the next time."""
@@ -339,8 +340,7 @@ class TailPass:
         # Now, as `status` reports a sink as followed while its lock is held.
         checkpoints.write_refold(connection, sink.name, None, None)
         self.checkpoints[sink.name] = found
-        letters = checkpoints.parked(connection, sink.name)
-        self.parked.update((letter.offset, letter) for letter in letters)
+        self.parked |= {x.offset: x for x in checkpoints.parked(connection, sink.name)}
         return has_fault
 
     def _fold(self, fold: LiveFold, batch: list[Event]) -> Event | None:

@@ -6,7 +6,7 @@ have the same methods.
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from eventsrc.base.text import advised
 from projections.fold.map_errors import QuestionError
@@ -25,7 +25,7 @@ from .graph_reads import (
     read_place_graph,
 )
 
-_OBJECT_FIELDS = (
+_RECORD_FIELDS: Final = (
     "object_id",
     "class_name",
     "mean_x",
@@ -33,15 +33,17 @@ _OBJECT_FIELDS = (
     "obs_count",
     "first_seen",
     "last_seen",
-    "est_x",
-    "est_y",
-    "est_sigma_m",
+)
+_ESTIMATE_FIELDS: Final = ("est_x", "est_y", "est_sigma_m")
+_OBJECT_FIELDS: Final = (
+    *_RECORD_FIELDS,
+    *_ESTIMATE_FIELDS,
     "missing",
     "place_id",
     "place_name",
 )
 """The fields of an Object in the order of the documents; agtype has its own order. Only an Object
-in a Place that has a name has the last one; only fusion by evidence gives ``est_x`` to
+in a Place that has a name has the last one; only fusion by evidence gives the estimate and
 ``missing``."""
 
 
@@ -105,8 +107,8 @@ class FoldedMap:
         by_evidence = view.settings.fusion == "evidence"
         place_name = None if thing.place is None else view.all_places[thing.place].name
         return {
-            **{name: getattr(thing, name) for name in _OBJECT_FIELDS[:7]},
-            **{name: getattr(at, name) for name in _OBJECT_FIELDS[7:10] if by_evidence and at},
+            **{name: getattr(thing, name) for name in _RECORD_FIELDS},
+            **{name: getattr(at, name) for name in _ESTIMATE_FIELDS if by_evidence and at},
             **({"missing": thing.missing_in is not None} if by_evidence else {}),
             "place_id": view.place_id(thing.place),
             **({} if place_name is None else {"place_name": place_name}),
