@@ -4,7 +4,7 @@ Log id: a segment copied from another log has a valid name and valid checksums. 
 and a writer does not start. Recovery keeps those of one log, chosen by `own_log_id`, and sets the
 others aside.
 
-Signatures: what is folded from a log (its gap ledger, snapshots of the map) is kept with the
+Signatures: what is folded from a log (its gap ledger, its history) is kept with the
 signatures of the segments it was folded from, and used only while these are the same. A growing
 segment may be sealed and new ones may be added behind; any other change means that events were lost
 (deletion, recovery, a power cut before a sync, a log put back from a copy and recorded on).

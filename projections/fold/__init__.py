@@ -10,7 +10,7 @@ from collections.abc import MutableSequence
 from typing import Any, Literal, TypeAlias
 
 State: TypeAlias = dict[str, Any]
-"""The state of a reducer in a snapshot: named values, each a numpy array or JSON."""
+"""The state of a reducer as it is kept: named values, each a numpy array or JSON."""
 
 
 def packed(typecode: Literal["i", "q"], content: bytes = b"") -> MutableSequence[Any]:

@@ -64,7 +64,7 @@ class Slopes:
                 self._count += 1.0
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {"sums": [self._sum, self._count]}
 
     def load(self, state: State) -> None:

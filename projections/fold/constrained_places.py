@@ -90,7 +90,7 @@ class ConstrainedPlaces(Places):
         return self._fold_changes(offset, point, self.core_index.insert(x_um, y_um))
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return super().dump() | self._anchors.dump()
 
     def load(self, state: State) -> None:

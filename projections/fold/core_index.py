@@ -200,7 +200,7 @@ class CoreIndex:
         return around
 
     def dump(self) -> State:
-        """The whole state, for a snapshot. Cells come in the order in which they were made."""
+        """The whole state, to be kept. Cells come in the order in which they were made."""
         cells = self._cells.values()
         sparse = [point for cell in cells for point in cell.cores]
         return {

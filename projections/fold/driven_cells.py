@@ -154,7 +154,7 @@ class DrivenCells:
         return (x - at[0]) ** 2 + (y - at[1]) ** 2 <= 4 * self._cell2
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         links = [(a, b) for a, linked in enumerate(self._linked) for b in sorted(linked) if a < b]
         near = [(a, b, d) for a, each in enumerate(self.near) for b, d in sorted(each.items())]
         return {

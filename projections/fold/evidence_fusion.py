@@ -100,7 +100,7 @@ class Relocations:
         return pairs
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {
             "newcomers": [[ordinal, *newcomer] for ordinal, newcomer in self._newcomers.items()],
             "classes": [[name, list(own)] for name, own in sorted(self._by_class.items())],
@@ -251,7 +251,7 @@ class EvidenceFusion:
         return [*_in_order(fused, {pair.new for pair in moved}), *left]
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return (
             prefixed("landmarks", self._objects.dump())
             | prefixed("presence", self._presence.dump())

@@ -239,7 +239,7 @@ class EvidenceObjects:
         return [*deltas, self._index.estimated(offset, moved.old)]
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return (
             {"object_of": sorted(map(list, self._object_of.items()))}
             | prefixed("scale", self._scale.dump())

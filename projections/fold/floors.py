@@ -130,12 +130,12 @@ class Floors:
         return [_put_back(delta) for delta in deltas] if len(self.ordinals) > 1 else deltas
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         homes = [[kind, group, floor] for (kind, group), floor in sorted(self._homes.items())]
         return {"names": self.names, "homes": homes}
 
     def load(self, state: State) -> None:
-        """Restore the state of `dump`; older snapshots have nothing, their maps one floor."""
+        """Restore the state of `dump`; an empty one is of a map of one floor."""
         self.names = list(state.get("names", [None]))
         self.ordinals = {name: ordinal for ordinal, name in enumerate(self.names)}
         self._homes = {(kind, group): floor for kind, group, floor in state.get("homes", ())}
@@ -225,7 +225,7 @@ class CurrentMap:
         return partial(_moved_back, way, *shift_um(number)) if number else way
 
     def dump(self) -> State:
-        """The whole state, for a snapshot; nothing without a map."""
+        """The whole state, to be kept; nothing without a map."""
         parts: State = {}
         for number, (offset, given) in enumerate(
             (delta.offset, delta.map) for delta in self.given.values()

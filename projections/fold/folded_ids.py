@@ -127,7 +127,7 @@ class FoldedIds:
         return bytes(self.digests[start : start + _DIGEST_BYTES])
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {
             "runs": list(self.runs),
             "started": self.started,

@@ -174,7 +174,7 @@ class LookScale:
         self._recent = both[-_RECENT:]
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {
             "sum": self._sum,
             "count": self._count,

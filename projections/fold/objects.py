@@ -153,7 +153,7 @@ class Objects:
         return self._near.get((class_name, x_um // radius_um, y_um // radius_um), ())
 
     def dump(self) -> State:
-        """The whole state, for a snapshot; the sums of vectors are one matrix, a row an Object."""
+        """The whole state, to be kept; the sums of vectors are one matrix, a row an Object."""
         objects = self.sums
         return {
             "classes": [o.class_name for o in objects],
@@ -292,7 +292,7 @@ class ConstrainedObjects(Objects):
         return deltas
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return super().dump() | {
             "other_classes": [[*o.other_classes] for o in self.sums],
             "object_of": sorted(map(list, self._object_of.items())),

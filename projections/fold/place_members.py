@@ -114,7 +114,7 @@ class PlaceMembers:
         )
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         absorbed_by, places = self.survivors.absorbed_by, range(len(self.member_counts))
         return {
             "joined": np.array(self.joined, np.int32),
@@ -210,7 +210,7 @@ class PlaceAnchors:
         return is_news
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {
             "anchors": [[keyframe, group] for keyframe, group in self._group_of.items()],
             "refused": sorted(map(list, self._refused)),

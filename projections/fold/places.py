@@ -75,7 +75,7 @@ class Places(PlaceMembers):
         return deltas
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return super().dump() | prefixed("crowd", self.core_index.dump())
 
     def load(self, state: State) -> None:

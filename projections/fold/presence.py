@@ -155,7 +155,7 @@ class Presence:
         self.attendance[old] = known
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         known = sorted(self.attendance.items())
         vantages = sorted(
             (*c, o, *at) for c, near in self._vantages.items() for o, at in near.items()

@@ -202,7 +202,7 @@ class LocatedIn:
         return moved
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {
             "votes": [list(map(list, votes.items())) for votes in self.votes],
             "located": self.located,
@@ -346,7 +346,7 @@ class Adjacency:
         return linked
 
     def dump(self) -> State:
-        """The whole state, for a snapshot: the same for equal states, however they were reached."""
+        """The whole state, to be kept: the same for equal states, however they were reached."""
         columns = {run: [*placed.items()] for run, placed in sorted(self.placed.items())}
         edges = [[a, b, n] for a, row in self.edges.items() for b, n in row.items() if a < b]
         return {

@@ -121,7 +121,7 @@ class Rooms(PlaceMembers):
         return deltas
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         own = {
             "cell_places": list(self._cell_places),
             "cell_founders": list(self._founders),

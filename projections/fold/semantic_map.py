@@ -231,7 +231,7 @@ class SemanticMap:
         return self.names.changes_from(older, offset)
 
     def dump(self) -> State:
-        """Everything but the settings, the corrections and names, for a snapshot."""
+        """Everything but the settings, the corrections and names, to be kept."""
         space = self.space
         own = {
             "next_offset": self.next_offset,

@@ -105,7 +105,7 @@ class ClassHeights:
         sums[4] += sign * elevation * elevation
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {"sums": sorted([name, *sums] for name, sums in self._sums.items())}
 
     def load(self, state: State) -> None:
@@ -245,7 +245,7 @@ class ThingIndex:
             self._sorted.pop(around, None)
 
     def dump(self) -> State:
-        """The whole state, for a snapshot. The looks are one matrix, a row for each exemplar."""
+        """The whole state, to be kept. The looks are one matrix, a row for each exemplar."""
         alive = [(o, thing) for o, thing in enumerate(self._things) if thing is not None]
         things = [thing for _, thing in alive]
         looks = [thing.looks[[mark[ROW] for mark in thing.marks]] for thing in things]

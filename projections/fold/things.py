@@ -151,7 +151,7 @@ class LabelCounts:
         return (self._counts.get(label, 0) + 1.0) / (self._total + 10.0)
 
     def dump(self) -> State:
-        """The whole state, for a snapshot."""
+        """The whole state, to be kept."""
         return {"counts": sorted(map(list, self._counts.items()))}
 
     def load(self, state: State) -> None:

@@ -1,4 +1,4 @@
-"""Public names of sim, drawing and demo; matplotlib is not imported before something is drawn."""
+"""Public names of sim and drawing; matplotlib is not imported before something is drawn."""
 
 import subprocess
 import sys
