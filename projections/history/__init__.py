@@ -12,7 +12,7 @@ from .bisect import Search, Turn
 from .conditions import Expression, ExpressionError
 from .diff import Difference
 from .explanation import Entry, Explanation
-from .known import KnownHistory, Progress
+from .known_history import KnownHistory, Progress
 from .names import NoSuchThing
 from .timeline import LogTimeline
 from .whatif import WhatIf, what_if

@@ -29,7 +29,7 @@ from projections.store.history import History
 from projections.store.history_records import Cause, PlaceHistory, RefusedMerge
 
 from .explanation import Entry
-from .merges import refusal_reason
+from .merge_reasons import refusal_reason
 from .names import log_name, place_name
 
 _NS = 1e9

@@ -18,7 +18,7 @@ from projections.fold.exact import mean_m
 from projections.store.history import NEVER, History
 from projections.store.history_records import Cause, Merge, PlaceHistory, count_before
 
-from .merges import merge_reason
+from .merge_reasons import merge_reason
 from .names import id_of_place, keyframe_name, place_name, place_title
 
 MOST_FOUNDERS = 6

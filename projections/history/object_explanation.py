@@ -18,7 +18,7 @@ from projections.store.history import History
 from projections.store.history_records import ObjectHistory, ObjectMerge, count_before
 
 from .explanation import Entry, Explanation, passed_milestone, position_text
-from .merges import evidence_document, evidence_text
+from .merge_reasons import evidence_document, evidence_text
 from .names import id_of_place, place_name, place_title
 
 

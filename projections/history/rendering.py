@@ -15,7 +15,7 @@ from projections.store.history_records import EdgeChange, Merge, ObjectMerge, Re
 from .bisect import Search, Turn
 from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
 from .explanation import Explanation
-from .merges import evidence_text, merge_reason, refuser
+from .merge_reasons import evidence_text, merge_reason, refuser
 from .names import keyframe_name, place_name, place_title
 
 

@@ -45,7 +45,7 @@ from projections.store.history_recorder import map_at
 from projections.store.history_records import PlaceHistory
 from projections.store.tables import Tables
 
-from .known import Progress
+from .known_history import Progress
 
 if TYPE_CHECKING:
     from projections.localize.evaluate.truth import Truth

@@ -24,7 +24,7 @@ from .bisect import HistoryFacts, Search
 from .conditions import Expression
 from .diff import Difference, difference_of
 from .explanation import Explanation
-from .known import KnownHistory, Progress, checked_end
+from .known_history import KnownHistory, Progress, checked_end
 from .names import place_name
 
 SettingsChoice: TypeAlias = Callable[[Corrections], Settings]

@@ -16,7 +16,7 @@ from projections.map.partitions import PartitionComparison, Regrouping, compare_
 from projections.map.phrases import command_document, command_name
 from projections.store.history import NEVER
 
-from .known import Progress
+from .known_history import Progress
 from .names import NoSuchThing
 from .rule_folds import NO_NUMBER, FoldResult, Rules, fold_all
 

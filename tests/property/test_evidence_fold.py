@@ -17,8 +17,8 @@ from projections.fold.settings import Settings
 from projections.history import LogTimeline
 from projections.history.object_explanation import explain_object
 from projections.map.digest import map_digest
-from projections.map.export import state_document
 from projections.map.fold import fold_log
+from projections.map.state_output import state_document
 from projections.map.view import MapView
 from tests.property.test_kept_folds import _plain
 from tests.support.evidence_drives import (

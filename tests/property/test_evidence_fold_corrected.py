@@ -18,7 +18,7 @@ from eventsrc.envelope.commands import (
 )
 from projections.fold import deltas as d
 from projections.fold.exact import metres_to_um
-from projections.map.export import state_document
+from projections.map.state_output import state_document
 from projections.map.view import MapView
 from tests.support.evidence_drives import EVIDENCE, SLOW, check_recounts, compiled, det_ids, drives
 from tests.support.folds import Folded

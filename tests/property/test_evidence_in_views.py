@@ -19,8 +19,8 @@ from projections.fold.settings import Settings
 from projections.history.bisect import CountIndex, HistoryFacts
 from projections.history.diff import difference_of, rows_of
 from projections.map.digest import map_digest
-from projections.map.export import state_document, state_text
 from projections.map.records import EstimatedPosition, ObjectRecord, Relocation
+from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
 from tests.support.histories import view_at
 from tests.support.memory_history import MemoryHistory

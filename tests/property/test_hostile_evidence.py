@@ -18,7 +18,7 @@ from projections.fold.sights import MOST_OF_A_PICTURE
 from projections.fold.spots import Spots
 from projections.fold.things import FusedThing
 from projections.map.digest import map_digest
-from projections.map.export import state_document
+from projections.map.state_output import state_document
 from tests.support.envelopes import detection, envelope, payload
 from tests.support.folds import Folded, resumed, state_bytes
 from tests.support.thorough import examples

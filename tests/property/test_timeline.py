@@ -17,10 +17,10 @@ from projections.fold.settings import Settings
 from projections.history import Expression, LogTimeline
 from projections.history.bisect import Search
 from projections.history.diff import rows_of
-from projections.history.merges import chains_of
+from projections.history.merge_reasons import chains_of
 from projections.map.digest import map_digest
-from projections.map.export import state_document
 from projections.map.fold import fold_log
+from projections.map.state_output import state_document
 from projections.map.view import MapView
 from projections.store.history_records import Merge
 from tests.support.thorough import examples

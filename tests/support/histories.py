@@ -25,10 +25,13 @@ from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
 from projections.history.diff import difference_of, rows_of
-from projections.history.known import KnownHistory
-from projections.history.merges import merge_document, object_merge_document, refusal_document
+from projections.history.known_history import KnownHistory
+from projections.history.merge_reasons import (
+    merge_document,
+    object_merge_document,
+    refusal_document,
+)
 from projections.map.digest import map_digest
-from projections.map.export import state_document, state_text
 from projections.map.fold import fold_events
 from projections.map.own_events import new_map
 from projections.map.records import (
@@ -38,6 +41,7 @@ from projections.map.records import (
     PlaceRecord,
     RunRecord,
 )
+from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_records import count_before, last_before

@@ -3,7 +3,7 @@
 import pytest
 
 from projections.fold.settings import Settings
-from projections.map.export import places_advice
+from projections.map.state_output import places_advice
 
 PAGE, ROOMS = Settings(), Settings(places="rooms")
 

@@ -14,7 +14,7 @@ from projections.fold.deltas import (
 )
 from projections.fold.settings import Settings
 from projections.history.explanation import explain_place, explain_same_place
-from projections.history.merges import merge_document
+from projections.history.merge_reasons import merge_document
 from projections.history.rendering import explanation_text, merge_row, merge_text
 from projections.store.history_records import Cause, cause_of
 from tests.support.memory_history import MemoryHistory

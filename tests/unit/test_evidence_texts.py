@@ -10,7 +10,7 @@ from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.history.diff import difference_of
 from projections.history.explanation import Explanation
-from projections.history.merges import object_merge_document
+from projections.history.merge_reasons import object_merge_document
 from projections.history.object_explanation import explain_object
 from projections.history.rendering import difference_text, explanation_text, object_merges_text
 from projections.map.view import MapView

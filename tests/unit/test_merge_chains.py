@@ -10,7 +10,7 @@ from eventsrc.base.errors import MisuseError
 from projections.adapters.drawing.merge_picture import draw_merge
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
-from projections.history.merges import chains_of, merge_reason
+from projections.history.merge_reasons import chains_of, merge_reason
 from projections.history.names import keyframe_name
 from tests.support.envelopes import envelope
 from tests.support.walks import write_log

@@ -10,7 +10,12 @@ from eventsrc.envelope.commands import Command, Join, KeepApart
 from projections.adapters.drawing.merge_picture import draw_merge
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
-from projections.history.merges import chains_of, merge_document, merge_reason, refusal_document
+from projections.history.merge_reasons import (
+    chains_of,
+    merge_document,
+    merge_reason,
+    refusal_document,
+)
 from projections.history.rendering import merge_text, merges_text, refusals_text
 from tests.support.envelopes import detection, envelope
 from tests.support.walks import anchor, write_mixed_log

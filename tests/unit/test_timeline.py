@@ -10,7 +10,7 @@ from eventsrc.log import LogWriter
 from projections.fold.map_errors import LogPointError
 from projections.fold.settings import Settings
 from projections.history import ExpressionError, LogTimeline, NoSuchThing
-from projections.history.merges import merge_document
+from projections.history.merge_reasons import merge_document
 from tests.support.envelopes import detection, envelope
 from tests.support.walks import write_log
 

@@ -14,8 +14,8 @@ from matplotlib.patches import Circle
 
 from eventsrc.envelope.model import Offset
 from projections.adapters import palette
-from projections.history.known import KnownHistory
-from projections.history.merges import chains_of, merge_reason
+from projections.history.known_history import KnownHistory
+from projections.history.merge_reasons import chains_of, merge_reason
 from projections.history.names import keyframe_name, place_title
 from projections.map.view import MapView
 from projections.store.history import History

@@ -26,8 +26,8 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "log": "log:log_commands",
     },
     "Project it into databases": {
-        "replay": "databases:replay",
-        "tail": "databases:tail_command",
+        "replay": "replay_and_tail:replay",
+        "tail": "replay_and_tail:tail_command",
         "status": "db:status",
         "db": "db:group",
         "fleet": "fleet:fleet",

@@ -18,9 +18,9 @@ from projections.postgres.rebuild import retry
 from projections.postgres.sink import SinkName
 from projections.postgres.status import SinkStatus, Status, projection_status
 
-from .databases import OnlyOption, only_of
 from .folded_log import LogSettings
 from .options import Databases, JsonOption
+from .replay_and_tail import OnlyOption, only_of
 from .terminal import display, emit, finish, say
 
 group = typer.Typer(

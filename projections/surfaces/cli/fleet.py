@@ -17,7 +17,6 @@ from projections.adapters.fleet.engines import Ended
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
 
-from .databases import LoaderOption, Loaders, loader_of
 from .event_text import iso_time
 from .fleet_options import (
     EngineOption,
@@ -31,6 +30,7 @@ from .fleet_options import (
 )
 from .folded_log import FoldSettings, settings_from
 from .options import CameraOptions, JsonOption, QuestionArgument, question_from
+from .replay_and_tail import LoaderOption, Loaders, loader_of
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:

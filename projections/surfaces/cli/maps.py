@@ -10,7 +10,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
 from projections.map.digest import map_digest
-from projections.map.export import places_advice, space_advice, state_document, state_text
+from projections.map.state_output import places_advice, space_advice, state_document, state_text
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache

@@ -28,9 +28,9 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.reading import MAX_QUESTION_BYTES
 from projections.map.digest import map_digest
-from projections.map.export import state_document, state_text
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
+from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
 
 _MOST_ROWS = 50

@@ -11,7 +11,7 @@ from eventsrc.log.seek import resolve
 from projections import history
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
-from projections.history.merges import merge_document
+from projections.history.merge_reasons import merge_document
 
 from .map import Map, SettingsLike, settings_from
 

@@ -15,7 +15,7 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import compile_corrections
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
-from projections.history.merges import merge_document
+from projections.history.merge_reasons import merge_document
 from projections.history.rendering import difference_text, search_text
 from projections.history.rule_folds import Rules
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if

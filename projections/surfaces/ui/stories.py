@@ -16,7 +16,7 @@ from projections.fold.deltas import KeyframeOrdinal
 from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
 from projections.history.explanation import Entry, Explanation, explain_same_place
-from projections.history.merges import (
+from projections.history.merge_reasons import (
     chains_of,
     merge_document,
     merge_reason,

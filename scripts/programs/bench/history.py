@@ -21,10 +21,10 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogWriter, parse_fsync
 from projections.history import LogTimeline
 from projections.history.diff import difference_of
-from projections.history.known import KnownHistory
-from projections.history.merges import merge_document
+from projections.history.known_history import KnownHistory
+from projections.history.merge_reasons import merge_document
 from projections.map.digest import map_digest
-from projections.map.export import state_text
+from projections.map.state_output import state_text
 from projections.map.view import MapView
 from scripts.programs.bench.timetravel import RULES, make_log, payloads, say, timed
 from tests.support.histories import MemoryHistory

@@ -12,8 +12,12 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import PRESETS, Settings
-from projections.history.known import KnownHistory
-from projections.history.merges import merge_document, object_merge_document, refusal_document
+from projections.history.known_history import KnownHistory
+from projections.history.merge_reasons import (
+    merge_document,
+    object_merge_document,
+    refusal_document,
+)
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
 from tests.support.histories import whole

@@ -18,8 +18,8 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.record.transport.config import parse_address
 from projections.fold.settings import Settings
-from projections.map.export import places_advice
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
+from projections.map.state_output import places_advice
 from projections.postgres import (
     ForeignEmbedding,
     RebuildReport,
