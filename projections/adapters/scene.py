@@ -145,8 +145,8 @@ def hull(poses: Iterable[Pose | None]) -> list[Point]:
 
 
 @dataclass(frozen=True, slots=True)
-class Floor:
-    """A building's plan: wall lines, furniture boxes, and where to write the rooms' names.
+class HousePlan:
+    """A house's plan: wall lines, furniture boxes, and where to write the rooms' names.
 
     Lines are x0, y0, x1, y1; boxes are x0, y0, x1, y1 with the lower corner first.
     """
@@ -216,7 +216,7 @@ class ObjectGroup:
 def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     """The objects seen at least that often, by place and class; most seen first."""
     grouped: dict[tuple[int | None, str, bool], list[list[ObjectRecord]]] = defaultdict(list)
-    for found in shown_objects(view, min_observations):
+    for found in objects_seen(view, min_observations):
         _add_to_group(grouped[found.place, found.class_name, found.missing_in is not None], found)
     groups = [
         ObjectGroup(name, place, missing, tuple(members))
@@ -226,7 +226,7 @@ def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     return sorted(groups, key=lambda group: (-group.obs_count, group.members[0].ordinal))
 
 
-def shown_objects(view: MapView, min_observations: int) -> list[ObjectRecord]:
+def objects_seen(view: MapView, min_observations: int) -> list[ObjectRecord]:
     """The objects seen at least that often."""
     return [found for found in view.objects.values() if found.obs_count >= min_observations]
 
@@ -311,10 +311,10 @@ def place_spots(view: MapView) -> dict[int, list[tuple[float, float]]]:
     }
 
 
-def floor_of(house: "House") -> Floor:
+def plan_of(house: "House") -> HousePlan:
     """Walls, standing furniture and room names of ``house``."""
     standing = (thing.footprint for thing in house.things if thing.model.stands)
-    return Floor(
+    return HousePlan(
         walls=tuple((wall.x0, wall.y0, wall.x1, wall.y1) for wall in house.plan.walls),
         furniture=tuple((rect.x0, rect.y0, rect.x1, rect.y1) for rect in standing),
         rooms=tuple(

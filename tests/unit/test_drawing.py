@@ -9,7 +9,7 @@ import pytest
 
 from eventsrc.adapters.sim import build_house
 from eventsrc.base.errors import MisuseError
-from projections.adapters.drawing import Floor, LostRobot, MergeMark, Spot, draw_map, floor_of
+from projections.adapters.drawing import HousePlan, LostRobot, MergeMark, Spot, draw_map, plan_of
 from projections.adapters.drawing.map_picture import compose, legend_lines
 from projections.adapters.drawing.sheet import Sheet
 from projections.adapters.palette import place_colour
@@ -57,7 +57,7 @@ def _texts(sheet: Sheet) -> list[str]:
 
 
 def test_the_picture_names_places_objects_and_transitions() -> None:
-    texts = _texts(compose(_two_places(), "a title", Floor()))
+    texts = _texts(compose(_two_places(), "a title", HousePlan()))
     assert {"a title", "p0", "p1", "37", "cup & saucer", "<vase>"} <= set(texts)
     assert "rare" not in texts  # seen once
     assert any("2 places  ·  3 objects, 2 of them shown" in text for text in texts)
@@ -67,14 +67,14 @@ def test_names_of_places_carry_the_run_where_two_runs_have_the_same() -> None:
     view = _two_places()
     view.apply(d.RunSeen(10, 1, "other", 0.0))
     view.apply(d.PlaceFormed(10, 2, "other_p1", 9))
-    texts = _texts(compose(view, "", Floor()))
+    texts = _texts(compose(view, "", HousePlan()))
     assert {"p0", "run_p1", "other_p1"} <= set(texts)
 
 
 def test_a_place_with_a_name_shows_it_instead_of_its_id() -> None:
     view = _two_places()
     view.apply(d.PlaceNamed(10, 0, "Ann's kitchen", 10))
-    texts = set(_texts(compose(view, "", Floor())))
+    texts = set(_texts(compose(view, "", HousePlan())))
     assert {"Ann's kitchen", "p1"} <= texts
     assert "p0" not in texts
 
@@ -83,15 +83,15 @@ def test_places_that_share_a_name_show_their_ids_too() -> None:
     view = _two_places()
     view.apply(d.PlaceNamed(10, 0, "office", 10))
     view.apply(d.PlaceNamed(10, 1, "office", 11))
-    assert {"office (p0)", "office (p1)"} <= set(_texts(compose(view, "", Floor())))
+    assert {"office (p0)", "office (p1)"} <= set(_texts(compose(view, "", HousePlan())))
     view.apply(d.PlaceNamed(10, 1, "p0", 12))  # one is called as another's id is
-    assert {"office", "p0 (p1)"} <= set(_texts(compose(view, "", Floor())))
+    assert {"office", "p0 (p1)"} <= set(_texts(compose(view, "", HousePlan())))
 
 
 def test_a_long_name_is_cut() -> None:
     view = _two_places()
     view.apply(d.PlaceNamed(10, 0, "the room behind the second kitchen", 10))
-    assert "the room behind the sec…" in _texts(compose(view, "", Floor()))
+    assert "the room behind the sec…" in _texts(compose(view, "", HousePlan()))
 
 
 def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
@@ -101,7 +101,7 @@ def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
     view.apply(d.ObjectFound(4, 3, "obj-3", "<vase>", 3))
     view.apply(d.ObjectSeen(4, 3, 3, 0, 2, 8_000_000, 1_000_000, 0.0, 0.0))
     view.apply(d.ObjectMoved(4, 3, 0))
-    assert _texts(compose(view, "", Floor())).count("<vase>") == 2
+    assert _texts(compose(view, "", HousePlan())).count("<vase>") == 2
 
 
 def test_objects_of_one_class_in_one_place_share_a_label() -> None:
@@ -111,7 +111,7 @@ def test_objects_of_one_class_in_one_place_share_a_label() -> None:
     view.apply(d.ObjectFound(3, 3, "obj-3", "<vase>", 3))
     view.apply(d.ObjectSeen(3, 3, 3, 0, 2, 6_000_000, 1_000_000, 0.0, 0.0))
     view.apply(d.ObjectMoved(3, 3, 0))
-    assert "<vase> ×2" in _texts(compose(view, "", Floor()))
+    assert "<vase> ×2" in _texts(compose(view, "", HousePlan()))
 
 
 def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
@@ -119,7 +119,7 @@ def test_the_house_the_lost_robot_and_the_bridge_are_on_it() -> None:
     sheet = compose(
         _two_places(),
         "",
-        floor_of(house),
+        plan_of(house),
         LostRobot(Spot(2, 1, 0.3), Spot(3, 1), 0.5),
         [MergeMark(5.0, 0.5, "p0 took in p2")],
     )
@@ -145,7 +145,7 @@ def _add_objects(view: MapView, names: Iterable[str]) -> None:
 def test_labels_that_find_no_room_are_counted_on_the_picture() -> None:
     view = _two_places()
     _add_objects(view, (f"a rather long class name {number}" for number in range(3, 300)))
-    texts = _texts(compose(view, "", Floor()))
+    texts = _texts(compose(view, "", HousePlan()))
     drawn = sum(text.startswith("a rather long") for text in texts)
     assert 0 < drawn < 297
     assert any(f"{297 - drawn} object labels had no room" in text for text in texts)
@@ -192,14 +192,14 @@ def test_keyframes_without_a_pose_are_left_out(tmp_path: Path) -> None:
 
 def test_a_png_is_large_enough_to_read(tmp_path: Path) -> None:
     out = tmp_path / "map.PNG"
-    draw_map(_two_places(), out, title="t", floor=floor_of(build_house(7)))
+    draw_map(_two_places(), out, title="t", plan=plan_of(build_house(7)))
     width, height = struct.unpack(">II", out.read_bytes()[16:24])
     assert width >= 1200
     assert height >= 800
 
 
 def test_an_empty_map_is_a_picture_too(tmp_path: Path) -> None:
-    texts = _texts(compose(MapView(Settings()), "nothing yet", Floor()))
+    texts = _texts(compose(MapView(Settings()), "nothing yet", HousePlan()))
     assert any("0 places" in text for text in texts)
     draw_map(MapView(Settings()), tmp_path / "map.png", title="nothing yet")
     assert (tmp_path / "map.png").stat().st_size > 1_000

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.patches import Ellipse
 
-from projections.adapters.drawing import Floor, draw_map
+from projections.adapters.drawing import HousePlan, draw_map
 from projections.adapters.drawing.map_picture import EVIDENCE_LEGEND, LEGEND, compose
 from projections.adapters.drawing.sheet import Sheet
 from projections.adapters.scene import two_sigma
@@ -77,7 +77,7 @@ def diamonds(sheet: Sheet) -> list[tuple[float, float]]:
 
 
 def test_objects_are_where_they_stand_with_their_ellipse() -> None:
-    sheet = compose(view_with(EVIDENCE, CUP, VASE), "", Floor())
+    sheet = compose(view_with(EVIDENCE, CUP, VASE), "", HousePlan())
     assert sorted(diamonds(sheet)) == [(1.0, 1.5), (3.0, 9.0)]
     shapes = {tuple(e.get_center()): (e.get_width(), e.get_height()) for e in ellipses(sheet)}
     assert shapes[1.0, 1.5] == pytest.approx((4 * 0.3, 4 * 0.2))
@@ -87,20 +87,20 @@ def test_objects_are_where_they_stand_with_their_ellipse() -> None:
 
 
 def test_the_canvas_reaches_to_objects_beyond_the_drive() -> None:
-    _, _, _, top = compose(view_with(EVIDENCE, CUP, VASE), "", Floor()).bounds
+    _, _, _, top = compose(view_with(EVIDENCE, CUP, VASE), "", HousePlan()).bounds
     assert top > 9.0
-    _, _, _, without = compose(view_with(EVIDENCE, CUP), "", Floor()).bounds
+    _, _, _, without = compose(view_with(EVIDENCE, CUP), "", HousePlan()).bounds
     assert without < 3.0
 
 
 def test_objects_without_an_estimate_are_where_the_robot_saw_them_from() -> None:
-    sheet = compose(view_with(EVIDENCE), "", Floor())
+    sheet = compose(view_with(EVIDENCE), "", HousePlan())
     assert diamonds(sheet) == [(2.0, 0.0), (2.0, 0.0)]
     assert ellipses(sheet) == []
 
 
 def test_the_picture_of_the_page_has_no_ellipse() -> None:
-    sheet = compose(view_with(Settings()), "", Floor())
+    sheet = compose(view_with(Settings()), "", HousePlan())
     assert diamonds(sheet) == [(2.0, 0.0), (2.0, 0.0)]
     assert ellipses(sheet) == []
     assert LEGEND in texts(sheet)
@@ -109,46 +109,46 @@ def test_the_picture_of_the_page_has_no_ellipse() -> None:
 
 def test_a_missing_object_is_hollow_and_dashed() -> None:
     view = view_with(EVIDENCE, CUP, VASE, d.ObjectMissing(4, 1, 0, 6, True))
-    sheet = compose(view, "", Floor())
+    sheet = compose(view, "", HousePlan())
     assert {"cup", "vase (missing)"} <= set(texts(sheet))
     lines = {tuple(e.get_center()): e.get_linestyle() for e in ellipses(sheet)}
     assert lines[1.0, 1.5] in ("-", "solid")
     assert lines[3.0, 9.0] not in ("-", "solid")
-    found = compose(view_with(EVIDENCE, CUP, VASE), "", Floor())
+    found = compose(view_with(EVIDENCE, CUP, VASE), "", HousePlan())
     assert "vase" in texts(found)
 
 
 def test_missing_and_present_objects_of_a_class_have_labels_of_their_own() -> None:
     again = d.ObjectEstimated(3, 1, 1_100_000, 1_500_000, 10_000_000, 0, 10_000_000, 2)
     view = view_with(EVIDENCE, CUP, again, d.ObjectClassified(3, 1, "cup"))
-    assert "cup ×2" in texts(compose(view, "", Floor()))
+    assert "cup ×2" in texts(compose(view, "", HousePlan()))
     view.apply(d.ObjectMissing(4, 1, 0, 6, True))
-    assert {"cup", "cup (missing)"} <= set(texts(compose(view, "", Floor())))
+    assert {"cup", "cup (missing)"} <= set(texts(compose(view, "", HousePlan())))
 
 
 def test_a_wide_ellipse_is_faint() -> None:
     unsure = d.ObjectEstimated(3, 1, 3_000_000, 0, 10_000_000_000, 0, 640_000_000_000, 1)
     alphas = {
         tuple(e.get_center()): e.get_alpha()
-        for e in ellipses(compose(view_with(EVIDENCE, CUP, unsure), "", Floor()))
+        for e in ellipses(compose(view_with(EVIDENCE, CUP, unsure), "", HousePlan()))
     }
     assert 0 < alphas[3.0, 0.0] < alphas[1.0, 1.5]
 
 
 def test_the_name_of_a_room_keeps_clear_of_the_objects_in_its_corners() -> None:
-    floor = Floor(rooms=(("kitchen", (0.0, 0.0, 4.0, 4.0)),))
-    texts_before = compose(view_with(EVIDENCE), "", floor).axes.texts
+    plan = HousePlan(rooms=(("kitchen", (0.0, 0.0, 4.0, 4.0)),))
+    texts_before = compose(view_with(EVIDENCE), "", plan).axes.texts
     (corner,) = [t.get_position() for t in texts_before if t.get_text() == "kitchen"]
     there = round(corner[0] * 1e6), round(corner[1] * 1e6)
     standing = d.ObjectEstimated(3, 0, *there, 10_000_000, 0, 10_000_000, 2)
-    texts_then = compose(view_with(EVIDENCE, standing), "", floor).axes.texts
+    texts_then = compose(view_with(EVIDENCE, standing), "", plan).axes.texts
     (then,) = [t.get_position() for t in texts_then if t.get_text() == "kitchen"]
     assert math.dist(then, corner) > 1.0
 
 
 def test_an_arrow_leads_from_where_a_moved_object_stood() -> None:
     moved = d.ObjectRelocated(4, 0, 0, 3_000_000, -500_000, 1_000_000, 1_500_000)
-    sheet = compose(view_with(EVIDENCE, CUP, moved), "", Floor())
+    sheet = compose(view_with(EVIDENCE, CUP, moved), "", HousePlan())
     arrows = [a for a in sheet.axes.texts if getattr(a, "arrow_patch", None) is not None]
     assert [(a.xy, a.get_position()) for a in arrows] == [((1.0, 1.5), (3.0, -0.5))]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.adapters.drawing import Floor
+from projections.adapters.drawing import HousePlan
 from projections.adapters.drawing.base_layers import wall_spots
 from projections.adapters.drawing.map_picture import compose
 from projections.fold.deltas import MapGiven
@@ -25,7 +25,7 @@ def _view(given: OccupancyMap, *spots: tuple[float, float]) -> MapView:
 
 def _drawn_walls(view: MapView) -> tuple[np.ndarray, np.ndarray]:
     """Where the middles of the drawn wall cells lie, in metres, shape (n, 2); the area drawn."""
-    sheet = compose(view, "t", Floor())
+    sheet = compose(view, "t", HousePlan())
     _, walls = sheet.axes.get_images()
     alpha = np.asarray(walls.get_array())[..., 3]
     height, width = alpha.shape
@@ -73,10 +73,10 @@ def test_the_picture_has_room_for_walls_near_the_drive_only() -> None:
 def test_a_map_away_from_the_drive_or_without_one_is_no_trouble() -> None:
     given = drawn_map("###", 0.5, (500.0, 500.0, 0.0))
     assert wall_spots(_view(given, (0.0, 0.0))) == []
-    assert compose(_view(given, (0.0, 0.0)), "t", Floor()).axes.get_images() == []
+    assert compose(_view(given, (0.0, 0.0)), "t", HousePlan()).axes.get_images() == []
     alone = MapView(Settings())
     alone.maps[None] = MapGiven(0, given)
     found, _ = _drawn_walls(alone)
     assert len(found) == 3
     alone.maps[None] = MapGiven(0, drawn_map("..", 0.5))
-    compose(alone, "t", Floor())
+    compose(alone, "t", HousePlan())

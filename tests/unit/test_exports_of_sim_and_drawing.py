@@ -19,7 +19,7 @@ def test_sim() -> None:
 
 
 def test_drawing() -> None:
-    names = ["Floor", "LostRobot", "MergeMark", "Spot", "draw_map", "floor_of", "map_png"]
+    names = ["HousePlan", "LostRobot", "MergeMark", "Spot", "draw_map", "map_png", "plan_of"]
     assert projections.adapters.drawing.__all__ == names
 
 

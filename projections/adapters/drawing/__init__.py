@@ -3,8 +3,8 @@
 matplotlib is used through its objects alone: no pyplot, no global state.
 """
 
-from projections.adapters.scene import Floor, LostRobot, MergeMark, Spot, floor_of
+from projections.adapters.scene import HousePlan, LostRobot, MergeMark, Spot, plan_of
 
 from .map_picture import draw_map, map_png
 
-__all__ = ["Floor", "LostRobot", "MergeMark", "Spot", "draw_map", "floor_of", "map_png"]
+__all__ = ["HousePlan", "LostRobot", "MergeMark", "Spot", "draw_map", "map_png", "plan_of"]

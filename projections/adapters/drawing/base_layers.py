@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
 from projections.adapters import palette
-from projections.adapters.scene import Box, Floor, drives, place_spots
+from projections.adapters.scene import Box, HousePlan, drives, place_spots
 from projections.fold.occupancy import pooled
 from projections.map.view import MapView
 
@@ -88,17 +88,17 @@ def _within(span: slice, whole: slice) -> slice:
     return slice(span.start - whole.start, span.stop - whole.start)
 
 
-def draw_floor(sheet: Sheet, floor: Floor) -> None:
+def draw_floor(sheet: Sheet, plan: HousePlan) -> None:
     """Rooms and the furniture in them."""
-    for _, box in floor.rooms:
+    for _, box in plan.rooms:
         _rectangle(sheet, box, palette.FLOOR, palette.FLOOR, 0)
-    for box in floor.furniture:
+    for box in plan.furniture:
         _rectangle(sheet, box, palette.FURNITURE, palette.FURNITURE_EDGE, 1)
 
 
-def draw_walls(sheet: Sheet, floor: Floor) -> None:
+def draw_walls(sheet: Sheet, plan: HousePlan) -> None:
     """Walls, on top of the regions, which may reach a little through them."""
-    for x0, y0, x1, y1 in floor.walls:
+    for x0, y0, x1, y1 in plan.walls:
         sheet.axes.plot(
             (x0, x1), (y0, y1), color=palette.WALL, lw=3.2, solid_capstyle="projecting", zorder=7
         )

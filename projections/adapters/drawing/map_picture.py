@@ -10,11 +10,11 @@ from pathlib import Path
 from eventsrc.base.text import counted
 from projections.adapters import palette
 from projections.adapters.scene import (
-    Floor,
+    HousePlan,
     LostRobot,
     MergeMark,
+    objects_seen,
     place_names,
-    shown_objects,
     spot_of,
 )
 from projections.fold.deltas import PlacesMerged
@@ -56,7 +56,7 @@ def draw_map(
     out: Path,
     *,
     title: str,
-    floor: Floor | None = None,
+    plan: HousePlan | None = None,
     lost: LostRobot | None = None,
     marks: Sequence[MergeMark] = (),
     min_observations: int = 2,
@@ -67,38 +67,38 @@ def draw_map(
     cannot be written or has another suffix.
     """
     check_suffix(out)
-    compose(view, title, floor or Floor(), lost, marks, min_observations).save(out)
+    compose(view, title, plan or HousePlan(), lost, marks, min_observations).save(out)
 
 
 def map_png(view: MapView, title: str) -> bytes:
     """``view`` drawn as a PNG."""
-    return compose(view, title, Floor()).png()
+    return compose(view, title, HousePlan()).png()
 
 
 def compose(
     view: MapView,
     title: str,
-    floor: Floor,
+    plan: HousePlan,
     lost: LostRobot | None = None,
     marks: Sequence[MergeMark] = (),
     min_observations: int = 2,
 ) -> Sheet:
     """The finished sheet, not yet written to a file."""
     by_evidence = view.settings.fusion == "evidence"
-    shown = shown_objects(view, min_observations) if by_evidence else []
+    shown = objects_seen(view, min_observations) if by_evidence else []
     standing = [found.spot for found in shown]
-    sheet = new_sheet(view, floor, [*standing, *wall_spots(view)])
-    draw_floor(sheet, floor)
+    sheet = new_sheet(view, plan, [*standing, *wall_spots(view)])
+    draw_floor(sheet, plan)
     draw_map_walls(sheet, view)
     draw_regions(sheet, view)
     draw_drives(sheet, view)
-    draw_walls(sheet, floor)
+    draw_walls(sheet, plan)
     draw_adjacency(sheet, view)
     draw_place_names(sheet, view)
     if lost is not None:
         draw_lost(sheet, lost)
     sheet.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
-    draw_room_names(sheet, floor)
+    draw_room_names(sheet, plan)
     draw_merge_marks(sheet, marks)
     left_out = draw_objects(sheet, view, min_observations)
     sheet.header(0, title, 14, palette.INK, "bold")

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Ellipse
 
 from projections.adapters import palette
 from projections.adapters.scene import (
-    Floor,
+    HousePlan,
     LostRobot,
     MergeMark,
     Spot,
@@ -56,10 +56,10 @@ def draw_place_names(sheet: Sheet, view: MapView) -> None:
         _draw_badge(sheet, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9")
 
 
-def draw_room_names(sheet: Sheet, floor: Floor) -> None:
+def draw_room_names(sheet: Sheet, plan: HousePlan) -> None:
     """Each room's name, in the first of its corners that is free."""
     height = 12 * sheet.unit
-    for name, (x0, y0, x1, y1) in floor.rooms:
+    for name, (x0, y0, x1, y1) in plan.rooms:
         width = 5.6 * len(name) * sheet.unit
         dx, dy = width / 2 + 0.14, height / 2 + 0.1
         corners = ((x0 + dx, y1 - dy), (x1 - dx, y1 - dy), (x0 + dx, y0 + dy), (x1 - dx, y0 + dy))

@@ -25,7 +25,7 @@ from matplotlib.text import Text
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.user_files import write_files
-from projections.adapters.scene import Floor, drives
+from projections.adapters.scene import HousePlan, drives
 from projections.map.view import MapView
 
 _ANGLES = 16
@@ -220,9 +220,9 @@ def check_suffix(out: Path) -> None:
         raise MisuseError(f"{out}: a picture is .png, .svg or .pdf; give such a name")
 
 
-def new_sheet(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] = ()) -> Sheet:
-    """An empty sheet that fits every pose of ``view``, wall of ``floor`` and spot of ``more``."""
-    x0, y0, x1, y1 = bounds = _bounds(view, floor, more)
+def new_sheet(view: MapView, plan: HousePlan, more: Sequence[tuple[float, float]] = ()) -> Sheet:
+    """An empty sheet that fits every pose of ``view``, wall of ``plan`` and spot of ``more``."""
+    x0, y0, x1, y1 = bounds = _bounds(view, plan, more)
     height = _WIDTH_IN * (y1 - y0) / (x1 - x0) + _HEAD_IN + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height), facecolor="white")
     axes = figure.add_axes((0.0, _FOOT_IN / height, 1.0, 1 - (_HEAD_IN + _FOOT_IN) / height))
@@ -233,11 +233,11 @@ def new_sheet(view: MapView, floor: Floor, more: Sequence[tuple[float, float]] =
     return Sheet(figure, axes, bounds, (x1 - x0) / (_WIDTH_IN * 72))
 
 
-def _bounds(view: MapView, floor: Floor, more: Sequence[tuple[float, float]]) -> Bounds:
+def _bounds(view: MapView, plan: HousePlan, more: Sequence[tuple[float, float]]) -> Bounds:
     reach = _AROUND_POSES_M
     poses = [spot for _, drive in drives(view) for spot in drive]
     spots = [(x + dx, y + dy) for x, y in poses for dx in (-reach, reach) for dy in (-reach, reach)]
-    spots += [end for x0, y0, x1, y1 in floor.walls for end in ((x0, y0), (x1, y1))]
+    spots += [end for x0, y0, x1, y1 in plan.walls for end in ((x0, y0), (x1, y1))]
     spots += more
     if not spots:
         return (-2.0, -1.0, 2.0, 1.0)

@@ -92,7 +92,7 @@ def draw(
     """
     # Imported here: matplotlib takes longer to import than most commands take to run.
     from eventsrc.adapters.sim import build_house
-    from projections.adapters.drawing import draw_map, floor_of
+    from projections.adapters.drawing import draw_map, plan_of
     from projections.adapters.drawing.map_picture import merge_marks
     from projections.map.one_floor import view_of_floor
 
@@ -112,7 +112,7 @@ def draw(
             view,
             out,
             title=title,
-            floor=None if house is None else floor_of(build_house(house)),
+            plan=None if house is None else plan_of(build_house(house)),
             marks=merge_marks(view, merged) if merges else (),
             min_observations=min_observations,
         )

@@ -25,7 +25,7 @@ from eventsrc.base.user_files import write_files
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections import history
-from projections.adapters.drawing import LostRobot, MergeMark, Spot, draw_map, floor_of
+from projections.adapters.drawing import LostRobot, MergeMark, Spot, draw_map, plan_of
 from projections.adapters.drawing.map_picture import merge_marks
 from projections.postgres import rebuild
 from projections.postgres.check import check
@@ -135,7 +135,7 @@ def run_demo(
                 corrected.house.view,
                 folder / "map.png",
                 title=f"House {seed}: explored by {explorer.run_id}, {lost.run_id} lost in it",
-                floor=floor_of(house),
+                plan=plan_of(house),
                 lost=_where_lost(lost),
                 marks=_merge_marks(log, corrected.house),
             )
