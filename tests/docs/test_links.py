@@ -8,7 +8,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "logs" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _MODULE = re.compile(r"`((?:eventsrc|projections|tests|scripts)/[\w/]+\.py)`")
+_BARE = re.compile(r"`(\w+\.py)`")
 _LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)(?:#[^)]*)?\)")
+
+
+@pytest.fixture(scope="module")
+def file_names() -> frozenset[str]:
+    folders = ("eventsrc", "projections", "tests", "scripts")
+    return frozenset(path.name for each in folders for path in (ROOT / each).rglob("*.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -21,6 +28,11 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_named_modules_are_there(page: Path) -> None:
     for path in _MODULE.findall(page.read_text("utf-8")):
         assert (ROOT / path).is_file(), path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_modules_named_without_a_folder_are_there(page: Path, file_names: frozenset[str]) -> None:
+    assert set(_BARE.findall(page.read_text("utf-8"))) <= file_names
 
 
 def test_links_are_found() -> None:
