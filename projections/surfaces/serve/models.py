@@ -180,7 +180,8 @@ class RefusalShape(TypedDict):
 
 
 for _shape in [each for name, each in vars().items() if name.endswith("Shape")]:
-    # Clients know them by these names.
+    # Clients know them by these names. pydantic names components after the class, and a title in
+    # its configuration changes only the title.
     _shape.__name__ = _shape.__qualname__ = _shape.__name__.removesuffix("Shape")
 
 
