@@ -16,6 +16,7 @@ import contextlib
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -43,22 +44,34 @@ _PROGRAM: Final = (
 )
 _REPORT_S: Final = 0.1
 _POLL_S: Final = 0.2
+_END_S: Final = 10.0
+_STDERR_BYTES: Final = 400
+"""Bytes of stderr in which the last line is looked for."""
 
 
 class ProcessGone(Exception):
     """The process cannot be started, has died or does not answer."""
 
 
+class ProcessKilled(ProcessGone):
+    """The process was killed by SIGKILL, perhaps because memory ran out."""
+
+
 class WorkerProcess:
     """A process that runs a function. A context manager, which kills the process."""
 
     def __init__(
-        self, main: Callable[..., None], *arguments: str, memory: int | None = None
+        self,
+        main: Callable[..., None],
+        *arguments: str,
+        memory: int | None = None,
+        stderr: int = subprocess.DEVNULL,
     ) -> None:
         """Run ``main(connection, *arguments)``, a function of a module. The number of the
         ``memory`` (`unnamed_memory`) comes before the arguments. Raises ProcessGone.
 
-        The process has the ``sys.path`` of this one, without the current folder.
+        The process has the ``sys.path`` of this one, without the current folder. By default its
+        stderr is dropped: where this process then does the work, it reports the same error.
         """
         from multiprocessing import Pipe  # slow to import, and few commands start a process
 
@@ -74,7 +87,7 @@ class WorkerProcess:
                     [sys.executable, "-P", "-c", _PROGRAM, *words],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,  # this process has the same problem, and reports it
+                    stderr=stderr,
                     pass_fds=files,
                     process_group=0,
                     env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
@@ -176,7 +189,7 @@ def call_in_processes(
             while waiting and len(running) < workers:
                 number = waiting.popleft()
                 idle = [each for each in idle if not each.has_answer()]  # the end of one that died
-                process = idle.pop() if idle else stack.enter_context(_CallingProcess())
+                process = idle.pop() if idle else _start_calling(stack)
                 running[process.connection] = process, number
                 made[number] += 1
                 process.begin(calls[number])
@@ -209,8 +222,9 @@ class _Answer(NamedTuple):
 class _CallingProcess(WorkerProcess):
     """A process that makes call after call."""
 
-    def __init__(self) -> None:
-        super().__init__(_make_calls)
+    def __init__(self, stderr: int) -> None:
+        super().__init__(_make_calls, stderr=stderr)
+        self._stderr = stderr
 
     def begin(self, call: Call[Any]) -> None:
         """Assign a call. If the process has died, `answer` says so."""
@@ -221,10 +235,35 @@ class _CallingProcess(WorkerProcess):
         """The next answer; the end of the call if the process has died."""
         try:
             answer: _Answer = self.connection.recv()
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError):
+            error = self._end()
             self.close()
-            return _Answer(0, is_end=True, error=ProcessGone(str(error)))
+            return _Answer(0, is_end=True, error=error)
         return answer
+
+    def _end(self) -> ProcessGone:
+        """How the process, which has closed its connection, ended: its signal or exit status, and
+        the last line that it wrote to stderr."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+        code = self._process.poll()
+        if code == -signal.SIGKILL:
+            return ProcessKilled("killed")
+        how = "no answer"
+        if code is not None:
+            how = f"exit code {code}" if code >= 0 else str(signal.strsignal(-code))
+        size = os.fstat(self._stderr).st_size
+        said = os.pread(self._stderr, _STDERR_BYTES, max(0, size - _STDERR_BYTES))
+        *_, last = ["", *said.decode(errors="replace").strip().splitlines()]
+        return ProcessGone(f"{how}: {last}" if last else how)
+
+
+def _start_calling(stack: contextlib.ExitStack) -> _CallingProcess:
+    try:
+        stderr = stack.enter_context(unnamed_memory(0))
+    except OSError as error:
+        raise ProcessGone(str(error)) from error
+    return stack.enter_context(_CallingProcess(stderr))
 
 
 def _make_calls(connection: "Connection") -> None:

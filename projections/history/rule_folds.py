@@ -19,7 +19,13 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.machine import gc_paused, usable_processors
-from eventsrc.base.worker_process import Called, ProcessGone, Report, call_in_processes
+from eventsrc.base.worker_process import (
+    Called,
+    ProcessGone,
+    ProcessKilled,
+    Report,
+    call_in_processes,
+)
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
@@ -275,10 +281,14 @@ def _in_processes(
             if isinstance(called.error, ProcessGone):
                 raise called.error
             ended[called.number] = called
-    except ProcessGone:
+    except ProcessKilled:
         raise MapfoldError(
             f"{log}: a process that folded it was killed, perhaps for lack of memory; "
             "try fewer --processes"
+        ) from None
+    except ProcessGone as error:
+        raise MapfoldError(
+            f"{log}: a process that folds it died or did not start: {error}; try --processes 1"
         ) from None
     for _, called in sorted(ended.items()):  # of several errors always the same one
         if called.error is not None:

@@ -104,7 +104,8 @@ def test_ctrl_c_in_a_starting_worker_is_one_line(mapfold: Commands) -> None:
         "whatif", "log", "--grid", "eps_m=1.0,2.0", "--processes", "2", code=1
     )
     (line,) = said.err.splitlines()
-    assert "a process that folded it was killed" in line
+    assert "a process that folds it died or did not start: " in line
+    assert "KeyboardInterrupt" in line
 
 
 def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> tuple[int, str]:

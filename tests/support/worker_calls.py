@@ -56,6 +56,12 @@ def answers_unportably(_: Report) -> threading.Lock:
     return threading.Lock()
 
 
+def aborts(_: Report) -> NoReturn:
+    """End as faulty native code does."""
+    os.write(2, b"some\nheap: corrupted\n\n")
+    os.abort()
+
+
 def fails_in_turn(folder: Path, names: list[str], _: int, report: Report, **__: object) -> NoReturn:
     """Raise an error of the first name; ``first`` waits until a file ``go`` is in the folder."""
     report(1)

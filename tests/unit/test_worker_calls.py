@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.base.worker_process import Called, ProcessGone, call_in_processes
+from eventsrc.base.worker_process import Called, ProcessGone, ProcessKilled, call_in_processes
 from tests.support.worker_calls import (
+    aborts,
     answers_unportably,
     double,
     fails,
@@ -29,7 +30,7 @@ def test_each_call_has_one_outcome_whichever_worker_is_killed(tmp_path: Path) ->
     ended = sorted(call_in_processes(calls, 2, attempts=3), key=lambda each: each.number)
     assert ended[:3] == [Called(0, 0, None, 1), Called(1, 1, None, 2), Called(2, 2, None, 1)]
     assert (ended[3].result, ended[3].attempts) == (None, 3)
-    assert isinstance(ended[3].error, ProcessGone)
+    assert isinstance(ended[3].error, ProcessKilled)
     # Beside a worker that was killed no other call was made again.
     assert [(tmp_path / str(n)).stat().st_size for n in range(4)] == [1, 2, 1, 3]
 
@@ -53,6 +54,24 @@ def test_an_error_is_the_outcome_of_its_call_alone() -> None:
         (None, "RuntimeError('SystemExit: enough')"),
         (2, "None"),
     ]
+
+
+@pytest.mark.seconds
+def test_how_a_worker_died_is_in_the_error() -> None:
+    died, made = call_in_processes([aborts, partial(double, 1)], 1)
+    assert repr(died.error) == "ProcessGone('Aborted: heap: corrupted')"
+    assert made.result == 2
+
+
+@pytest.mark.seconds
+def test_why_workers_cannot_start_is_in_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "path", [str(tmp_path)])
+    (died,) = call_in_processes([partial(double, 1)], 1)
+    assert repr(died.error) == (
+        "ProcessGone(\"exit code 1: ModuleNotFoundError: No module named 'eventsrc'\")"
+    )
 
 
 @pytest.mark.seconds

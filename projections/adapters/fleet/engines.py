@@ -7,7 +7,7 @@ from typing import Any, Final, Protocol, Self, TypeAlias
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.text import counted
-from eventsrc.base.worker_process import Called, ProcessGone, call_in_processes
+from eventsrc.base.worker_process import Called, ProcessGone, ProcessKilled, call_in_processes
 
 RETRIES: Final = 2
 """The most times that the task of a killed worker is started again."""
@@ -94,11 +94,13 @@ class LocalPool:
 
 
 def _error_text(ended: Called[Any]) -> str | None:
-    if isinstance(ended.error, ProcessGone):
+    if isinstance(ended.error, ProcessKilled):
         return (
             f"its worker process was killed {counted(ended.attempts, 'time')}; out of memory? Look"
             " in the kernel's log, or run with fewer --jobs"
         )
+    if isinstance(ended.error, ProcessGone):
+        return f"its worker process died {counted(ended.attempts, 'time')}: {ended.error}"
     if ended.error is None:
         return None
     text = str(ended.error)[:_ERROR_CHARS]
