@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 from eventsrc.base.errors import MisuseError
 
-from .condition_functions import FUNCTIONS, Direction, Function, Names, Type, Value
+from .condition_functions import FUNCTIONS, Direction, Function, HistoryFacts, Names, Type, Value
 
 MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
@@ -91,7 +91,7 @@ class Mention:
 class _Call:
     function: Function
     mentions: tuple[Mention, ...]
-    value: Callable[[object], Value]
+    value: Callable[[HistoryFacts], Value]
 
     def __str__(self) -> str:
         arguments = ", ".join(repr(mention.text) for mention in self.mentions)
@@ -104,7 +104,7 @@ class _Term:
 
     column: int
     type: Type
-    value: Callable[[object], Value]
+    value: Callable[[HistoryFacts], Value]
     direction: Direction = Direction.STEADY
     calls: tuple[_Call, ...] = ()
 
@@ -156,11 +156,11 @@ class Expression:
     def __str__(self) -> str:
         return self.source
 
-    def holds(self, facts: object) -> bool:
+    def holds(self, facts: HistoryFacts) -> bool:
         """Whether it is true of this map."""
         return bool(self._term.value(facts))
 
-    def readings(self, facts: object) -> tuple[tuple[str, Value], ...]:
+    def readings(self, facts: HistoryFacts) -> tuple[tuple[str, Value], ...]:
         """Every function call as written, with its value."""
         return tuple({str(call): call.value(facts) for call in self._term.calls}.items())
 

@@ -27,8 +27,9 @@ from projections.store.history_records import Merge, ObjectMerge, RefusedMerge
 from projections.store.stored_view import StoredView
 from projections.store.timeline_cache import TimelineCache
 
-from .bisect import CountIndex, HistoryFacts, Search, Searcher
+from .bisect import Search, Searcher
 from .command_entries import EntryMaker, object_commands, place_commands, same_place_commands
+from .condition_functions import CountIndex, HistoryFacts
 from .conditions import Expression
 from .explanation import Explanation, explain_place, explain_same_place, with_entries
 from .names import (

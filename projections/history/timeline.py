@@ -20,7 +20,8 @@ from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_records import Cause, Merge
 
-from .bisect import HistoryFacts, Search
+from .bisect import Search
+from .condition_functions import HistoryFacts
 from .conditions import Expression
 from .diff import Difference, difference_of
 from .explanation import Explanation

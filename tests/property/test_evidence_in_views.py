@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from eventsrc.envelope.model import Offset
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
-from projections.history.bisect import CountIndex, HistoryFacts
+from projections.history.condition_functions import CountIndex, HistoryFacts
 from projections.history.diff import difference_of, rows_of
 from projections.map.digest import map_digest
 from projections.map.records import EstimatedPosition, ObjectRecord, Relocation

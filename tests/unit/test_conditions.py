@@ -1,10 +1,11 @@
 """Conditions: evaluation, and errors with their columns."""
 
+import inspect
 from dataclasses import dataclass, field
 
 import pytest
 
-from projections.history.condition_functions import FUNCTIONS, functions_help
+from projections.history.condition_functions import FUNCTIONS, Function, functions_help
 from projections.history.conditions import Expression, ExpressionError
 
 
@@ -47,6 +48,13 @@ class FakeFacts:
 
     def merged(self, place_id: str) -> bool:
         return place_id == "a_p1"
+
+
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_the_method_of_a_function_takes_its_arguments(function: Function) -> None:
+    _, *taken = inspect.signature(function.method).parameters.values()
+    assert len(taken) == len(function.parameters)
+    assert all((each.default is None) is function.optional for each in taken)
 
 
 @pytest.mark.parametrize(
