@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eventsrc.adapters.detector.heads import suppress
-from eventsrc.adapters.detector.keyframes import GateLimits, KeyframeGate, PicturePose
+from eventsrc.adapters.detector.keyframes import GateLimits, KeyframeGate, RobotPose
 from eventsrc.adapters.detector.poses import NEAR_S, PoseTrack
 from eventsrc.adapters.detector.vision import Letterbox
 
@@ -90,7 +90,7 @@ def test_boxes_beyond_the_picture_are_cut_to_it() -> None:
 
 
 POSE = st.builds(
-    PicturePose,
+    RobotPose,
     st.floats(-3, 3, allow_nan=False),
     st.floats(-3, 3, allow_nan=False),
     st.floats(-10, 10, allow_nan=False),
@@ -99,7 +99,7 @@ PICTURES = st.lists(st.tuples(st.floats(0, 30), st.none() | POSE), max_size=40)
 
 
 def _naive_keyframes(
-    pictures: list[tuple[float, PicturePose | None]], limits: GateLimits
+    pictures: list[tuple[float, RobotPose | None]], limits: GateLimits
 ) -> list[int]:
     """Each picture judged by the whole list of keyframes so far."""
     chosen: list[int] = []
@@ -122,7 +122,7 @@ def _naive_keyframes(
 
 @given(PICTURES, st.none() | st.floats(0.5, 10))
 def test_the_gate_is_the_naive_one(
-    pictures: list[tuple[float, PicturePose | None]], after_s: float | None
+    pictures: list[tuple[float, RobotPose | None]], after_s: float | None
 ) -> None:
     limits = GateLimits(after_s=after_s)
     gate = KeyframeGate(limits)
@@ -139,8 +139,8 @@ def test_half_a_metre_in_steps_is_half_a_metre() -> None:
     taken = 0
     x = 0.0
     for step in range(101):
-        if gate.is_due(float(step), PicturePose(x, 0.0, 3.1)):
-            gate.set_last(float(step), PicturePose(x, 0.0, 3.1))
+        if gate.is_due(float(step), RobotPose(x, 0.0, 3.1)):
+            gate.set_last(float(step), RobotPose(x, 0.0, 3.1))
             taken += 1
         x += 0.05
     assert taken == 11
@@ -155,8 +155,8 @@ STAMPS = st.lists(
 def test_a_picture_has_the_pose_of_its_time(stamps: list[float], at: float, rng: object) -> None:
     """The robot drives and turns evenly, so that between two poses it is where the clock says."""
 
-    def truth(stamp: float) -> PicturePose:
-        return PicturePose(stamp, -2 * stamp, math.remainder(3 * stamp, math.tau))
+    def truth(stamp: float) -> RobotPose:
+        return RobotPose(stamp, -2 * stamp, math.remainder(3 * stamp, math.tau))
 
     track = PoseTrack()
     shuffled = list(stamps)
@@ -179,8 +179,8 @@ def test_a_picture_has_the_pose_of_its_time(stamps: list[float], at: float, rng:
 @pytest.mark.parametrize("first", [3.1, -3.1])
 def test_a_turn_through_the_back_is_short(first: float) -> None:
     track = PoseTrack()
-    track.add(1.0, PicturePose(0, 0, first))
-    track.add(1.1, PicturePose(0, 0, -first))
+    track.add(1.0, RobotPose(0, 0, first))
+    track.add(1.1, RobotPose(0, 0, -first))
     found = track.at(1.05)
     assert found is not None
     assert abs(abs(found.yaw) - math.pi) < 1e-9

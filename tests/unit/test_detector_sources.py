@@ -17,7 +17,7 @@ from eventsrc.adapters.detector.picture_sources import NewestQueue, Timing, open
 from eventsrc.adapters.detector.poses import (
     LivePoses,
     MessageError,
-    PicturePose,
+    RobotPose,
     pose_of,
     poses_of_file,
 )
@@ -127,7 +127,7 @@ def test_poses_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_text("stamp,x,y,yaw\n1.0,0,0,0\n1.1,1,0,0.5\n")
     found = poses_of_file(path).at(1.05)
-    assert found == pytest.approx(PicturePose(0.5, 0.0, 0.25))
+    assert found == pytest.approx(RobotPose(0.5, 0.0, 0.25))
     path.write_text("keyframe_id,x,y,yaw\n1,0,0,0\n")
     with pytest.raises(MisuseError, match="pictures need poses by stamp"):
         poses_of_file(path)
@@ -179,7 +179,7 @@ def test_poses_of_ros(kind: str, order: str, frame: str) -> None:
     payload = _pose_message(kind, order, frame)
     stamp_s, pose = pose_of(payload, 99.0)
     assert stamp_s == 12.5
-    assert pose == pytest.approx(PicturePose(1.5, -2.5, 0.8))
+    assert pose == pytest.approx(RobotPose(1.5, -2.5, 0.8))
     assert pose_of(payload + b"\0\0\0", 99.0)[0] == 12.5
     passed = []
     for length in range(4, len(payload)):
@@ -195,12 +195,12 @@ def test_poses_of_ros(kind: str, order: str, frame: str) -> None:
 @pytest.mark.parametrize(
     ("document", "expected"),
     [
-        ({"x": 1, "y": 2, "yaw": 3, "stamp": 4}, (4.0, PicturePose(1, 2, 3))),
+        ({"x": 1, "y": 2, "yaw": 3, "stamp": 4}, (4.0, RobotPose(1, 2, 3))),
         (
             {"map_x": 1.5, "map_y": 2, "map_yaw": 3, "timestamp": 4.5},
-            (4.5, PicturePose(1.5, 2, 3)),
+            (4.5, RobotPose(1.5, 2, 3)),
         ),
-        ({"x": 1, "y": 2, "yaw": 3}, (99.0, PicturePose(1, 2, 3))),
+        ({"x": 1, "y": 2, "yaw": 3}, (99.0, RobotPose(1, 2, 3))),
         ({"x": 1, "y": 2}, None),
         ({"x": "1", "y": 2, "yaw": 3}, None),
         ({"x": True, "y": 2, "yaw": 3}, None),
@@ -285,7 +285,7 @@ def test_live_poses_are_read_when_asked() -> None:
     for stamp in (2.0, 1.0, 1.1):
         poses.put(json.dumps({"x": stamp, "y": 0, "yaw": 0, "stamp": stamp}).encode(), 0.0)
     poses.put(b"nonsense", 0.0)
-    assert poses.at(1.05) == pytest.approx(PicturePose(1.05, 0, 0))
+    assert poses.at(1.05) == pytest.approx(RobotPose(1.05, 0, 0))
     assert (poses.count, poses.bad) == (3, 1)
     assert poses.bad_reason is not None
     assert poses.at(50.0) is None  # after a tenth of a second
@@ -306,7 +306,7 @@ def test_unread_live_poses_stay_within_bounds_of_number_and_bytes() -> None:
         assert sum(map(len, kept)) == poses._bytes <= 16 * 1024 * 1024
         assert poses.dropped == (30_000 if not size else 1_000) - len(kept) > 0
         last = 29_999.0 if not size else 999.0
-        assert poses.at(last) == PicturePose(last, 0, 0)  # the newest are kept
+        assert poses.at(last) == RobotPose(last, 0, 0)  # the newest are kept
         assert poses._bytes == 0
 
 
@@ -317,9 +317,9 @@ def test_one_pose_far_in_the_future_does_not_end_the_wait(
     poses = LivePoses()
     for stamp in (1.0, 99_999.0):
         poses.put(_pose(stamp), 0.0)
-    assert poses.at(1.0) == PicturePose(1.0, 0, 0)
+    assert poses.at(1.0) == RobotPose(1.0, 0, 0)
     monkeypatch.setattr(poses._came, "wait", lambda _left: poses.put(_pose(1.05), 0.0))
-    assert poses.at(1.02) == pytest.approx(PicturePose(1.02, 0, 0))
+    assert poses.at(1.02) == pytest.approx(RobotPose(1.02, 0, 0))
 
 
 def test_poses_that_are_all_later_are_not_waited_for(

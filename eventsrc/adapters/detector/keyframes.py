@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
 
 from .picture import Picture, PictureError, Pixels
-from .poses import PicturePose, Poses
+from .poses import Poses, RobotPose
 from .vision import encode_jpeg, shrunk
 from .vision_models import Encoder, Finder, Found
 
@@ -44,14 +44,14 @@ class KeyframeGate:
     def __init__(self, limits: GateLimits) -> None:
         self._limits = limits
         self._stamp_s: float | None = None
-        self._pose: PicturePose | None = None
+        self._pose: RobotPose | None = None
 
-    def set_last(self, stamp_s: float, pose: PicturePose | None) -> None:
+    def set_last(self, stamp_s: float, pose: RobotPose | None) -> None:
         """Set the last keyframe."""
         self._stamp_s = stamp_s
         self._pose = pose or self._pose
 
-    def is_due(self, stamp_s: float, pose: PicturePose | None) -> bool:
+    def is_due(self, stamp_s: float, pose: RobotPose | None) -> bool:
         """Whether this picture should be a keyframe."""
         if self._stamp_s is None or (pose is not None and self._pose is None):
             return True
@@ -182,7 +182,7 @@ class Keyframes:
             )
 
     def _keyframe(
-        self, picture: Picture, pixels: Pixels, pose: PicturePose | None, found: Found
+        self, picture: Picture, pixels: Pixels, pose: RobotPose | None, found: Found
     ) -> DetectedKeyframe:
         number = KeyframeId(FIRST_KEYFRAME + self.counts.keyframes - 1)
         cut_out = [_cut_out(pixels, box) for box in found.boxes]
@@ -249,7 +249,7 @@ class Keyframes:
             self._note(text + last)
 
 
-def _pose_fields(pose: PicturePose | None) -> dict[str, float]:
+def _pose_fields(pose: RobotPose | None) -> dict[str, float]:
     if pose is None:
         return {}
     yaw = math.remainder(pose.yaw, math.tau)

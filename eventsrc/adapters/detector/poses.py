@@ -38,7 +38,7 @@ _MOST_PADDING: Final = 3
 _NORM_SLACK: Final = 0.1
 
 
-class PicturePose(NamedTuple):
+class RobotPose(NamedTuple):
     """The robot's pose in the map frame: metres, and radians to the left of the x axis."""
 
     x: float
@@ -51,9 +51,9 @@ class PoseTrack:
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
-        self._poses: list[PicturePose] = []
+        self._poses: list[RobotPose] = []
 
-    def add(self, stamp_s: float, pose: PicturePose) -> None:
+    def add(self, stamp_s: float, pose: RobotPose) -> None:
         """Add a pose; of equal stamps the last one counts."""
         index = bisect_right(self._stamps, stamp_s)
         if index and self._stamps[index - 1] == stamp_s:
@@ -74,7 +74,7 @@ class PoseTrack:
         after = bisect_left(self._stamps, stamp_s)
         return after < len(self._stamps) and self._stamps[after] <= stamp_s + NEAR_S + _SLACK_S
 
-    def at(self, stamp_s: float) -> PicturePose | None:
+    def at(self, stamp_s: float) -> RobotPose | None:
         """The pose at a stamp, interpolated or the nearest; None if none is within `NEAR_S`."""
         after = bisect_left(self._stamps, stamp_s)
         near = [
@@ -87,11 +87,11 @@ class PoseTrack:
             return self._between(near[0], near[1], stamp_s)
         return self._poses[near[0]] if near else None
 
-    def _between(self, before: int, after: int, stamp_s: float) -> PicturePose:
+    def _between(self, before: int, after: int, stamp_s: float) -> RobotPose:
         start, end = self._poses[before], self._poses[after]
         part = (stamp_s - self._stamps[before]) / (self._stamps[after] - self._stamps[before])
         turned = math.remainder(end.yaw - start.yaw, math.tau)
-        return PicturePose(
+        return RobotPose(
             start.x + part * (end.x - start.x),
             start.y + part * (end.y - start.y),
             math.remainder(start.yaw + part * turned, math.tau),
@@ -107,7 +107,7 @@ def poses_of_file(path: Path) -> PoseTrack:
         )
     track = PoseTrack()
     for pose in trajectory.poses:
-        track.add(pose.key, PicturePose(pose.x, pose.y, pose.yaw))
+        track.add(pose.key, RobotPose(pose.x, pose.y, pose.yaw))
     return track
 
 
@@ -149,7 +149,7 @@ class LivePoses:
             self.bad += 1
             self.bad_reason = reason
 
-    def at(self, stamp_s: float) -> PicturePose | None:
+    def at(self, stamp_s: float) -> RobotPose | None:
         """The pose at a stamp; waits up to `NEAR_S` for poses of that time to come in."""
         deadline = time.monotonic() + NEAR_S
         while True:
@@ -190,7 +190,7 @@ class MessageError(ValueError):
     """A message that is no picture or no pose; the text is the reason."""
 
 
-def pose_of(payload: bytes, received_s: float) -> tuple[float, PicturePose]:
+def pose_of(payload: bytes, received_s: float) -> tuple[float, RobotPose]:
     """Stamp, in seconds, and pose of a message. Raises MessageError."""
     if is_cdr(payload):
         try:
@@ -200,7 +200,7 @@ def pose_of(payload: bytes, received_s: float) -> tuple[float, PicturePose]:
     return _pose_of_json(payload, received_s)
 
 
-def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, PicturePose]:
+def _pose_of_cdr(fields: CdrFields, received_s: float) -> tuple[float, RobotPose]:
     stamp_s = header_stamp(fields, received_s)
     if not _is_length(fields.left(8), _POSE_BYTES, _POSE_BYTES + _COVARIANCE_BYTES):
         fields.text("child_frame_id")
@@ -235,7 +235,7 @@ def _yaw(quaternion: tuple[float, ...]) -> float:
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def _pose_of_json(payload: bytes, received_s: float) -> tuple[float, PicturePose]:
+def _pose_of_json(payload: bytes, received_s: float) -> tuple[float, RobotPose]:
     try:
         document = json.loads(payload)
     except (ValueError, RecursionError):
@@ -268,7 +268,7 @@ def _float(value: float) -> float:
         return math.inf
 
 
-def _checked(x: float, y: float, yaw: float) -> PicturePose:
+def _checked(x: float, y: float, yaw: float) -> RobotPose:
     if not (abs(x) <= MAX_POSITION_M and abs(y) <= MAX_POSITION_M and math.isfinite(yaw)):
         raise MessageError(f"a pose at x {x:g}, y {y:g}, yaw {yaw:g}")
-    return PicturePose(x, y, yaw)
+    return RobotPose(x, y, yaw)
