@@ -26,7 +26,7 @@ NINES = "9" * 5_000
 
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy: snapshots and effects are kept beside a log."""
+    """A copy: histories and effects are kept beside a log."""
     return Path(
         shutil.copytree(ROOT / "logs" / "sample", tmp_path_factory.mktemp("sample") / "log")
     )

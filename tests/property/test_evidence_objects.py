@@ -53,7 +53,7 @@ def _assignment(deltas: list[ObjectDelta]) -> dict[ObservationOrdinal, ObjectOrd
 
 
 def _through_json(state: State) -> State:
-    """As a snapshot keeps it: arrays as they are, the rest as JSON."""
+    """As it is kept: arrays as they are, the rest as JSON."""
     return {
         key: value if isinstance(value, np.ndarray) else json.loads(json.dumps(value))
         for key, value in state.items()

@@ -220,7 +220,7 @@ OBSERVATION = ObservationOrdinal(0)
 
 
 @given(stories(), st.integers(0, 30))
-def test_presence_tells_what_the_oracle_tells_also_from_a_snapshot(story, cut):
+def test_presence_tells_what_the_oracle_tells_also_when_kept_and_loaded(story, cut):
     presence, oracle = Presence(), Oracle()
     for number, (run, pose, deltas, moved) in enumerate(story):
         if number == cut:

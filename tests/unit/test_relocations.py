@@ -221,7 +221,7 @@ def test_newcomers_are_compared_when_they_have_doubled(story):
     assert story.table.asked == 2 * 4  # at 3, 6, 12, 24 with either chair
 
 
-def test_a_snapshot_goes_on_where_it_was_taken(story):
+def test_a_kept_state_goes_on_where_it_was_kept(story):
     story.table.looks |= {(0, 3): 2.5}
     story.see(3, 1, 2)
     again = Relocations(story.presence, story.table)

@@ -65,7 +65,7 @@ def test_other_content_under_the_same_number_is_a_conflict_and_the_first_stands(
 
 
 def test_the_digest_of_a_content_is_the_same_in_every_process_and_python() -> None:
-    """It is kept in snapshots. The same in CPython 3.10 to 3.13."""
+    """It is kept beside logs. The same in CPython 3.10 to 3.13."""
     seen = [detection("cup", [1, 2], det_id="x"), detection("é")]
     digest = content_digest(accepted(envelope(7, 1.0, 2.0, detections=seen)))
     assert digest.hex() == "bc7dbc8e3a8bb14f42cb6364f81a2b2d"
