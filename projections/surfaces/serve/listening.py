@@ -170,10 +170,11 @@ def serving(
     server = _Server(config, Connections(RepeatFilter(note), MAX_CONNECTIONS), tls)
     listener.setblocking(False)
     listener.listen(_BACKLOG)  # from now on clients can connect
+    port = int(listener.getsockname()[1])  # here: a server that ends closes its listener
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="http")
     thread.start()
     try:
-        yield int(listener.getsockname()[1])
+        yield port
     finally:
         server.should_exit = True
         thread.join()
