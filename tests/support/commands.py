@@ -231,8 +231,9 @@ def unused_cpu() -> UnusedCpu | None:
     return UnusedCpu(ticks[3] / _TICKS, ticks[4] / _TICKS, ticks[7] / _TICKS)
 
 
-_UNRAISABLE = ("__del__",)
-"""Functions from which Python reports an exception instead of raising it."""
+_UNRAISABLE = ("__del__", "<genexpr>")
+"""Functions from which Python reports an exception instead of raising it: the second is closed when
+it is freed, where `next` or `any` needs no more of it."""
 
 
 class Moments:
