@@ -1,5 +1,5 @@
-"""What a tail is told, and what it tells: a report, and its progress for other threads to read and
-to wait for, and for Prometheus to scrape."""
+"""Options, report and progress of a tail. Other threads read the progress and wait for it, and
+Prometheus scrapes it."""
 
 import threading
 import time

@@ -1,5 +1,6 @@
 """Messages to import and what gives them: their topics and log times, MCAP files, other logs."""
 
+from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ class ImportedMessage:
     is_grid: bool = False
 
 
-class Source:
+class Source(ABC):
     """A file, stream or log to import from. An importer defines `messages`, which sets `at`."""
 
     unit = "message"
@@ -65,9 +66,9 @@ class Source:
         """Number of messages not yielded because their format is not read."""
         self._read = 0
 
+    @abstractmethod
     def messages(self) -> Iterator[ImportedMessage]:
         """The messages in order."""
-        raise NotImplementedError
 
     def bytes_read(self) -> int:
         """Bytes read so far, of ``size_bytes``."""
