@@ -1,17 +1,16 @@
 """Addresses of ``--engine dask://`` at which no scheduler answers, or another server does."""
 
-import asyncio
 import logging
 import socket
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
 
 from projections.adapters.fleet import dask_cluster
 from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
+from tests.support.event_loops import run_apart
 
 FRAME = (17).to_bytes(8, "little") + (1).to_bytes(8, "little") + (1).to_bytes(8, "little")
 OTHERS = {
@@ -96,9 +95,8 @@ def test_a_caller_that_runs_an_event_loop_gets_the_same_error() -> None:
         with pytest.raises(ClusterError, match="the answer is not Dask's"):
             DaskCluster(address)
 
-    # In a thread of its own: tests of the page in a browser leave a loop running in this one.
-    with answering(bytes(64)) as address, ThreadPoolExecutor(1) as thread:
-        thread.submit(lambda: asyncio.run(ask(address))).result()
+    with answering(bytes(64)) as address:
+        run_apart(ask(address))
 
 
 @pytest.mark.parametrize(

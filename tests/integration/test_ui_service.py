@@ -27,6 +27,7 @@ from projections.surfaces.ui.editor import Edit, Editor
 from projections.surfaces.ui.live_watch import LiveWatch
 from projections.surfaces.ui.log_map import MOST_ALTERNATIVES, LogMap, Opened
 from projections.surfaces.ui.question_threads import GivenUp, UiService
+from tests.support.event_loops import run_apart
 from tests.support.logs import walk, write_log
 
 WAIT_S = 60.0
@@ -228,7 +229,7 @@ def test_commands_are_listed_while_the_map_and_a_fold_are_busy(
     try:
         (route,) = (each for each in app.routes if getattr(each, "path", "") == "/api/corrections")
         request = Request({"type": "http", "query_string": b"", "headers": []}, _stays)
-        answer = asyncio.run(asyncio.wait_for(route.endpoint(request), WAIT_S))
+        answer = run_apart(asyncio.wait_for(route.endpoint(request), WAIT_S))
         assert json.loads(answer.body)["corrections"] == []
         listing = service.ask_apart(lambda *_: held.wait(WAIT_S), folds=False)
     finally:

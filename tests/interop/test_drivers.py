@@ -1,8 +1,6 @@
 """The databases by other drivers than ours, and dumped and restored by PostgreSQL's own tools."""
 
-import asyncio
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import asyncpg
@@ -21,6 +19,7 @@ from projections.map.view import MapView
 from projections.postgres import rebuild
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
+from tests.support.event_loops import run_apart
 
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
 SETTINGS = Settings(eps_m=0.75, min_samples=8)
@@ -65,8 +64,7 @@ def test_asyncpg(filled: Targets, view: MapView) -> None:
             await connection.close()
         return places, vectors
 
-    with ThreadPoolExecutor(1) as thread:  # the browser of other tests leaves a loop in this one
-        places, vectors = thread.submit(lambda: asyncio.run(read())).result()
+    places, vectors = run_apart(read())
     found = [(row["place_id"].strip('"'), float(row["x"])) for row in places]
     assert sorted(found) == places_of(view)
     seen = {o.det_id: o.embedding for o in view.observations if o.class_name == "toilet"}

@@ -141,7 +141,7 @@ def _check_scheduler(address: str) -> None:
     A `Client` that meets another server, such as the dashboard, can wait without end, and cannot be
     closed.
     """
-    kind = asyncio.run(_kind_of_server(address))
+    kind = asyncio.run(_kind_of_server(address))  # noqa: TID251  in a thread of its own
     if kind != "Scheduler":
         raise ValueError(f"it is a Dask {kind}")
 
