@@ -16,7 +16,7 @@ had always been known, but only from the offset where it was recorded.
 
 import hashlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -263,7 +263,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     places: list[tuple[tuple[Keyframe, ...], bool]] = []
     objects: list[tuple[tuple[DetId, ...], bool]] = []
     names: list[PlaceName] = []
-    settings: Settings | None = None
+    document: Mapping[str, object] | None = None
     reembedded: list[Reembed] = []
     for offset, command in in_force:
         match command:
@@ -285,7 +285,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
             case CorrectPoses():
                 poses.setdefault(command.run_id, []).append(PoseCorrection.of(command))
             case UseSettings():
-                settings = Settings.from_document(command.settings)
+                document = command.settings
             case Reembed():
                 reembedded.append(command)
             case Join() | Undo():
@@ -303,7 +303,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         different=different,
         same=tuple(same),
         names=tuple(names),
-        settings=settings,
+        settings=None if document is None else Settings.from_document(document),
         reembedded=tuple(reembedded),
     )
 

@@ -67,3 +67,7 @@ class EvidenceConstants(BaseModel):
     def _in_order_of_names(cls, sizes: dict[str, float]) -> dict[str, float]:
         """One order, so that equal constants have one fingerprint."""
         return dict(sorted(sizes.items()))
+
+    def __hash__(self) -> int:
+        """Of the constants; pydantic copies a default that has none for every `Settings`."""
+        return hash(self.model_dump_json())

@@ -38,6 +38,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import mul
 from typing import TypeAlias
 
 import numpy as np
@@ -54,6 +55,8 @@ FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np
 """Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
 Bucket = tuple[str, int, int]
 """Class name, column and row of a grid cell."""
+Listed: TypeAlias = tuple[tuple[str, ...], int, int]
+"""Class names, and the column and row of the grid cell in the middle of those that list it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -73,6 +76,11 @@ class ObjectSums:
     column: int
     row: int
     other_classes: tuple[str, ...] = ()
+
+    @property
+    def listed(self) -> Listed:
+        """What determines the buckets that list it."""
+        return (self.class_name, *self.other_classes), self.column, self.row
 
 
 def object_id(det_id: DetId) -> str:
@@ -205,27 +213,37 @@ class Objects:
         side = self._radius_um * sums.count
         column, row = sums.sum_x_um // side, sums.sum_y_um // side
         if (column, row) != (sums.column, sums.row):
-            self._unlist(ordinal, sums)
+            before = sums.listed
             sums.column, sums.row = column, row
-            self._list(ordinal, sums)
+            self._list_again(ordinal, before, sums)
 
     def _list(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
         """Enter it in the nine cells around its mean position."""
-        for bucket in _buckets(sums):
+        for bucket in _buckets(*sums.listed):
             self._near.setdefault(bucket, []).append(ordinal)
 
     def _unlist(self, ordinal: ObjectOrdinal, sums: ObjectSums) -> None:
-        for bucket in _buckets(sums):
+        for bucket in _buckets(*sums.listed):
             self._near[bucket].remove(ordinal)
 
+    def _list_again(self, ordinal: ObjectOrdinal, before: Listed, sums: ObjectSums) -> None:
+        """Remove it where it was listed before and is not now; enter it where it was not."""
+        if sums.listed == before:
+            return
+        old, new = _buckets(*before), _buckets(*sums.listed)
+        for bucket in old - new:
+            self._near[bucket].remove(ordinal)
+        for bucket in new - old:
+            self._near.setdefault(bucket, []).append(ordinal)
 
-def _buckets(sums: ObjectSums) -> list[Bucket]:
-    return [
-        (class_name, sums.column + dx, sums.row + dy)
-        for class_name in (sums.class_name, *sums.other_classes)
+
+def _buckets(classes: tuple[str, ...], column: int, row: int) -> set[Bucket]:
+    return {
+        (class_name, column + dx, row + dy)
+        for class_name in classes
         for dx in (-1, 0, 1)
         for dy in (-1, 0, 1)
-    ]
+    }
 
 
 def _object_seen(
@@ -321,11 +339,16 @@ class ConstrainedObjects(Objects):
                 f"objects {survivor} and {absorbed} have more than {MAX_IN_A_SUM} observations "
                 "together, the bound of exact arithmetic"
             )
-        self._unlist(survivor, sums)
+        before = sums.listed
         self._unlist(absorbed, other)
         self._absorbed.add(absorbed)
+        if sums.count * other.count <= MAX_IN_ONE_DOT:
+            dot = int(sums.vector_sum.dot(other.vector_sum))
+        else:
+            one, two = (map(int, each.vector_sum.tolist()) for each in (sums, other))
+            dot = sum(map(mul, one, two))
+        sums.norm2 += 2 * dot + other.norm2
         sums.vector_sum += other.vector_sum
-        sums.norm2 = sum(component**2 for component in map(int, sums.vector_sum.tolist()))
         sums.count += other.count
         sums.sum_x_um += other.sum_x_um
         sums.sum_y_um += other.sum_y_um
@@ -335,7 +358,7 @@ class ConstrainedObjects(Objects):
         sums.column, sums.row = sums.sum_x_um // side, sums.sum_y_um // side
         classes = (*sums.other_classes, other.class_name, *other.other_classes)
         sums.other_classes = tuple(c for c in dict.fromkeys(classes) if c != sums.class_name)
-        self._list(survivor, sums)
+        self._list_again(survivor, before, sums)
         moved = self._inside.pop(absorbed, set())
         self._inside.setdefault(survivor, set()).update(moved)
         self._object_of |= dict.fromkeys(moved, survivor)
@@ -354,6 +377,6 @@ class ConstrainedObjects(Objects):
         """Add a class of which the Object has a member."""
         sums = self.sums[ordinal]
         if class_name not in (sums.class_name, *sums.other_classes):
-            self._unlist(ordinal, sums)
+            before = sums.listed
             sums.other_classes += (class_name,)
-            self._list(ordinal, sums)
+            self._list_again(ordinal, before, sums)

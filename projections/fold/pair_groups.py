@@ -189,12 +189,14 @@ class PairGroups(Generic[_Thing]):
         """The pairs of a group of ``groups`` and one of ``others`` that are kept apart."""
         if len(groups) > len(others):
             return [(group, other) for other, group in self.conflicts(others, groups)]
-        return [
-            (group, other)
-            for group in groups
-            for other in self._against.get(group, _NONE).intersection(others)
-            if other != group
-        ]
+        found = list[tuple[int, int]]()
+        for group in groups:
+            if against := self._against.get(group):
+                less, more = (against, others) if len(against) < len(others) else (others, against)
+                for other in less:
+                    if other in more and other != group:
+                        found.append((group, other))
+        return found
 
 
 def without_contradictions(

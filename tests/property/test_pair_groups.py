@@ -1,5 +1,6 @@
 """Which of contradicting statements count, and the groups they make, by brute force."""
 
+from collections.abc import Iterator
 from itertools import chain, combinations, product
 
 from hypothesis import given
@@ -76,3 +77,19 @@ def test_pairs_kept_as_divided_sets_are_those_of_two_parts(sets: list[list[set[s
         assert ((a, b) in apart) is ((min(a, b), max(a, b)) in pairs)
     some = NAMES[:3]
     assert apart.between(some, NAMES) == [p for p in pairs if not set(some).isdisjoint(p)]
+
+
+class _Unlisted(dict[int, int]):
+    """A dict whose keys may be looked up and not gone through."""
+
+    def __iter__(self) -> Iterator[int]:
+        raise AssertionError("it goes through the many")
+
+
+def test_conflicts_go_through_the_fewer_of_a_place_with_many_anchors() -> None:
+    """Else ten thousand `keep-apart` in one place cost a minute."""
+    groups = PairGroups([], ApartPairs.of([("a", "b")]))
+    a, b = groups.group_of["a"], groups.group_of["b"]
+    many = _Unlisted({n: n for n in range(1000)})
+    assert groups.conflicts([a], many) == [(a, b)]
+    assert groups.conflicts(many, [a]) == [(b, a)]
