@@ -194,7 +194,8 @@ class Settings(BaseModel):
         return {name: here.get(name) for name in names if here.get(name) != before.get(name)}
 
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
-        """These settings changed by ``name=value`` texts, as ``option`` takes them.
+        """These settings changed by ``name=value`` texts, as ``option`` takes them. ``preset=NAME``
+        stands for the assignments of a preset.
 
         Raises SettingsError that names the option, the setting and the rule it breaks.
         """
@@ -242,9 +243,25 @@ def read_settings(file: Path) -> Settings:
 
 
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"page": ("places=page", "eps_m=1.5", "min_samples=3"), "rooms": ("places=rooms",)}
+    {
+        "classic": (
+            *("places=page", "eps_m=1.5", "min_samples=3"),
+            *("fusion=page", "fusion_radius_m=3.0", "fusion_similarity=0.7"),
+        ),
+        "rooms": ("places=rooms", "fusion=page"),
+        "full": ("places=rooms", "fusion=evidence"),
+    }
 )
-"""Settings by name, as assignments for `Settings.with_assignments`."""
+"""Settings by name, as assignments: each names the rules of places and of fusion."""
+_OLD_NAMES: Final = {"page": "classic"}
+
+
+def preset_assignments(name: str) -> tuple[str, ...]:
+    """The assignments of a preset, also by its old name. Raises SettingsError."""
+    found = PRESETS.get(_OLD_NAMES.get(name, name))
+    if found is None:
+        raise SettingsError(f"no preset {_shown(name)}; there are {', '.join(PRESETS)}")
+    return found
 
 
 def _rule(error: ErrorDetails) -> str:
@@ -333,6 +350,10 @@ def _assign(values: dict[str, Any], text: str) -> None:
     name, value = split[0].strip(), split[2].strip()
     if not split[1]:
         raise SettingsError("write it as name=value, such as eps_m=1.0")
+    if name == "preset":
+        for each in preset_assignments(value):
+            _assign(values, each)
+        return
     given = None if value in ("", "none") else value
     if name.startswith(_SIZES):
         values["evidence"]["sizes_m"].pop(name[len(_SIZES) :], None)

@@ -196,7 +196,7 @@ def _walls(floor: str | None, delta: MapGiven, view: MapView) -> str:
     line = f"walls    {size}{where}, from {given.source} at offset {delta.offset:,}"
     if view.settings.places == "rooms":
         return line
-    return f"{line}; places=page does not use them for places, --preset rooms does"
+    return f"{line}; places=page does not use them for places, --preset full does"
 
 
 def _standing(view: MapView) -> str:
@@ -317,7 +317,7 @@ def places_advice(counts: Mapping[str, int], settings: Settings) -> str | None:
         return None
     if noise >= _MOSTLY * posed:
         return (
-            f"{noise:,} of {counted(posed, 'keyframe')} with a pose are in no place; --preset rooms"
+            f"{noise:,} of {counted(posed, 'keyframe')} with a pose are in no place; --preset full"
             " puts each into one"
         )
     if places != 1:
@@ -329,4 +329,4 @@ def places_advice(counts: Mapping[str, int], settings: Settings) -> str | None:
             f"{found}; if that is more than one room, a smaller rooms.drive_m than"
             f" {settings.rooms.drive_m:g} tells them apart"
         )
-    return f"{found}; if that is more than one room, --preset rooms tells them apart"
+    return f"{found}; if that is more than one room, --preset full tells them apart"

@@ -193,7 +193,7 @@ def test_state_names_the_map_only_where_there_is_one(tmp_path: Path) -> None:
         "digest": HALL.digest(),
     }
     named = "walls    10 × 5 cells of 1 m, from drawing at offset 8"
-    unused = "; places=page does not use them for places, --preset rooms does"
+    unused = "; places=page does not use them for places, --preset full does"
     assert f"{named}{unused}\n" in run("state", "mapped").out
     assert f"{named}\n" in run("state", "mapped", "--preset", "rooms").out
 

@@ -53,7 +53,7 @@ OFFERED = {
     "mapfold stat": {"state", "status"},
     "mapfold db ch": {"check"},
     "mapfold state log --set": {"--set", "--settings"},
-    "mapfold draw log --preset ": {"page", "rooms"},
+    "mapfold draw log --preset ": {"classic", "full", "rooms"},
     "mapfold state l": set(),  # so that bash offers files
 }
 

@@ -23,11 +23,11 @@ def test_no_advice_for_a_usual_map(poses: int, noise: int, places: int, settings
 def test_everything_in_one_place() -> None:
     assert advice(1234, 0, 1) == (
         "all 1,234 keyframes with a pose are in one place; if that is more than one room,"
-        " --preset rooms tells them apart"
+        " --preset full tells them apart"
     )
     assert advice(20, 3, 1) == (
         "all 20 keyframes with a pose but 3 are in one place; if that is more than one room,"
-        " --preset rooms tells them apart"
+        " --preset full tells them apart"
     )
 
 
@@ -42,5 +42,5 @@ def test_everything_in_one_place_under_rooms() -> None:
 @pytest.mark.parametrize(("noise", "places"), [(80, 1), (80, 2), (100, 0)])
 def test_hardly_anything_in_a_place(noise: int, places: int) -> None:
     assert advice(100, noise, places) == (
-        f"{noise} of 100 keyframes with a pose are in no place; --preset rooms puts each into one"
+        f"{noise} of 100 keyframes with a pose are in no place; --preset full puts each into one"
     )

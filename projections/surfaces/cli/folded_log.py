@@ -7,7 +7,6 @@ that ``--set`` changes it; ``--space NAME`` is ``--set embedding_model=NAME`` an
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -21,7 +20,7 @@ from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.map_errors import SettingsError
-from projections.fold.settings import PRESETS, Settings, read_settings
+from projections.fold.settings import PRESETS, Settings, preset_assignments, read_settings
 from projections.map.own_events import read_corrections
 
 from .terminal import say
@@ -57,16 +56,14 @@ def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
 
 # Settings of the fold
 
-Preset = StrEnum("Preset", list(PRESETS))  # type: ignore[misc]
-"""The values of ``--preset``."""
-
 PresetOption = Annotated[
-    Preset | None,
+    str | None,
     typer.Option(
         "--preset",
         metavar="|".join(PRESETS),
-        help="Named settings: page, for places by DBSCAN, or rooms, for places that are rooms;"
-        " --set goes on top.",
+        autocompletion=lambda: list(PRESETS),
+        help="Named settings: classic, places by DBSCAN; rooms, places that are rooms; full, rooms"
+        " and objects by evidence. --set goes on top.",
     ),
 ]
 SpaceOption = Annotated[
@@ -108,10 +105,18 @@ class NamedSettings:
     space: SpaceOption = None
 
     def around(self, assignments: list[str] | None) -> list[str]:
-        """All of them as assignments, with those of ``--set`` in between."""
-        preset = () if self.preset is None else PRESETS[self.preset]
+        """All of them as assignments, with those of ``--set`` in between. Raises SettingsError for
+        a preset that does not exist."""
+        preset = () if self.preset is None else _preset(self.preset)
         space = () if self.space is None else (f"embedding_model={self.space}",)
         return [*preset, *(assignments or ()), *space]
+
+
+def _preset(name: str) -> tuple[str, ...]:
+    try:
+        return preset_assignments(name)
+    except SettingsError as error:
+        raise SettingsError(f"--preset: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)

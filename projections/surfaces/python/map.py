@@ -16,7 +16,7 @@ from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import SettingsError
-from projections.fold.settings import CameraConstants, Settings, read_settings
+from projections.fold.settings import CameraConstants, Settings, preset_assignments, read_settings
 from projections.localize.relocalize import (
     Answer,
     ExactIndex,
@@ -193,6 +193,7 @@ def fold(
     *,
     at: int | str = "end",
     settings: SettingsLike = None,
+    preset: str | None = None,
     known_at: int | str | None = None,
     embeddings: bool = True,
 ) -> Map:
@@ -200,9 +201,10 @@ def fold(
 
     ``at`` is the point up to which it is folded: a number of events, a time in ISO 8601,
     ``RUN:KEYFRAME`` or ``end``. ``settings`` are `Settings`, a mapping of their names as in
-    ``--settings``, or a file of these; by default those that the log names. Commands recorded
-    before ``known_at``, by default ``at``, are obeyed. Without ``embeddings`` the map takes less
-    memory and cannot be asked by `relocalize`.
+    ``--settings``, or a file of these; by default those that the log names. ``preset`` changes
+    them: ``classic``, ``rooms`` or ``full``. Commands recorded before ``known_at``, by default
+    ``at``, are obeyed. Without ``embeddings`` the map takes less memory and cannot be asked by
+    `relocalize`.
 
     Raises LogNotFound, NotALog or LogDamaged for the log, MisuseError for a point that it does not
     have, SettingsError for settings, FoldError for an event that cannot be folded.
@@ -215,16 +217,21 @@ def fold(
         end = resolve(reader, str(at))
         known = end if known_at is None else resolve(reader, str(known_at))
         corrections = read_corrections(reader, known)
-        chosen = settings_from(settings)(corrections)
+        chosen = settings_from(settings, preset)(corrections)
         view = fold_log(reader, chosen, end, keep_embeddings=embeddings, corrections=corrections)[1]
     return Map(view, known)
 
 
-def settings_from(settings: SettingsLike) -> Callable[[Corrections], Settings]:
-    """The settings under some corrections: those given, else those that the log names."""
+def settings_from(
+    settings: SettingsLike, preset: str | None = None
+) -> Callable[[Corrections], Settings]:
+    """The settings under some corrections: those given, else those that the log names, changed by
+    a preset. Raises SettingsError."""
+    assignments = () if preset is None else preset_assignments(preset)
     if settings is None:
-        return lambda corrections: corrections.settings or Settings()
-    chosen = settings if isinstance(settings, Settings) else _parse(settings)
+        return lambda known: (known.settings or Settings()).with_assignments(assignments)
+    given = settings if isinstance(settings, Settings) else _parse(settings)
+    chosen = given.with_assignments(assignments)
     return lambda _: chosen
 
 

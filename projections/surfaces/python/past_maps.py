@@ -34,9 +34,9 @@ class Timeline:
     ``RUN:KEYFRAME`` or ``end``.
 
     The log is folded once, at the first question, and its history kept in files beside the log
-    (``LOG.history``, a cache), unless ``cache`` is false. ``settings`` are as in `fold`. Answers
-    are the documents that the commands print with ``--json``. Raises LogNotFound, NotALog,
-    LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
+    (``LOG.history``, a cache), unless ``cache`` is false. ``settings`` and ``preset`` are as in
+    `fold`. Answers are the documents that the commands print with ``--json``. Raises LogNotFound,
+    NotALog, LogDamaged or SettingsError, and MisuseError for a point that the log does not have.
 
     Several threads may ask one timeline; they are answered one after another. A question that is
     interrupted, by Ctrl-C or the stop button of a notebook, can be asked again.
@@ -50,11 +50,16 @@ class Timeline:
     """
 
     def __init__(
-        self, log: str | Path, settings: SettingsLike = None, *, cache: bool = True
+        self,
+        log: str | Path,
+        settings: SettingsLike = None,
+        *,
+        preset: str | None = None,
+        cache: bool = True,
     ) -> None:
         self._lock = threading.RLock()
         self._log = Path(log)
-        self._chosen = settings_from(settings)
+        self._chosen = settings_from(settings, preset)
         self._timeline = history.LogTimeline(self._log, self._settings, cache=cache)
 
     def __enter__(self) -> "Timeline":

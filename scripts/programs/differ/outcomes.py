@@ -26,7 +26,6 @@ CHOICES = [
     *((name, *assignments) for name, assignments in PRESETS.items()),
     ("classic, close together", "eps_m=0.7", "fusion_radius_m=2.0"),
     ("evidence", "fusion=evidence", "eps_m=0.8"),
-    ("full", "places=rooms", "fusion=evidence"),
 ]
 """Settings that a log is folded under where it names none: a name, and assignments."""
 
