@@ -27,7 +27,7 @@ are those of `Places`.
 """
 
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple, TypeAlias
 
 import msgspec
@@ -186,19 +186,21 @@ class ConstrainedPlaces(Places):
         forest = _Forest()
         for rank in ranks.values():
             inside = self._anchors.inside(PlaceOrdinal(rank[1])) if rank[0] == 0 else {}
-            forest.inside[rank] = dict(inside)
+            forest.inside[rank] = [inside, {}]
         for point in filter(self._is_new_anchor, fresh):
-            inside = forest.inside[ranks[self.core_index.first_core(point)]]
+            inside, entering = forest.inside[ranks[self.core_index.first_core(point)]]
             for group, keyframe in self._own(point).items():
-                inside.setdefault(group, keyframe)
+                if group not in inside:
+                    entering.setdefault(group, keyframe)
         for link in sorted(links, key=lambda each: sorted((ranks[each.cell], ranks[each.near]))):
             one, other = forest.find(ranks[link.cell]), forest.find(ranks[link.near])
             if one != other:
-                apart = self._anchors.apart(forest.inside[one], forest.inside[other])
-                if apart is None:
-                    forest.unite(one, other)
+                sides = product(forest.inside[one], forest.inside[other])
+                found = [apart for side in sides if (apart := self._anchors.apart(*side))]
+                if found:
+                    self._refusals.append(RefusedLink(link, min(found)))
                 else:
-                    self._refusals.append(RefusedLink(link, apart))
+                    forest.unite(one, other)
         return self._parts_of(forest, ranks, links, fresh)
 
     def _fresh_cells(self, fresh: list[int]) -> dict[int, Rank]:
@@ -326,10 +328,11 @@ def _both_ways(link: CellLink) -> tuple[tuple[int, int], tuple[int, int]]:
 
 class _Forest:
     """The links so far, as union-find by rank; a root is the earliest member. ``inside`` are the
-    anchors below each root."""
+    anchors below each root: those of places, which may be many and are not copied, and those that
+    enter them."""
 
     def __init__(self) -> None:
-        self.inside: dict[Rank, Inside] = {}
+        self.inside: dict[Rank, list[Inside]] = {}
         self._parents: dict[Rank, Rank] = {}
 
     def find(self, rank: Rank) -> Rank:
@@ -341,6 +344,4 @@ class _Forest:
         """Unite two roots."""
         first, second = sorted((one, other))
         self._parents[second] = first
-        for group, keyframe in self.inside[second].items():
-            inside = self.inside[first]
-            inside[group] = min(keyframe, inside.get(group, keyframe))
+        self.inside[first] += self.inside[second]
