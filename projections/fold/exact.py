@@ -27,6 +27,7 @@ are the same everywhere, but less accurate.
 
 import math
 from collections.abc import Sequence
+from operator import mul
 from typing import TypeAlias
 
 import numpy as np
@@ -192,6 +193,7 @@ MAX_IN_A_SUM = 1 << 32
 """Unit vectors; a component of their sum, a little over 2³² · 2²⁰ at most, is below 2⁵³. At ten
 observations of one object a second, that is thirteen years."""
 _HALF_BITS = 21
+_FEW = 16
 _SAFE_UM = 1e12
 
 
@@ -278,6 +280,20 @@ def long_dot(vector_sum: NDArray[np.float64], unit: NDArray[np.float64]) -> int:
     high = np.floor(np.ldexp(vector_sum, -_HALF_BITS))
     low = vector_sum - np.ldexp(high, _HALF_BITS)
     return (int(high.dot(unit)) << _HALF_BITS) + int(low.dot(unit))
+
+
+def dot_of_sums(
+    one: NDArray[np.float64], count: int, other: NDArray[np.float64], other_count: int
+) -> int:
+    """The exact product of two sums of ``count`` and ``other_count`` unit vectors, of shape (dim,)
+    both."""
+    if count < other_count:
+        return dot_of_sums(other, other_count, one, count)
+    if count * other_count <= MAX_IN_ONE_DOT:
+        return int(one.dot(other))
+    if other_count <= _FEW and count * other_count <= MAX_IN_A_SUM:
+        return long_dot(one, other)  # neither product reaches 2⁵³ either
+    return sum(map(mul, map(int, one.tolist()), map(int, other.tolist())))
 
 
 def distance_um(ax: int, ay: int, bx: int, by: int) -> int:

@@ -38,7 +38,6 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import mul
 from typing import TypeAlias
 
 import numpy as np
@@ -48,7 +47,7 @@ from eventsrc.envelope.model import DetId, Offset
 
 from . import State
 from .deltas import ObjectFound, ObjectOrdinal, ObjectSeen, ObjectsMerged, ObservationOrdinal
-from .exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, long_dot, metres_to_um
+from .exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, dot_of_sums, long_dot, metres_to_um
 from .pair_groups import PairGroups
 
 FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
@@ -342,11 +341,7 @@ class ConstrainedObjects(Objects):
         before = sums.listed
         self._unlist(absorbed, other)
         self._absorbed.add(absorbed)
-        if sums.count * other.count <= MAX_IN_ONE_DOT:
-            dot = int(sums.vector_sum.dot(other.vector_sum))
-        else:
-            one, two = (map(int, each.vector_sum.tolist()) for each in (sums, other))
-            dot = sum(map(mul, one, two))
+        dot = dot_of_sums(sums.vector_sum, sums.count, other.vector_sum, other.count)
         sums.norm2 += 2 * dot + other.norm2
         sums.vector_sum += other.vector_sum
         sums.count += other.count

@@ -262,7 +262,8 @@ class MapView:
         if absorbed is not None:
             for observation in absorbed.observations:
                 self.observations[observation].object = delta.survivor
-            survivor.observations = sorted(survivor.observations + absorbed.observations)
+            survivor.observations += absorbed.observations
+            survivor.observations.sort()
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None

@@ -9,6 +9,7 @@ Processor time of running processes and of the machine, from /proc.
 Interrupts as those of Ctrl-C at any moment: a KeyboardInterrupt where Python handles signals.
 """
 
+import inspect
 import json
 import os
 import signal
@@ -231,9 +232,11 @@ def unused_cpu() -> UnusedCpu | None:
     return UnusedCpu(ticks[3] / _TICKS, ticks[4] / _TICKS, ticks[7] / _TICKS)
 
 
-_UNRAISABLE = ("__del__", "<genexpr>")
-"""Functions from which Python reports an exception instead of raising it: the second is closed when
-it is freed, where `next` or `any` needs no more of it."""
+def reports_exceptions(frame: FrameType) -> bool:
+    """Whether Python may report an exception from it instead of raising it: it is a ``__del__``, or
+    a generator, which is closed when it is freed and needs no more of it."""
+    code = frame.f_code
+    return code.co_name == "__del__" or bool(code.co_flags & inspect.CO_GENERATOR)
 
 
 class Moments:
@@ -261,7 +264,7 @@ class Moments:
             sys.setprofile(None)
 
     def _pass(self, frame: FrameType, event: str, _: Any) -> None:
-        if event == "c_call" or frame.f_code.co_name in _UNRAISABLE:  # no moment before a C call
+        if event == "c_call" or reports_exceptions(frame):  # no moment before a C call
             return
         self.count += 1
         if event == "call" and frame.f_code.co_name == self._mark:

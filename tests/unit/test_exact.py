@@ -13,6 +13,7 @@ from projections.fold.exact import (
     MAX_DIMENSION,
     Q40,
     UNIT,
+    dot_of_sums,
     long_dot,
     mean_m,
     metres_to_um,
@@ -112,6 +113,21 @@ def test_the_product_of_a_long_sum_is_that_of_python_integers(count: int, dim: i
     for total in (count * first, -count * first, count * unit + 1):
         expected = sum(int(a) * int(b) for a, b in zip(total, unit, strict=True))
         assert long_dot(total, unit) == expected
+
+
+@pytest.mark.parametrize(
+    "counts", [(64, 64), (65, 64), (1 << 28, 16), (16, 1 << 28), (1 << 20, 40)]
+)
+@pytest.mark.parametrize("dim", [1, 512, 16_000])
+def test_the_product_of_two_sums_is_that_of_python_integers(
+    counts: tuple[int, int], dim: int
+) -> None:
+    rng = np.random.default_rng(dim)
+    first, second = unit_rows(rng.normal(size=(2, dim)))
+    for unit in (first, second):
+        sums = [counts[0] * first + 1, counts[1] * unit]
+        expected = sum(int(a) * int(b) for a, b in zip(*sums, strict=True))
+        assert dot_of_sums(sums[0], counts[0], sums[1], counts[1]) == expected
 
 
 def test_the_largest_dimension_keeps_its_sums_exact() -> None:

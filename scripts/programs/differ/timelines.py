@@ -18,6 +18,7 @@ from projections.history.rule_folds import Rules, fold_all
 from projections.map.own_events import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
+from tests.support.commands import reports_exceptions
 from tests.support.histories import whole
 
 from .outcomes import Chosen, Tally, folded, outcome, stories
@@ -168,10 +169,10 @@ def interrupt(work: Callable[[], object], calls: int) -> None:
     """Do ``work``, in which the ``calls``-th function call raises; suppress that."""
     left, armed = calls, True
 
-    def counted(_frame: FrameType, event: str, _: object) -> None:
+    def counted(frame: FrameType, event: str, _: object) -> None:
         nonlocal left
         left -= armed and event in ("call", "c_call")
-        if armed and left == 0:
+        if armed and left <= 0 and not reports_exceptions(frame):
             sys.setprofile(None)
             raise Interrupted
 
