@@ -245,14 +245,15 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
     """An observation was assigned to an Object (the founding one too); the Object's new values.
 
     ``similarity_q40`` is the cosine with the Object's mean embedding before this observation, as an
-    exact multiple of 2⁻⁴⁰ (2⁴⁰ for the founding one). The mean position in metres is
+    exact multiple of 2⁻⁴⁰ (2⁴⁰ for the founding one); by evidence that with the most similar look
+    kept, None where there was no embedding to compare. The mean position in metres is
     ``sum / (obs_count * 1_000_000)``. ``first_seen`` and ``last_seen`` are robot timestamps.
     """
 
     offset: Offset
     object: ObjectOrdinal
     observation: ObservationOrdinal
-    similarity_q40: int
+    similarity_q40: int | None
     obs_count: int
     sum_x_um: int
     sum_y_um: int

@@ -21,8 +21,9 @@ from .sights import Sight, Sighting
 from .thing_index import ThingIndex
 from .things import LABEL_WEIGHT, FusedThing, LabelCounts
 
-Match: TypeAlias = tuple[float, ObjectOrdinal, float]
-"""The evidence for an Object, its ordinal, and the cosine of the best pair of looks."""
+Match: TypeAlias = tuple[float, ObjectOrdinal, float | None]
+"""The evidence for an Object, its ordinal, and the cosine of the best pair of looks, None where one
+of the two has no look."""
 _MOST = 32
 
 
@@ -128,10 +129,15 @@ def _largest_sum(wanted: Sequence[Sequence[Match]]) -> list[Match | None]:
     return taken
 
 
+_WITHOUT_LOOKS = 0.0, 1.0
+"""The ratio that stands for that of the looks where there are not two, by whether the labels agree:
+this thing's being seen again is that much likelier than another one of its class, unseen so far."""
+_SEEN_ONCE = 1.5
+"""What such a pair loses with a thing seen once: many of these are phantoms and wrong labels."""
 _LEAST_EXPONENT = -50.0
-Choice: TypeAlias = tuple[ObjectOrdinal | None, float, float]
-"""An Object, None for a new one; the cosine of the best pair of looks; the probability that it is
-that Object and no other."""
+Choice: TypeAlias = tuple[ObjectOrdinal | None, float | None, float]
+"""An Object, None for a new one; the cosine of the best pair of looks, as in `Match`; the
+probability that it is that Object and no other."""
 _NEW: Choice = (None, 1.0, 1.0)
 
 
@@ -227,6 +233,12 @@ class Matching:
             if self._groups is not None and self._is_apart(
                 self._groups, thing, sightings[column], object_of
             ):
+                continue
+            if not (inverses[column] and thing.marks):
+                value += _WITHOUT_LOOKS[agree]
+                if thing.count == 1:
+                    value -= _SEEN_ONCE
+                matches[column].append((value, ordinal, None))
                 continue
             ratio, cosine = ratio_of_looks(
                 thing.looks.dot(looks[column]).tolist(),

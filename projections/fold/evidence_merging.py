@@ -40,6 +40,8 @@ _FARTHEST_CHI2 = 2.0 * (_LOG_AREA - _LEAST_GEOMETRY) - 2.0 * log(2.0 * COMMON_M2
 """An upper bound of χ² for pairs of estimates with enough evidence: the variance of their
 difference is at least twice the common one in every direction."""
 _SHARE_OF_PICTURES = 10
+_WITHOUT_LOOKS = -1.0, 1.0
+"""The ratio that stands for that of the looks where one has none, by whether the labels agree."""
 _MOST_PER_PAIR = 6.0
 _UNIT = 1 << 20
 
@@ -123,8 +125,16 @@ class Merging:
         """The log-likelihood ratio that a thing and each of several others are one, by looks (the
         mean over pairs of exemplars) and labels. The others' exemplars are columns of one
         matrix."""
+        looked = [bool(one.marks and other.marks) for other in others]
+        if not all(looked):
+            alike = [other for other, is_one in zip(others, looked, strict=True) if is_one]
+            values = iter(self._looks(one, alike) if alike else ())
+            return [
+                next(values) if is_one else self._without_looks(one, other)
+                for other, is_one in zip(others, looked, strict=True)
+            ]
         counts = [len(other.marks) for other in others]
-        agree = [o.class_name in one.classes or one.class_name in o.classes for o in others]
+        agree = [_labels_agree(one, other) for other in others]
         a = np.array(one.by_row())
         b = np.array([mark for other in others for mark in other.by_row()])
         looks = np.concatenate([other.looks[: len(other.marks)] for other in others])
@@ -140,14 +150,18 @@ class Merging:
         )
         ratios = np.maximum(np.minimum(ratios, _MOST_PER_PAIR), -_MOST_PER_PAIR)
         sums = np.rint(ratios * _UNIT).astype(np.int64).sum(axis=0)  # exact: integers
-        values: list[float] = []
+        found: list[float] = []
         first = 0
         for other, count in zip(others, counts, strict=True):
             total = int(sums[first : first + count].sum())
             mean = total / (len(one.marks) * count * _UNIT)
-            values.append(mean + self._by_labels(one, other))
+            found.append(mean + self._by_labels(one, other))
             first += count
-        return values
+        return found
+
+    def _without_looks(self, one: FusedThing, other: FusedThing) -> float:
+        """`_looks` of a pair of which one has no look."""
+        return _WITHOUT_LOOKS[_labels_agree(one, other)] + self._by_labels(one, other)
 
     def _by_labels(self, one: FusedThing, other: FusedThing) -> float:
         """The part of the labels in `_looks`."""
@@ -155,6 +169,11 @@ class Merging:
         for label, count in other.classes.items():
             labels += count * self._labels.ratio(one, label, self._labels.usual(label))
         return LABEL_WEIGHT * labels / other.count
+
+
+def _labels_agree(one: FusedThing, other: FusedThing) -> bool:
+    """Whether the class of one is among the labels of the other."""
+    return other.class_name in one.classes or one.class_name in other.classes
 
 
 def _geometry(thing: FusedThing, other: FusedThing) -> tuple[float, float]:
@@ -180,8 +199,8 @@ _UNIT = 1 << 20
 def turned_looks(
     one: FusedThing, others: Sequence[FusedThing], look_ratios: LookRatios, scale: LookScale
 ) -> list[float]:
-    """The logarithm of the ratio for a thing and each of several others of its class: their
-    exemplars are columns of one matrix."""
+    """The logarithm of the ratio for a thing and each of several others of its class, all with
+    exemplars: those of the others are columns of one matrix."""
     if not others:
         return []
     own, counts = len(one.marks), [len(other.marks) for other in others]

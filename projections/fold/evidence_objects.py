@@ -7,7 +7,8 @@ The rules, for the observations of one picture:
 2.  The evidence that an observation is of a candidate is a log-likelihood ratio: of its sight and
     the estimate (`agreement`), of its look and the exemplars (the mean of the best four; each that
     is missing costs an eighth), and half of that of its label and the labels seen so far
-    (`LabelCounts`). Below −5 the sight alone rules a candidate out.
+    (`LabelCounts`). Below −5 the sight alone rules a candidate out. Where there is no look on one
+    side, since a detection came without an embedding, constants stand for the looks' part.
 3.  Each observation goes to one Object, and each Object gets one observation of a picture: two
     things in one picture are not one. Of all such choices that with the largest sum of evidence is
     taken, a pair's being above 0 (`assign`). What is left founds Objects. Where other Objects,
@@ -116,7 +117,7 @@ class EvidenceObjects:
         labels = [sighting.class_name for sighting in sightings]
         looks, inverses = looks_of([sighting.vector for sighting in sightings])
         sights = self._sights.of(pose, camera, sightings, error)
-        self._scale.learn(labels, looks)
+        self._scale.learn(labels, looks, inverses)
         self._slopes.learn(sights)
         self._labels.learn(labels)
         chosen = self._matching.choose(
@@ -145,7 +146,7 @@ class EvidenceObjects:
                 _count(thing, ordinal, sighting.class_name, pose, timestamp)
             sight = sights[k]
             spot = thing.spots.add(sight, share)
-            if share >= _SURE:
+            if share >= _SURE and inverses[k]:
                 thing.keep(looks[k], inverses[k], sight.side_cos, sight.side_sin, run)
             index.solve(ordinal, thing, spot)
             seen.append(ordinal)
@@ -154,7 +155,7 @@ class EvidenceObjects:
                     offset,
                     ordinal,
                     sighting.observation,
-                    Q40 if wanted is None else round(cosine * Q40),
+                    _similarity(wanted, cosine) if inverses[k] else None,
                     thing.count,
                     thing.sum_x_um,
                     thing.sum_y_um,
@@ -202,16 +203,18 @@ class EvidenceObjects:
 
     def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
         """The log-likelihood ratio of the looks of an Object and of each of several others,
-        whatever their headings (`turned_looks`); None where a command keeps them apart."""
+        whatever their headings (`turned_looks`); None where a command keeps them apart, or one of
+        them has no look."""
         thing, things = self._index.thing(one), [self._index.thing(other) for other in others]
-        looks = turned_looks(thing, things, self._look_ratios, self._scale)
         groups = self._groups
-        if groups is None:
-            return [*looks]
-        return [
-            None if groups.conflicts(thing.groups, other.groups) else look
-            for look, other in zip(looks, things, strict=True)
+        may_be = [
+            bool(thing.marks and other.marks)
+            and not (groups and groups.conflicts(thing.groups, other.groups))
+            for other in things
         ]
+        alike = [other for other, may in zip(things, may_be, strict=True) if may]
+        looks = iter(turned_looks(thing, alike, self._look_ratios, self._scale))
+        return [next(looks) if may else None for may in may_be]
 
     def relocate(self, offset: Offset, moved: MovedObject) -> list[ObjectDelta]:
         """Merge an Object with the one found at its new position, and estimate it from the later
@@ -305,6 +308,13 @@ class EvidenceObjects:
             thing.last_seen,
             evidence,
         )
+
+
+def _similarity(wanted: ObjectOrdinal | None, cosine: float | None) -> int | None:
+    """The similarity of an observation that has a look, as in `ObjectSeen`."""
+    if wanted is None:
+        return Q40
+    return None if cosine is None else round(cosine * Q40)
 
 
 def _count(

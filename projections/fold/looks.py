@@ -48,11 +48,19 @@ _FIRST_GUESS, _GUESS_WEIGHT = 0.5, 0.5
 
 
 def looks_of(vectors: Sequence[Floats]) -> tuple[Looks, list[float]]:
-    """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths."""
+    """Looks of unit vectors in multiples of 2⁻²⁰, and the inverses of their lengths. An empty
+    vector has no look: a row of zeros, and 0."""
+    are_looks = [len(vector) > 0 for vector in vectors]
+    if not all(are_looks):
+        nothing = np.zeros(max(map(len, vectors)))
+        vectors = [vector if len(vector) else nothing for vector in vectors]
     looks = np.array(vectors, np.float32)  # exact: 21 bits
     looks *= np.float32(LOOK_UNIT / UNIT)
     np.rint(looks, out=looks)
-    return looks, [1.0 / math.sqrt(max(float(look.dot(look)), 1.0)) for look in looks]
+    return looks, [
+        1.0 / math.sqrt(max(float(look.dot(look)), 1.0)) if is_look else 0.0
+        for look, is_look in zip(looks, are_looks, strict=True)
+    ]
 
 
 class LookRatios:
@@ -158,10 +166,15 @@ class LookScale:
         total = self._sum / (LOOK_UNIT * LOOK_UNIT) + _FIRST_GUESS * _GUESS_WEIGHT
         return total / (self._count + _GUESS_WEIGHT)
 
-    def learn(self, labels: Sequence[str], looks: Looks) -> None:
-        """Count the pairs of a picture with different labels."""
+    def learn(self, labels: Sequence[str], looks: Looks, inverses: Sequence[float]) -> None:
+        """Count the pairs of a picture with different labels, of those that have looks."""
         if self._stated is not None or self._count >= _ENOUGH_PAIRS:
             return
+        if not all(inverses):
+            have = [row for row, inverse in enumerate(inverses) if inverse]
+            labels, looks = [labels[row] for row in have], looks[have]
+            if not have:
+                return
         rows = list(zip(labels, looks, strict=True))
         both = self._recent + rows
         dots: list[list[float]] = (np.array([row for _, row in both]) @ looks.T).tolist()

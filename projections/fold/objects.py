@@ -38,7 +38,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,8 @@ from .pair_groups import PairGroups
 
 FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
 """Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
+NO_VECTOR: Final = np.zeros(0)
+"""The vector of an observation without an embedding, which only fusion by evidence fuses."""
 Bucket = tuple[str, int, int]
 """Class name, column and row of a grid cell."""
 Listed: TypeAlias = tuple[tuple[str, ...], int, int]

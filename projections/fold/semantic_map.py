@@ -8,8 +8,8 @@ Per keyframe, in this order:
 2.  The run, the keyframe and its observations are added. An observation whose det_id an earlier
     keyframe has is left out and reported.
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
-    to Objects: one by one under `fusion = "page"`, all together under fusion by evidence. A
-    keyframe without a pose is only added. Floors are laid out beside each other (`floors`).
+    to Objects: one by one under `fusion = "page"`, all together, with those that have no embedding,
+    by evidence. Without one it is only added. Floors are laid out beside each other (`floors`).
 4.  Names of places, located-in and adjacency get the changes of places and Objects, in order, and
     return the deltas that follow from them.
 
@@ -53,7 +53,7 @@ from .evidence_fusion import EvidenceFusion
 from .exact import Units, metres_to_um, unit_vectors
 from .floors import CurrentMap, Floors
 from .folded_ids import FoldedIds, content_digest
-from .objects import ConstrainedObjects, FusibleObservation, Objects
+from .objects import NO_VECTOR, ConstrainedObjects, FusibleObservation, Objects
 from .pair_groups import PairGroups
 from .place_members import PosedKeyframe
 from .places import Places
@@ -284,7 +284,7 @@ class SemanticMap:
         units: Sequence[Units | None],
         deltas: list[Delta],
     ) -> list[FusibleObservation]:
-        """Add the observations; returns those with a vector in the map's space."""
+        """Add the observations; returns those to fuse."""
         envelope, det_ids = accepted.envelope, self.folded_ids.det_ids
         run_id, keyframe_id = envelope.run_id, envelope.keyframe_id
         fusible: list[FusibleObservation] = []
@@ -317,6 +317,8 @@ class SemanticMap:
             )
             if unit is not None and is_member:
                 fusible.append((observation, det_id, class_name, unit[0], unit[2]))
+            elif unit is None and isinstance(self.objects, EvidenceFusion):
+                fusible.append((observation, det_id, class_name, NO_VECTOR, 0))
             self.observation_count += 1
         return fusible
 

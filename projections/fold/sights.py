@@ -51,9 +51,9 @@ def half_field(hfov_deg: float) -> tuple[float, float]:
 
 class Sighting(NamedTuple):
     """A detection that may be fused. ``vector`` is its unit vector, multiples of 2⁻²⁰ as of
-    `projections.fold.exact.Units`, ``norm2`` its squared norm. ``depth`` is metres along the ray
-    and its standard error; ``position`` is x, y in the map frame and their standard error,
-    metres."""
+    `projections.fold.exact.Units`, empty without an embedding, ``norm2`` its squared norm.
+    ``depth`` is metres along the ray and its standard error; ``position`` is x, y in the map frame
+    and their standard error, metres."""
 
     observation: ObservationOrdinal
     det_id: DetId

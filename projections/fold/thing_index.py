@@ -248,7 +248,7 @@ class ThingIndex:
         """The whole state, to be kept. The looks are one matrix, a row for each exemplar."""
         alive = [(o, thing) for o, thing in enumerate(self._things) if thing is not None]
         things = [thing for _, thing in alive]
-        looks = [thing.looks[[mark[ROW] for mark in thing.marks]] for thing in things]
+        looks = [t.looks[[mark[ROW] for mark in t.marks]] for t in things if t.marks]
         marks = [mark[:ROW] for thing in things for mark in thing.marks]
         spots = [spot + part for t in things for spot, part in _spots_and_parts(t)]
         return {

@@ -68,8 +68,8 @@ def _object_summary(
         survivor = history.objects[merge.survivor].object_id
         return f"fused into {survivor} at offset {merge.offset:,} ({merge.cause.when})"
     sightings = sightings_of(history, record, end)
-    least = min(seen.similarity_q40 for seen in sightings) / Q40
-    similar = f" (similarity at least {least:.2f})" if now.obs_count > 1 else ""
+    q40s = [seen.similarity_q40 for seen in sightings if seen.similarity_q40 is not None]
+    similar = f" (similarity at least {min(q40s) / Q40:.2f})" if len(q40s) > 1 else ""
     return (
         f"{now.class_name}{_votes_text(votes) if record.estimates else ''}, "
         f"seen {counted(now.obs_count, 'time')}{similar}, on average from "

@@ -100,7 +100,8 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
 
 
 class ObservationRecord(msgspec.Struct, eq=False, gc=False):
-    """One detection. ``object`` and ``similarity_q40`` are None when it was not fused.
+    """One detection. ``object`` is None when it was not fused, ``similarity_q40`` also where there
+    was nothing to compare (`ObjectSeen`).
 
     ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
     made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.

@@ -294,8 +294,9 @@ def _observes_rows(view: MapView, observations: Iterable[int]) -> Iterator[EdgeR
     edge, observation, fused = BASE["OBSERVES"], BASE["Observation"], BASE["Object"]
     for i in observations:
         o = view.observations[i]
-        if o.object is not None and o.similarity_q40 is not None:
-            properties = f'{{"similarity": {o.similarity_q40 / Q40!r}}}'
+        if o.object is not None:
+            q40 = o.similarity_q40
+            properties = _NONE if q40 is None else f'{{"similarity": {q40 / Q40!r}}}'
             yield edge + i, observation + i, fused + o.object, properties
 
 

@@ -8,10 +8,11 @@ and an embedding is kept as its checksum.
 A `Stripe` has the rows of a span of events. Rows are only ever added, so the map after any number
 of events is made from the first rows of each table, and a log that has grown adds a stripe.
 
-Kinds of columns: ``int``, ``number?`` (an integer of 0 or more, -1 for none), ``float``, ``flag``,
-``code`` (a text that repeats, as its index in the stripe's own ``strings``, -1 for none) and
-``text``. Integers take the fewest bytes that hold all of a stripe; a text is its UTF-8 bytes and,
-in the array ``NAME/ends``, where each ends.
+Kinds of columns: ``int``, ``number?`` (an integer of 0 or more, -1 for none), ``int?`` (any
+integer, the least of 64 bits for none), ``float``, ``flag``, ``code`` (a text that repeats, as its
+index in the stripe's own ``strings``, -1 for none) and ``text``. Integers take the fewest bytes
+that hold all of a stripe; a text is its UTF-8 bytes and, in the array ``NAME/ends``, where each
+ends.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,13 +28,17 @@ from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 from projections.fold import deltas
 
-Kind = Literal["int", "number?", "float", "flag", "code", "text"]
+Kind = Literal["int", "number?", "int?", "float", "flag", "code", "text"]
 Array: TypeAlias = NDArray[Any]
 Table: TypeAlias = dict[str, Kind]
 Row: TypeAlias = tuple[Any, ...]
 
 NONE: Final = -1
 """The value of ``number?`` and ``code`` for None."""
+NO_INT: Final = -(1 << 63)
+"""The value of ``int?`` for None."""
+
+_NOTHING: Final[Mapping[Kind, int]] = {"number?": NONE, "int?": NO_INT}
 
 DELTAS: Final[Mapping[str, type[msgspec.Struct]]] = {
     "run": deltas.RunSeen,
@@ -67,6 +72,8 @@ _LEFT_OUT: Final = {
     "observation": ("run_id", "keyframe_id"),  # those of its keyframe
     "map": ("map",),  # it is read from the log
 }
+_SIGNED: Final = ("similarity_q40",)
+"""Optional integers that may be negative."""
 _UNIQUE: Final = ("det_id", "place_id", "object_id")
 _SCALARS: Final[Mapping[type, Kind]] = {
     inspect.IntType: "int",
@@ -100,7 +107,7 @@ class _Field:
         else:
             kind = _SCALARS[type(type_)]
             if self.optional and kind == "int":
-                kind = "number?"
+                kind = "int?" if self.name in _SIGNED else "number?"
             elif not self.optional and self.name in _UNIQUE:
                 kind = "text"
             self.columns = {self.name: kind}
@@ -248,8 +255,9 @@ class Stripe:
                 continue
             array = self.arrays[f"{table}.{column}"][rows]
             values: list[Any] = (array.astype(np.bool_) if kind == "flag" else array).tolist()
-            if kind == "number?":
-                values = [None if value == NONE else value for value in values]
+            if kind in _NOTHING:
+                nothing = _NOTHING[kind]
+                values = [None if value == nothing else value for value in values]
             yield values
 
 
@@ -291,8 +299,9 @@ def _arrays(
         return {name: np.array(values, np.uint8)}
     if kind == "code":
         values = [NONE if v is None else codes.setdefault(v, len(codes)) for v in values]
-    elif kind == "number?":
-        values = [NONE if value is None else value for value in values]
+    elif kind in _NOTHING:
+        nothing = _NOTHING[kind]
+        values = [nothing if value is None else value for value in values]
     return {name: smallest(_integers(values))}
 
 

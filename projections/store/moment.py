@@ -9,7 +9,7 @@ import numpy as np
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
 
-from .columns import NONE, Array
+from .columns import NO_INT, NONE, Array
 from .history import History, placed_columns
 from .tables import Groups, Rows, last_rows
 
@@ -96,9 +96,10 @@ class Moment:
 
     @cached_property
     def fused(self) -> tuple[Array, Array]:
-        """By observation the object that it is part of, -1 for none, and its similarity."""
+        """By observation the object that it is part of, -1 for none, and its similarity, `NO_INT`
+        for none."""
         size, seen = self.count("observation"), self.column("seen", "observation")
-        objects, similarities = np.full(size, NONE, np.int32), np.zeros(size, np.int64)
+        objects, similarities = np.full(size, NONE, np.int32), np.full(size, NO_INT, np.int64)
         objects[seen] = self.object_of_seen
         similarities[seen] = self.column("seen", "similarity_q40")
         return objects, similarities

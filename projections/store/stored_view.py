@@ -34,7 +34,7 @@ from projections.map.records import (
 )
 from projections.map.view import MapView
 
-from .columns import NONE, TABLES
+from .columns import NO_INT, NONE, TABLES
 from .history import History
 from .lazy_rows import Chunks
 from .moment import Moment
@@ -202,10 +202,7 @@ def _observations(moment: Moment, first: int, last: int) -> list[ObservationReco
             found["crc"],
             found["foreign_space"],
             [None if each == NONE else each for each in objects],
-            [
-                None if each == NONE else q40
-                for each, q40 in zip(objects, similarities, strict=True)
-            ],
+            [None if q40 == NO_INT else q40 for q40 in similarities],
         )
     )
 

@@ -199,11 +199,10 @@ def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> No
             (gid("HAS_OBSERVATION", n), start, gid("Observation", n), {})
         )
         if o.object is not None:
-            assert o.similarity_q40 is not None
             ends = gid("Observation", n), gid("Object", o.object + 1)
-            rows["OBSERVES"].append(
-                (gid("OBSERVES", n), *ends, {"similarity": o.similarity_q40 / Q40})
-            )
+            q40 = o.similarity_q40
+            properties = {} if q40 is None else {"similarity": q40 / Q40}
+            rows["OBSERVES"].append((gid("OBSERVES", n), *ends, properties))
     for obj in view.objects.values():
         n = obj.ordinal + 1
         properties = {

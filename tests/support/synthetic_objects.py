@@ -225,7 +225,7 @@ def expected_rows(events: Iterable[Sequence[d.Delta]]) -> dict[str, list[tuple[A
             gid("OBSERVES", seen.observation + 1),
             gid("Observation", seen.observation + 1),
             gid("Object", now(seen.object) + 1),
-            {"similarity": seen.similarity_q40 / Q40},
+            {} if seen.similarity_q40 is None else {"similarity": seen.similarity_q40 / Q40},
         )
         for seen in deltas
         if isinstance(seen, d.ObjectSeen)

@@ -119,15 +119,17 @@ def make_case(
     limit: int = LIMIT,
     seed: int = SEED,
     cache: Path = CACHE,
+    embeddings: bool = True,
 ) -> Case:
-    """The runs of a profile in a world, generated unless the cache has them."""
+    """The runs of a profile in a world, generated unless the cache has them; without
+    ``embeddings`` as a bare detector sees them."""
     source = Path(str(generator.__file__))
     layout = source.parent / "layouts" / f"{world}.json"
     version = zlib.crc32(layout.read_bytes(), zlib.crc32(source.read_bytes()))
     kept = cache / f"{version:08x}-seed{seed}-moved{moved:g}-limit{limit}" / profile / world
     if not (kept / "looks-again.json").exists():
         _generate(source, generator, profile, world, moved, limit, seed, kept)
-    return read_case(kept, profile, world)
+    return read_case(kept, profile, world, embeddings=embeddings)
 
 
 def _generate(
@@ -185,7 +187,7 @@ def _looks_again(
     return looks
 
 
-def read_case(folder: Path, profile: str, world: str) -> Case:
+def read_case(folder: Path, profile: str, world: str, *, embeddings: bool = True) -> Case:
     """A case from the generator's files and ``looks-again.json``."""
     runs = _runs(folder, world)
     camera = json.loads((folder / "camera.json").read_text())
@@ -194,7 +196,7 @@ def read_case(folder: Path, profile: str, world: str) -> Case:
         CameraConstants(
             hfov_deg=camera["hfov_deg"], width_px=camera["width"], height_px=camera["height"]
         ),
-        [accepted for path in runs for accepted in _accepted(path)],
+        [accepted for path in runs for accepted in _accepted(path, embeddings=embeddings)],
         read_truth([path.with_name(path.name.replace(".jsonl", ".truth.jsonl")) for path in runs]),
         {thing.instance: thing for thing in _things(folder)},
         f"{world}-{profile}-a",
@@ -202,14 +204,15 @@ def read_case(folder: Path, profile: str, world: str) -> Case:
     )
 
 
-def house_case(run: str = "house-a") -> Case | None:
+def house_case(run: str = "house-a", *, embeddings: bool = True) -> Case | None:
     """A run of the trial house beside the repository; None where it is absent."""
     path = DATA / "house" / f"{run}.jsonl.gz"
     if not path.exists():
         return None
     truth = read_truth([path.with_name(f"{run}.truth.jsonl.gz")])
     things = {thing.instance: thing for thing in _things(path.parent)}
-    return Case(run, CameraConstants(), _accepted(path), truth, things, run, {})
+    events = _accepted(path, embeddings=embeddings)
+    return Case(run, CameraConstants(), events, truth, things, run, {})
 
 
 def _runs(folder: Path, world: str) -> list[Path]:
@@ -222,13 +225,24 @@ def _documents(path: Path) -> list[dict[str, Any]]:
         return [json.loads(line) for line in lines]
 
 
-def _accepted(path: Path) -> list[Accepted]:
+def _accepted(path: Path, *, embeddings: bool) -> list[Accepted]:
     with gzip.open(path) as lines:
-        outcomes = ingest_all(lines.read().splitlines())
+        payloads = lines.read().splitlines()
+    if not embeddings:
+        payloads = [_without_embeddings(payload) for payload in payloads]
+    outcomes = ingest_all(payloads)
     for number, outcome in enumerate(outcomes, start=1):
         if isinstance(outcome, Rejected):
             raise NoWorldsError(f"{path}, line {number}: {outcome.reason}")
     return [outcome for outcome in outcomes if isinstance(outcome, Accepted)]
+
+
+def _without_embeddings(payload: bytes) -> bytes:
+    envelope = json.loads(payload)
+    for detection in envelope["detections"]:
+        for name in ("embedding", "embedding_dim", "embedding_model"):
+            detection.pop(name, None)
+    return json.dumps(envelope).encode()
 
 
 def _things(folder: Path) -> list[TrueThing]:
