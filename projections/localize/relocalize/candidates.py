@@ -99,13 +99,15 @@ class MapCandidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
 
     Those of a crop without an embedding are observations of Objects of its class, with the
-    similarity 1. ``walls`` are those of the occupancy maps in force, by floor.
+    similarity 1. ``by_class`` is whether the map has no embedding, so that crops were taken by
+    their classes. ``walls`` are those of the occupancy maps in force, by floor.
     """
 
     matches: tuple[tuple[Match, ...], ...]
     places: Mapping[PlaceOrdinal, CandidatePlace]
     constants: MapConstants = field(default_factory=MapConstants)
     walls: Mapping[str | None, WallMap] = field(default_factory=dict)
+    by_class: bool = False
 
 
 class ExactIndex:
@@ -177,16 +179,19 @@ class ExactIndex:
         """The nearest observations of each crop, as if the map had none of those ``without``.
         Raises QuestionError for another space."""
         self.check_spaces(crops)
+        by_class = not len(self._ordinals)
+        if by_class:
+            crops = [crop.by_class() for crop in crops]
         dropped = np.isin(self._ordinals, list(without)) if without else None
         objects = objects_of_a_class(crops)
         matches = tuple(
-            self._of_class(crop.class_name, objects)
+            self._of_class(crop.class_name, objects, without)
             if crop.vector is None
             else self._nearest(crop.vector, neighbours, dropped)
             for crop in crops
         )
         refuse_unknown_classes(crops, matches, self._class_names)
-        return MapCandidates(matches, self.places, self.constants, self._walls)
+        return MapCandidates(matches, self.places, self.constants, self._walls, by_class)
 
     def _nearest(
         self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None
@@ -206,12 +211,14 @@ class ExactIndex:
             for i in order
         )
 
-    def _of_class(self, class_name: str | None, objects: int) -> tuple[Match, ...]:
+    def _of_class(
+        self, class_name: str | None, objects: int, without: Collection[ObservationOrdinal]
+    ) -> tuple[Match, ...]:
         things = [o for o in self._view.objects.values() if o.class_name == class_name]
         most = sorted(things, key=lambda o: (-o.obs_count, o.ordinal))[:objects]
         picked = [
             seen[position]
-            for seen in (sorted(thing.observations) for thing in most)
+            for seen in (sorted(set(thing.observations).difference(without)) for thing in most)
             for position in range(len(seen))
             if (position + 1) * OBSERVATIONS_OF_EACH // len(seen)
             > position * OBSERVATIONS_OF_EACH // len(seen)

@@ -10,7 +10,7 @@ the last view add up, and a turn's error moves what lies behind it sideways.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -48,6 +48,10 @@ class QuestionCrop:
     model: str | None = None
     is_text: bool = False
 
+    def by_class(self) -> "QuestionCrop":
+        """The crop without its embedding, if it has a class."""
+        return self if self.class_name is None else replace(self, vector=None)
+
     @property
     def sort_key(self) -> tuple[bytes, Box, str, str]:
         """A key that sorts crops in the same order however they were sent."""
@@ -81,6 +85,11 @@ class Question:
     def crops(self) -> tuple[QuestionCrop, ...]:
         """The crops of all views, in order."""
         return tuple(crop for view in self.views for crop in view.crops)
+
+    def by_class(self) -> "Question":
+        """The question without embeddings of crops that have a class."""
+        views = (replace(v, crops=tuple(c.by_class() for c in v.crops)) for v in self.views)
+        return replace(self, views=tuple(views))
 
     @classmethod
     def of(cls, crops: Sequence[QuestionCrop]) -> "Question":

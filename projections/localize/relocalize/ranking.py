@@ -145,6 +145,8 @@ def rank(
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
     to the crops. The camera is that of the question, else ``camera``, else that of the map."""
     asked = question if isinstance(question, Question) else Question.of(question)
+    if candidates.by_class:
+        asked = asked.by_class()
     views, candidates = _in_order(asked, candidates)
     crops = [crop for view in views for crop in view.crops]
     known = known_probability(crops, candidates.matches, candidates.constants)

@@ -180,6 +180,14 @@ def assemble(crops: int, near: Rows, linked: Linked, known: KnownConstants) -> M
     return MapCandidates(rows, dict(linked.places.values()), known.constants, known.walls)
 
 
+def bare_row(det_pk: int, observation: str, pose: str) -> tuple[Any, ...]:
+    """The columns of the statement ``described`` from ``similarity`` on, made of the properties of
+    an observation's node and of its keyframe's Pose."""
+    seen, at = json.loads(observation), json.loads(pose)
+    named = (seen["det_id"], seen["run_id"], seen["class_name"], f"{{{str(seen['bbox'])[1:-1]}}}")
+    return 1.0, det_pk, *named, at["map_x"], at["map_y"], at["map_yaw"], None
+
+
 def _box(array: str) -> Box:
     """A box from the text form of its array, which gives the log's numbers; the binary form would
     be rounded to 32 bits."""

@@ -11,6 +11,7 @@ refused.
 import contextlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, Self
 
@@ -56,7 +57,15 @@ from projections.postgres.labels import LABEL_IDS
 from projections.postgres.map_table import read_with_key
 from projections.postgres.statements import statements, tables
 
-from .candidate_rows import NO_LINKS, ConstantsMemory, KnownConstants, Linked, Rows, assemble
+from .candidate_rows import (
+    NO_LINKS,
+    ConstantsMemory,
+    KnownConstants,
+    Linked,
+    Rows,
+    assemble,
+    bare_row,
+)
 from .graph_reads import map_errors
 
 _NEAR: Final = 12
@@ -102,14 +111,19 @@ class CandidateSearch:
         self, crops: Sequence[QuestionCrop], neighbours: int = NEIGHBOURS
     ) -> MapCandidates:
         """The ``neighbours`` observations most similar to each crop, with their Places; of a crop
-        without embedding observations of its class."""
+        without embedding, and of every one in a map without, observations of its class."""
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: Rows = []
         linked = NO_LINKS
+        by_class = False
         if looked or not named:
             near, linked = self._nearest([crops[number] for number in looked], neighbours)
-            if named:
+            by_class = bool(looked) and not near
+            if by_class:
+                crops = [crop.by_class() for crop in crops]
+                named = [number for number, crop in enumerate(crops) if crop.vector is None]
+            elif named:
                 near = [(looked[crop], *row) for crop, *row in near]
         if named:
             of_classes, more = self._of_classes(crops, named)
@@ -117,7 +131,7 @@ class CandidateSearch:
         self._memory.known = self._known
         found = assemble(len(crops), near, linked, self._known)
         refuse_unknown_classes(crops, found.matches, self._class_names)
-        return found
+        return replace(found, by_class=True) if by_class else found
 
     def try_question(self) -> None:
         """Ask a question of one observation that is stored, if there is one. Raises DatabaseError
@@ -167,6 +181,7 @@ class CandidateSearch:
             rows = self._vectors.execute(_statement("described"), values, binary=True).fetchall()
         found, origin = self._near(rows)
         described = {row[2]: row[1:] for row in found}
+        described |= self._bare([det_pk for det_pk in det_pks if det_pk not in described])
         linked = self._follow(det_pks, origin)
         by_class: dict[str, list[int]] = {}
         for place, det_pk in picked:
@@ -178,6 +193,16 @@ class CandidateSearch:
             if det_pk in described
         ]
         return near, linked
+
+    def _bare(self, det_pks: list[int]) -> dict[int, tuple[Any, ...]]:
+        """The columns of `described` but the first, of observations without an embedding."""
+        if not det_pks:
+            return {}
+        values = {"det_pks": det_pks, "observation": LABEL_IDS["Observation"]}
+        values |= {"pose": LABEL_IDS["Pose"]}
+        with _query_errors(self._targets.graph_url):
+            rows = self._graph.execute(_statement("bare"), values).fetchall()
+        return {det_pk: bare_row(det_pk, *properties) for det_pk, *properties in rows}
 
     def _near(self, rows: Rows) -> tuple[Rows, str | None]:
         """Store the cosines; returns the rows that have an observation, from the column ``crop``

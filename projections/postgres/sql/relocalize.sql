@@ -111,6 +111,16 @@ SELECT {of_vectors}, 0, 1.0, {observed}
 FROM (SELECT 1) AS one
 LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::bigint[])
 
+-- name: bare
+-- These observations and the poses of their keyframes, from the graph's database: of those that have no
+-- embedding the vectors' has no row. A Pose has the number of its keyframe.
+SELECT seen.id::text::bigint & 281474976710655, concat(seen.properties), concat(pose.properties)
+FROM {observation} AS seen
+JOIN {has_observation} AS has ON has.end_id = seen.id
+JOIN {pose} AS pose ON pose.id = ag_catalog._graphid(%(pose)s, has.start_id::text::bigint & 281474976710655)
+WHERE seen.id = ANY(ARRAY(SELECT ag_catalog._graphid(%(observation)s, det_pk)
+                          FROM unnest(%(det_pks)s::bigint[]) AS given (det_pk)))
+
 -- name: graph
 -- Object, its Place and the keyframe's Place of these observations, from the graph's database, in one row.
 WITH found AS MATERIALIZED (
