@@ -174,7 +174,7 @@ def test_the_camera_of_the_settings_serves_where_envelopes_state_none(tmp_path: 
 
 
 THIN: dict[str, tuple[list[dict[str, Any]], str]] = {
-    "empty": ([], "no observation has a pose and an embedding: all constants are priors"),
+    "empty": ([], "no observation with a pose is of an object: all constants are priors"),
     "no poses": ([envelope(k, None) for k in range(5)], "all constants are priors"),
     "no revisits": (walk(40, detections=1), "nothing was seen three times from spots 0.8 m apart"),
     "no detections": ([envelope(k, 0.1 * k) for k in range(5)], "all constants are priors"),

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ from tests.support.evidence_pictures import (
 from tests.support.thorough import examples
 
 _SEEDS = st.integers(0, 10_000)
+_BARE = st.sampled_from([0.0, 0.5, 1.0])
+"""Share of sightings without an embedding."""
 
 
 def _assignment(deltas: list[ObjectDelta]) -> dict[ObservationOrdinal, ObjectOrdinal]:
@@ -61,9 +64,11 @@ def _through_json(state: State) -> State:
 
 
 @settings(max_examples=examples(15), deadline=None)
-@given(_SEEDS, st.integers(0, 40))
-def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut: int) -> None:
-    pictures = pictures_of(a_room(seed), seed, 40)
+@given(_SEEDS, st.integers(0, 40), _BARE)
+def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(
+    seed: int, cut: int, bare: float
+) -> None:
+    pictures = pictures_of(a_room(seed), seed, 40, bare=bare)
     objects = EvidenceObjects(EvidenceConstants())
     before = [delta for picture in pictures[:cut] for delta in fold_one(objects, picture)]
     other = EvidenceObjects(EvidenceConstants())
@@ -73,9 +78,9 @@ def test_a_dump_taken_anywhere_goes_on_as_if_nothing_had_happened(seed: int, cut
 
 
 @settings(max_examples=examples(15), deadline=None)
-@given(_SEEDS)
-def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
-    pictures = pictures_of(a_room(seed, 12), seed, 40)
+@given(_SEEDS, _BARE)
+def test_two_things_in_one_picture_are_never_one(seed: int, bare: float) -> None:
+    pictures = pictures_of(a_room(seed, 12), seed, 40, bare=bare)
     objects = EvidenceObjects(EvidenceConstants())
     for picture in pictures:
         seen = [d.object for d in fold_one(objects, picture) if isinstance(d, ObjectSeen)]
@@ -83,9 +88,9 @@ def test_two_things_in_one_picture_are_never_one(seed: int) -> None:
 
 
 @settings(max_examples=examples(15), deadline=None)
-@given(_SEEDS)
-def test_deltas_are_complete_and_in_order(seed: int) -> None:
-    pictures = pictures_of(a_room(seed, 12), seed, 60)
+@given(_SEEDS, _BARE)
+def test_deltas_are_complete_and_in_order(seed: int, bare: float) -> None:
+    pictures = pictures_of(a_room(seed, 12), seed, 60, bare=bare)
     objects = EvidenceObjects(EvidenceConstants())
     alive: set[ObjectOrdinal] = set()
     members: Counter[ObjectOrdinal] = Counter()
@@ -136,9 +141,9 @@ def test_deltas_are_complete_and_in_order(seed: int) -> None:
 
 
 @settings(max_examples=examples(10), deadline=None)
-@given(_SEEDS, st.data())
-def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
-    pictures = pictures_of(a_room(seed, 6), seed, 40)
+@given(_SEEDS, st.data(), _BARE)
+def test_commands_are_obeyed(seed: int, data: st.DataObject, bare: float) -> None:
+    pictures = pictures_of(a_room(seed, 6), seed, 40, bare=bare)
     det_ids = [s.det_id for picture in pictures for s in picture.sightings]
     number = {det_id: index for index, det_id in enumerate(det_ids)}
     if len(det_ids) < 4:
@@ -161,9 +166,10 @@ def test_commands_are_obeyed(seed: int, data: st.DataObject) -> None:
         assert of[ObservationOrdinal(number[a])] != of[ObservationOrdinal(number[b])]
 
 
-def test_it_finds_the_things_of_a_room_where_they_stand() -> None:
+@pytest.mark.parametrize("bare", [0.0, 0.5, 1.0])
+def test_it_finds_the_things_of_a_room_where_they_stand(bare: float) -> None:
     room = a_room(3, 8)
-    pictures = pictures_of(room, 3, 120)
+    pictures = pictures_of(room, 3, 120, bare=bare)
     deltas = fold_all(pictures)
     truth = _truth(pictures)
     of = _assignment(deltas)

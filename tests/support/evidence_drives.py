@@ -6,10 +6,11 @@ and things are carried elsewhere, so that a few keyframes meet every branch of f
 Settings of drives with fusion by evidence, and recounts of their maps.
 """
 
+import copy
 import math
 import random
 from collections import Counter
-from typing import Any
+from typing import Any, Literal
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -108,9 +109,31 @@ def long_drive(seed: int, runs: int = 3, each: int = 80) -> list[dict[str, Any]]
 
 @st.composite
 def drives(draw: st.DrawFn, most: int = 30) -> list[dict[str, Any]]:
-    """`drive` of any length and seed."""
+    """`drive` of any length and seed, by a detector with embeddings, without, or at times."""
     seed, things = draw(st.integers(0, 2**32)), draw(st.integers(0, 7))
-    return drive(seed, draw(st.integers(0, most)), things)
+    documents = drive(seed, draw(st.integers(0, most)), things)
+    return without_embeddings(documents, draw(st.sampled_from(WITHOUT)))
+
+
+Without = Literal["", "none", "late", "half"]
+WITHOUT: tuple[Without, ...] = ("", "", "none", "late", "half")
+"""Which embeddings are left out: no more than a drive leaves out, all, those of its first half, and
+of every second detection."""
+
+
+def without_embeddings(documents: list[dict[str, Any]], which: Without) -> list[dict[str, Any]]:
+    """The same drive seen by another detector."""
+    left_out = copy.deepcopy(documents)
+    for number, document in enumerate(left_out):
+        for index, seen in enumerate(document["detections"]):
+            if (
+                which == "none"
+                or (which == "late" and number < len(documents) // 2)
+                or (which == "half" and (index + document["keyframe_id"]) % 2)
+            ):
+                for name in ("embedding", "embedding_dim", "embedding_model"):
+                    seen.pop(name, None)
+    return left_out
 
 
 EVIDENCE = Settings(fusion="evidence", eps_m=1.0)
@@ -189,7 +212,7 @@ def det_ids(documents: list[dict[str, Any]]) -> list[str]:
     named = (
         f"{e['run_id']}_kf{e['keyframe_id']}_d{i}"
         for e in documents
-        for i, seen in enumerate(e["detections"])
-        if e.get("map_x") is not None and seen.get("embedding") is not None
+        for i in range(len(e["detections"]))
+        if e.get("map_x") is not None
     )
     return list(dict.fromkeys(named))

@@ -10,6 +10,7 @@ from projections.fold.deltas import ObservationOrdinal, Pose, RunOrdinal
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.evidence_objects import EvidenceObjects, ObjectDelta
 from projections.fold.exact import metres_to_um, unit_vectors
+from projections.fold.objects import NO_VECTOR
 from projections.fold.pair_groups import PairGroups
 from projections.fold.settings import CameraConstants
 from projections.fold.sights import Sighting
@@ -57,10 +58,15 @@ def a_room(seed: int, count: int = 8, side: float = 5.0) -> list[Stuff]:
 
 
 def pictures_of(
-    room: list[Stuff], seed: int, count: int = 60, runs: int = 2, side: float = 5.0
+    room: list[Stuff],
+    seed: int,
+    count: int = 60,
+    runs: int = 2,
+    side: float = 5.0,
+    bare: float = 0.0,
 ) -> list[Picture]:
-    """Pictures from random poses in the room."""
-    chance = np.random.default_rng(seed)
+    """Pictures from random poses in the room; a ``bare`` share of sightings has no embedding."""
+    chance, bares = np.random.default_rng(seed), np.random.default_rng(seed)
     base = chance.normal(size=DIM) * 0.7
     of_class = {name: chance.normal(size=DIM) * 0.5 for name in CLASSES}
     of_thing = [chance.normal(size=DIM) * 0.3 for _ in room]
@@ -90,7 +96,9 @@ def pictures_of(
             vector = vector + chance.normal(size=DIM) * 0.15
             is_flicker = chance.random() < 0.05
             label = CLASSES[0] if is_flicker else thing.class_name
-            sightings.append(a_sighting(observation, label, vector, bbox))
+            looked = a_sighting(observation, label, vector, bbox)
+            is_bare = bares.random() < bare
+            sightings.append(looked._replace(vector=NO_VECTOR, norm2=0) if is_bare else looked)
             things.append(index)
             observation += 1
         run = RunOrdinal(number * runs // count)

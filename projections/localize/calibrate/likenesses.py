@@ -24,6 +24,7 @@ FEWEST_DIFFERENT = 20
 _MOST_IN_A_PICTURE = 24
 _MOST_PAIRS = 200_000
 _MOST_OF_A_THING = 300
+_A_PAIR = 2
 _ROUNDS = 15
 
 
@@ -41,6 +42,8 @@ class LookPairs(NamedTuple):
 def in_pictures(seen: Sightings) -> tuple[Floats, Flags]:
     """The cosines of pairs in one picture, and whether both have one class."""
     first, second = _pairs_in_pictures(seen.picture)
+    both = seen.looked[first] & seen.looked[second]
+    first, second = first[both], second[both]
     stride = -(-len(first) // _MOST_PAIRS) or 1
     first, second = first[::stride], second[::stride]
     labels = np.array(list(seen.classes), dtype=object)
@@ -90,12 +93,15 @@ def of_things(seen: Sightings, things: Sequence[QualifiedThing], scaled_by: floa
     observations."""
     first, second, weight = [], [], []
     for thing in things:
-        a, b = np.triu_indices(len(thing.rows), 1)
+        rows = thing.rows[seen.looked[thing.rows]]
+        if len(rows) < _A_PAIR:
+            continue
+        a, b = np.triu_indices(len(rows), 1)
         stride = -(-len(a) // _MOST_OF_A_THING)
         a, b = a[::stride], b[::stride]
-        first.append(thing.rows[a])
-        second.append(thing.rows[b])
-        weight.append(np.full(len(a), len(thing.rows) / len(a)))
+        first.append(rows[a])
+        second.append(rows[b])
+        weight.append(np.full(len(a), len(rows) / len(a)))
     if not first:
         none = np.zeros(0)
         return LookPairs(none, none, none, none.astype(np.bool_), none)

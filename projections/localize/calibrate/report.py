@@ -117,8 +117,10 @@ def hints(calibration: Calibration) -> Iterator[str]:
     """Obstacles to a better calibration, with the next step where there is one."""
     last, camera = calibration.last, calibration.settings.camera
     if not calibration.observations:
-        yield "no observation has a pose and an embedding: all constants are priors"
+        yield "no observation with a pose is of an object: all constants are priors"
         return
+    if not calibration.embedded:
+        yield "no observation has an embedding: the constants of likeness are left as they are"
     if calibration.unboxed:
         yield (
             f"{counted(calibration.unboxed, 'observation')} with an empty box: nothing is known of"
@@ -129,10 +131,10 @@ def hints(calibration: Calibration) -> Iterator[str]:
             "nothing was seen three times from spots 0.8 m apart with bearings that cross: ranges,"
             " errors, sizes and the likeness of one thing are priors"
         )
-    elif calibration.runs == 1:
+    elif calibration.embedded and calibration.runs == 1:
         yield "one run: session_shift, the loss of likeness between runs, is a prior"
     pairs = next(each.count for each in last.readings if each.name == "different")
-    if pairs < FEWEST_DIFFERENT:
+    if calibration.embedded and pairs < FEWEST_DIFFERENT:
         yield (
             f"{counted(pairs, 'pair')} of different classes in one picture, fewer than"
             f" {FEWEST_DIFFERENT}: `different` stays unset, so the fold measures it on the pictures"

@@ -107,8 +107,9 @@ def _bounds(name: str) -> tuple[float, float]:
 class Calibration:
     """The calibration of a log. ``settings`` are those that it was calibrated under; `calibrated`
     are the same with its constants. Counts are of the last fold: keyframes with a pose,
-    observations that were fused, Objects, runs. ``unboxed`` observations have an empty box;
-    ``beyond`` boxes reach beyond the picture. ``own`` are the results of its own questions."""
+    observations that were fused, Objects, runs. ``embedded`` observations have an embedding,
+    ``unboxed`` ones an empty box; ``beyond`` boxes reach beyond the picture. ``own`` are the
+    results of its own questions."""
 
     settings: Settings
     last: Round
@@ -116,6 +117,7 @@ class Calibration:
     keyframes: int
     observations: int
     objects: int
+    embedded: int
     unboxed: int
     beyond: int
     own: OwnScores
@@ -188,6 +190,7 @@ def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibra
         keyframes=sum(keyframe.pose is not None for keyframe in view.keyframes),
         observations=len(seen),
         objects=len(view.objects),
+        embedded=int(seen.looked.sum()),
         unboxed=int((~seen.boxed).sum()),
         beyond=seen.beyond,
         own=own,
@@ -208,7 +211,7 @@ def note_camera(
 def _rows(view: MapView, cameras: Cameras, default: CameraConstants) -> Iterator[Row]:
     for observation in view.observations:
         keyframe = view.keyframes[observation.keyframe]
-        if observation.object is None or keyframe.pose is None or observation.embedding is None:
+        if observation.object is None or keyframe.pose is None:
             continue
         yield Row(
             picture=keyframe.ordinal,

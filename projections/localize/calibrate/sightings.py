@@ -33,7 +33,7 @@ class Row(NamedTuple):
     camera: CameraConstants
     class_name: str
     bbox: tuple[float, float, float, float]
-    look: UnitVector
+    look: UnitVector | None
     thing: int
 
 
@@ -44,7 +44,8 @@ class Sightings:
     ``sight`` is the direction from the robot to the thing in the map frame, ``off_axis`` its angle
     from the picture's axis, left positive, radians. ``height`` is the box's height divided by the
     focal length, NaN where the picture's border cuts it at top or bottom. ``boxed`` is False where
-    the box is empty: nothing is known of its direction then. ``beyond`` counts the boxes that reach
+    the box is empty: nothing is known of its direction then, ``looked`` where there is no
+    embedding. ``beyond`` counts the boxes that reach
     beyond the picture.
     """
 
@@ -60,14 +61,15 @@ class Sightings:
     boxed: Flags
     classes: Sequence[str]
     thing: Ints
-    looks: Sequence[UnitVector]
+    looks: Sequence[UnitVector | None]
+    looked: Flags
     beyond: int
 
     def __len__(self) -> int:
         return len(self.picture)
 
     def cosines(self, a: Ints, b: Ints) -> Floats:
-        """The cosine of each pair of observations."""
+        """The cosine of each pair of observations, all of which have a look."""
         found = np.empty(len(a))
         for start in range(0, len(a), _PAIRS_AT_ONCE):
             part = slice(start, start + _PAIRS_AT_ONCE)
@@ -114,5 +116,6 @@ def sightings_of(rows: Iterable[Row]) -> Sightings:
         classes=[row.class_name for row in rows],
         thing=np.array([row.thing for row in rows], dtype=np.int64),
         looks=[row.look for row in rows],
+        looked=np.array([row.look is not None for row in rows], dtype=np.bool_),
         beyond=beyond,
     )
