@@ -23,6 +23,7 @@ from tests.support.synthetic_objects import (
     Step,
     SyntheticDeltas,
     expected_rows,
+    is_bare,
     random_steps,
     without_sigma,
 )
@@ -97,7 +98,10 @@ def test_batches_of_any_size_and_a_rebuild_give_what_the_deltas_say(
     assert {label: counted[label] for label in LABELS} == {
         label: counts[COUNT_KEYS[label]] for label in LABELS
     }
-    assert counted[TABLE] == len(view.observations)
+    assert counted[TABLE] == sum(not is_bare(o.ordinal) for o in view.observations)
+    assert live.vectors.keys() == {
+        o.ordinal + 1 for o in view.observations if not is_bare(o.ordinal)
+    }
 
 
 @pytest.mark.parametrize("size", [1, 7, 1_000])

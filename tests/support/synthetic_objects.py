@@ -75,6 +75,11 @@ def random_steps(seed: int, count: int) -> list[Step]:
     ]
 
 
+def is_bare(observation: int) -> bool:
+    """Whether an observation has no embedding."""
+    return observation % 5 == 3
+
+
 @dataclass
 class _Sums:
     count: int = 0
@@ -129,7 +134,8 @@ class SyntheticDeltas:
             sums = self._live[ordinal]
             sums.add(_Sums(1, x, y, time, time))
             values = sums.count, sums.x, sums.y, sums.first, sums.last
-            deltas.append(d.ObjectSeen(n, ordinal, observation, Q40 - observation, *values))
+            similarity = None if is_bare(observation) else Q40 - observation
+            deltas.append(d.ObjectSeen(n, ordinal, observation, similarity, *values))
         changed = {ordinal for _, ordinal in seen}
         changed |= self._merge(n, step.merge, deltas)
         if (ordinal := self._pick(step.relocate)) is not None:
@@ -166,13 +172,15 @@ class SyntheticDeltas:
             else:
                 ordinal = live[choice]
             observation, self._observations = self._observations, self._observations + 1
+            bare = is_bare(observation)
             vector = quantise(np.array([1.0, observation, pick], dtype=np.float32))
             deltas.append(
                 d.ObservationAdded(
                     n, observation, n, run_id=f"run-{run}", keyframe_id=n % 10,
                     det_id=f"det-{observation}", class_name=_CLASSES[observation % len(_CLASSES)],
-                    confidence=0.5, bbox=(1.0, 2.0, 3.0, 4.5), embedding_model="m",
-                    embedding=vector, foreign_space=False,
+                    confidence=0.5, bbox=(1.0, 2.0, 3.0, 4.5),
+                    embedding_model=None if bare else "m", embedding=None if bare else vector,
+                    foreign_space=False,
                 )
             )  # fmt: skip
             seen.append((observation, ordinal))

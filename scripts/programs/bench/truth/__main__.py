@@ -1,12 +1,13 @@
 """One table: Objects with fusion=page and by evidence, side by side, against the truth.
 
 scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--places [--walls] | --types]
+    [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
 
-With --localise another table: where the robot is, asked of the map of run a.
+With --no-embeddings the detectors are bare ones; page is then as if all looked alike: the class and
+the radius decide. With --localise another table: where the robot is, asked of the map of run a.
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """
@@ -42,6 +43,7 @@ from .worlds import (
     WORLDS,
     Case,
     NoWorldsError,
+    as_if_alike,
     house_case,
     load_generator,
     make_case,
@@ -78,6 +80,7 @@ def main() -> None:
     print(
         f"{options.half} half, {len(chosen)} of world × profile, at most {limit} keyframes a run"
         + (f", {options.moved:g} of the movable things moved" if options.moved else "")
+        + ("" if options.embeddings else ", no embeddings: page goes by class and radius alone")
     )
     if options.places:
         print(places_table(places))
@@ -153,6 +156,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
+    parser.add_argument(
+        "--no-embeddings", dest="embeddings", action="store_false", help="Objects by bare detectors"
+    )
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
     parser.add_argument(
         "--walls", action="store_true", help="with --places: rooms with an occupancy map, too"
@@ -187,11 +193,12 @@ def _cases(
             limit=limit,
             seed=options.seed,
             cache=options.cache,
+            embeddings=options.embeddings,
         )
     print("\r\033[K", end="", file=sys.stderr, flush=True)
     if options.moved or options.world or options.profile:
         return
-    house = house_case()
+    house = house_case(embeddings=options.embeddings)
     if house is None:
         print("house-a is left out: its data is absent; see MAPFOLD_SHARED_DATA", file=sys.stderr)
     else:
@@ -199,7 +206,8 @@ def _cases(
 
 
 def _row(case: Case, options: argparse.Namespace) -> tables.Row:
-    page, page_s = fold_timed(case.events, Settings())
+    plain = case.events if options.embeddings else list(map(as_if_alike, case.events))
+    page, page_s = fold_timed(plain, Settings())
     settings = Settings(fusion="evidence", camera=case.camera).with_assignments(options.set)
     evidence, evidence_s = fold_timed(case.events, settings)
     calibrated, calibrated_s = None, 0.0
