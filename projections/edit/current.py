@@ -10,10 +10,10 @@ from eventsrc.envelope.model import FIRST_OFFSET, DetId, KeyframeId, Offset, Run
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import Corrections, Keyframe, RecordedCommand, compile_corrections
-from projections.fold.deltas import PlaceOrdinal
+from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
-from projections.history import NoSuchThing
+from projections.map.naming import NoSuchThing, Thing, thing_called, things_of
 from projections.map.own_events import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
@@ -101,9 +101,9 @@ class MapToEdit:
         return {o.det_id: o for o in self.view.observations}
 
     @cached_property
-    def _objects(self) -> dict[str, ObjectRecord]:
-        """The objects of the map and the absorbed ones, by id."""
-        return {o.object_id: o for o in self.view.all_objects}
+    def things(self) -> list[Thing]:
+        """The places and objects of the map, by what they may be called."""
+        return things_of(self.view)
 
     def run(self, run_id: str) -> list[KeyframeRecord]:
         """The keyframes of a run. Raises NoSuchThing with the runs there are."""
@@ -124,23 +124,23 @@ class MapToEdit:
         return Keyframe(record.run_id, record.keyframe_id)
 
     def find_place(self, text: str) -> Keyframe:
-        """The keyframe that stands for a place: of a place id, also of an absorbed one, or of a
-        place's name, that which founded it; of ``run:keyframe`` this keyframe, for the place that
-        it is in.
+        """The keyframe that stands for a place: of ``run:keyframe`` this keyframe, for the place
+        that it is in; of what else may name a place, also an absorbed one, that which founded it.
 
-        Raises NoSuchThing, or MisuseError for a keyframe in no place.
+        Raises NoSuchThing, SeveralThings, or MisuseError for a keyframe in no place.
         """
         view = self.view
-        for place in view.all_places:
-            if place.place_id == text:
-                return self.founder(place.ordinal)
         run_id, colon, number = text.rpartition(":")
-        if not colon or all(run.run_id != run_id for run in view.runs):
-            if (named := self._named(text)) is not None:
-                return self.founder(named)
-            raise NoSuchThing("place", text, (p.place_id for p in view.all_places))
-        keyframe = _keyframe(run_id, number)
+        is_keyframe = bool(colon) and any(run.run_id == run_id for run in view.runs)
+        keyframe = _keyframe(run_id, number) if is_keyframe else None
         if keyframe is None or keyframe not in self.keyframes:
+            try:
+                return self.founder(
+                    PlaceOrdinal(thing_called(text, self.things, ("place",)).ordinal)
+                )
+            except NoSuchThing:
+                if not is_keyframe:
+                    raise
             names = (f"{run_id}:{k.keyframe_id}" for k in self.run(run_id))
             raise NoSuchThing("keyframe", text, names)
         if self.place_of(keyframe) is None:
@@ -151,29 +151,20 @@ class MapToEdit:
             )
         return keyframe
 
-    def _named(self, name: str) -> PlaceOrdinal | None:
-        """The place with this name; None if there is none. Raises MisuseError if there are
-        several."""
-        named = [place for place in self.view.places.values() if place.name == name]
-        if len(named) > 1:
-            ids = ", ".join(place.place_id for place in named)
-            raise MisuseError(f"{len(named)} places are called {name!r}: {ids}; give an id")
-        return named[0].ordinal if named else None
-
     def place_name(self, keyframe: Keyframe) -> str:
         """The id of the place that a keyframe is in now, or ``no place``."""
         return self.view.place_id(self.place_of(keyframe)) or "no place"
 
     def find_observation(self, text: str) -> ObservationRecord:
-        """The founding observation of an object, given by the object's id, also of an absorbed one;
-        or an observation by its det_id. Raises NoSuchThing, or MisuseError for an observation
-        without an object."""
-        if text in self._objects:
-            founding = (o for o in self.view.observations if object_id(o.det_id) == text)
-            return next(founding)
+        """An observation by its det_id; of what names an object, also an absorbed one, the
+        observation that founded it. Raises NoSuchThing, SeveralThings, or MisuseError for an
+        observation without an object."""
         observation = self.observations.get(DetId(text))
-        if observation is None:
-            raise self._no_object(text)
+        is_id = any(each.object_id == text for each in self.view.all_objects)
+        if observation is None or is_id:
+            found = self._object_called(text)
+            founding = (o for o in self.view.observations if object_id(o.det_id) == found.id)
+            return next(founding)
         if observation.object is None:
             raise MisuseError(
                 f"observation {text!r} is of no object: it has no embedding or no pose; "
@@ -182,17 +173,18 @@ class MapToEdit:
         return observation
 
     def find_object(self, text: str) -> ObjectRecord:
-        """The object of this id, for an absorbed one the object that it is part of now. Raises
-        NoSuchThing."""
-        found = self._objects.get(text)
-        if found is None:
-            raise self._no_object(text)
-        return self.view.objects[self.view.object_survivors.find(found.ordinal)]
+        """The object that ``text`` names, for an absorbed one the object that it is part of now.
+        Raises NoSuchThing and SeveralThings."""
+        found = ObjectOrdinal(self._object_called(text).ordinal)
+        return self.view.objects[self.view.object_survivors.find(found)]
 
-    def _no_object(self, text: str) -> NoSuchThing:
-        if text.startswith("obj-") or not self.observations:
-            return NoSuchThing("object", text, (o.object_id for o in self.view.objects.values()))
-        return NoSuchThing("observation", text, self.observations)
+    def _object_called(self, text: str) -> Thing:
+        try:
+            return thing_called(text, self.things, ("object",))
+        except NoSuchThing:
+            if text.startswith("obj-") or not self.observations:
+                raise
+            raise NoSuchThing("observation", text, self.observations) from None
 
 
 _NUMBER = re.compile(r"-?[0-9]{1,19}")

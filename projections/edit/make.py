@@ -33,7 +33,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import DetId, KeyframeId, RunId, describe_error
 from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.settings import Settings
-from projections.history import NoSuchThing
+from projections.map.naming import NoSuchThing
 
 from .conflicts import (
     EditRefused,

@@ -6,6 +6,7 @@ event that made a condition true. `what_if` folds the log under other settings, 
 its commands, and compares.
 """
 
+from projections.map.naming import NoSuchThing
 from projections.store.history_records import Cause
 
 from .bisect import Search, Turn
@@ -13,7 +14,6 @@ from .conditions import Expression, ExpressionError
 from .diff import Difference
 from .explanation import Entry, Explanation
 from .known_history import KnownHistory, Progress
-from .names import NoSuchThing
 from .timeline import LogTimeline
 from .whatif import WhatIf, what_if
 

@@ -9,12 +9,14 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import Enum
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from eventsrc.envelope.model import Offset
+from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.store.history import NEVER, History
 from projections.store.history_records import ObjectHistory, PlaceHistory
 
@@ -42,6 +44,15 @@ class Names(Enum):
     NAME = "name"
 
 
+@dataclass(frozen=True, slots=True)
+class Mention:
+    """A name in a condition, such as keyframe ``house-a:12``, what it names, and its column."""
+
+    kind: Names
+    text: str
+    column: int
+
+
 class Direction(Enum):
     """How a value can change as events are added: binary search is for rising conditions only."""
 
@@ -62,6 +73,14 @@ class Direction(Enum):
         if Direction.STEADY in (self, other):
             return self if other is Direction.STEADY else other
         return self if self is other else Direction.EITHER_WAY
+
+    def compared(self, sign: str, other: "Direction") -> "Direction":
+        """The direction of a comparison of two values by ``sign``."""
+        if sign in (">", ">="):
+            return self.joined(other.opposite)
+        if sign in ("<", "<="):
+            return self.opposite.joined(other)
+        return self if self is other is Direction.STEADY else Direction.EITHER_WAY
 
 
 class CountIndex:
@@ -118,12 +137,24 @@ def _sorted(offsets: Iterable[int]) -> "array[int]":
 
 class HistoryFacts:
     """The values of the functions of conditions for the map after ``end`` events, read from a
-    history; ``end`` may be assigned. Arguments are ids; a keyframe is ``run_id:keyframe_id``."""
+    history; ``end`` may be assigned. A keyframe is ``run_id:keyframe_id``; ``ids`` has the ids of
+    the places and objects that a condition calls otherwise."""
 
     def __init__(self, history: History, index: CountIndex, end: Offset) -> None:
         self._history = history
         self._index = index
         self.end = end
+        self.ids: dict[tuple[Names, str], str] = {}
+
+    def id_of(self, kind: Names, text: str) -> str:
+        """The id of the thing of this kind that a condition calls so."""
+        return self.ids.get((kind, text), text)
+
+    def _place(self, text: str) -> PlaceOrdinal | None:
+        return self._history.place_ordinals.get(self.id_of(Names.PLACE, text))
+
+    def _object(self, text: str) -> ObjectOrdinal | None:
+        return self._history.object_ordinals.get(self.id_of(Names.OBJECT, text))
 
     @property
     def objects_merge(self) -> bool:
@@ -161,39 +192,39 @@ class HistoryFacts:
         return place is not None and place == self.place_of(b)
 
     def located_in(self, object_id: str) -> str | None:
-        ordinal = self._history.object_ordinals.get(object_id)
+        ordinal = self._object(object_id)
         if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return None
         return id_of_place(self._history, self._history.object_at(ordinal, self.end).place)
 
     def sightings(self, object_id: str) -> int:
-        ordinal = self._history.object_ordinals.get(object_id)
+        ordinal = self._object(object_id)
         if ordinal is None or not self._history.objects[ordinal].stands(self.end):
             return 0
         return self._history.object_at(ordinal, self.end).obs_count
 
     def size(self, place_id: str) -> int:
-        ordinal = self._history.place_ordinals.get(place_id)
+        ordinal = self._place(place_id)
         if ordinal is None or not self._history.places[ordinal].stands(self.end):
             return 0
         change = self._history.places[ordinal].change(self.end)
         return 0 if change is None else change.keyframe_count
 
     def transitions(self, a: str, b: str) -> int:
-        first, second = (self._history.place_ordinals.get(place) for place in (a, b))
+        first, second = map(self._place, (a, b))
         if first is None or second is None:
             return 0
         return self._history.transitions(first, second, self.end)
 
     def merged(self, place_id: str) -> bool:
-        ordinal = self._history.place_ordinals.get(place_id)
+        ordinal = self._place(place_id)
         if ordinal is None:
             return False
         merge = self._history.places[ordinal].absorbed_by
         return merge is not None and merge.cause.offset < self.end
 
     def name(self, place_id: str) -> str | None:
-        ordinal = self._history.place_ordinals.get(place_id)
+        ordinal = self._place(place_id)
         if ordinal is None or not self._history.places[ordinal].stands(self.end):
             return None
         return self._history.places[ordinal].name(self.end)
@@ -253,6 +284,8 @@ class Function:
     """Whether the one parameter may be left out."""
     rises: bool = False
     """Whether more events never lower it, or turn it from true to false."""
+    gives_place: bool = False
+    """Whether its value is the id of a place."""
 
     @property
     def name(self) -> str:
@@ -279,11 +312,15 @@ _ALL = (
         HistoryFacts.object_count, (Names.CLASS,), _NUMBER, "objects, of one class or of all",
         optional=True, rises=True,
     ),
-    Function(HistoryFacts.place_of, (_KF,), _TEXT, "the place a keyframe is in"),
+    Function(
+        HistoryFacts.place_of, (_KF,), _TEXT, "the place a keyframe is in", gives_place=True
+    ),
     Function(
         HistoryFacts.same_place, (_KF, _KF), _BOOLEAN, "two keyframes are in one place", rises=True
     ),
-    Function(HistoryFacts.located_in, (_OBJECT,), _TEXT, "the place of an object"),
+    Function(
+        HistoryFacts.located_in, (_OBJECT,), _TEXT, "the place of an object", gives_place=True
+    ),
     Function(HistoryFacts.sightings, (_OBJECT,), _NUMBER, "times an object was seen", rises=True),
     Function(HistoryFacts.size, (_PLACE,), _NUMBER, "keyframes in a place"),
     Function(
@@ -292,11 +329,21 @@ _ALL = (
     Function(HistoryFacts.merged, (_PLACE,), _BOOLEAN, "a place was absorbed", rises=True),
     Function(HistoryFacts.name, (_PLACE,), _TEXT, "the name of a place"),
     Function(HistoryFacts.named, (_NAME,), _BOOLEAN, "a place has this name"),
-    Function(HistoryFacts.place_called, (_NAME,), _TEXT, "the place of this name"),
+    Function(
+        HistoryFacts.place_called, (_NAME,), _TEXT, "the place of this name", gives_place=True
+    ),
     Function(HistoryFacts.refused_count, (), _NUMBER, "merges that a command refused", rises=True),
 )  # fmt: skip
 
 FUNCTIONS: dict[str, Function] = {function.name: function for function in _ALL}
+
+
+def no_function(name: str) -> str:
+    """What is wrong with a name that no function has, and what could be meant."""
+    near = get_close_matches(name.lower(), FUNCTIONS, n=1)
+    if near:
+        return f"no function {name!r}; did you mean {near[0]!r}?"
+    return f"no function {name!r}; there are {', '.join(sorted(FUNCTIONS))}"
 
 
 def functions_help() -> str:

@@ -16,20 +16,29 @@ gives a token and with it a column.
 """
 
 import ast
-import difflib
 import functools
 import keyword
 import operator
 import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Literal
 
 from eventsrc.base.errors import MisuseError
 
-from .condition_functions import FUNCTIONS, Direction, Function, HistoryFacts, Names, Type, Value
+from .condition_functions import (
+    FUNCTIONS,
+    Direction,
+    Function,
+    HistoryFacts,
+    Mention,
+    Names,
+    Type,
+    Value,
+    no_function,
+)
 
 MAX_DEPTH = 100
 """Greatest depth of parentheses and ``not``; it bounds every recursion over the tree."""
@@ -79,15 +88,6 @@ class ExpressionError(MisuseError):
 
 
 @dataclass(frozen=True, slots=True)
-class Mention:
-    """A name in a condition, such as keyframe ``house-a:12``, what it names, and its column."""
-
-    kind: Names
-    text: str
-    column: int
-
-
-@dataclass(frozen=True, slots=True)
 class _Call:
     function: Function
     mentions: tuple[Mention, ...]
@@ -107,6 +107,7 @@ class _Term:
     value: Callable[[HistoryFacts], Value]
     direction: Direction = Direction.STEADY
     calls: tuple[_Call, ...] = ()
+    text: str | None = None  # of one in quotes
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +152,9 @@ class Expression:
 
     def __init__(self, source: str) -> None:
         self.source = source
-        self._term = _Parser(source).parse()
+        parser = _Parser(source)
+        self._term = parser.parse()
+        self._compared = tuple(parser.compared)
 
     def __str__(self) -> str:
         return self.source
@@ -171,7 +174,8 @@ class Expression:
 
     def mentions(self) -> tuple[Mention, ...]:
         """The keyframes, places, objects, classes and runs it names."""
-        return tuple(mention for call in self._term.calls for mention in call.mentions)
+        called = (mention for call in self._term.calls for mention in call.mentions)
+        return (*called, *self._compared)
 
     def error_at(self, column: int, reason: str) -> ExpressionError:
         """An error at a column of this condition."""
@@ -183,6 +187,8 @@ class _Parser:
 
     def __init__(self, source: str) -> None:
         self._source = source
+        self.compared: list[Mention] = []
+        """Texts that are compared with a place."""
         self._tokens = list(islice(self._split(), MAX_TOKENS + 2))
         if len(self._tokens) > MAX_TOKENS + 1:
             raise self._error(self._tokens[MAX_TOKENS], f"more than {MAX_TOKENS:,} words and signs")
@@ -261,7 +267,8 @@ class _Parser:
                 number = token.kind == "number"
                 constant = int(token.text) if number else token.text
                 kind = Type.NUMBER if number else Type.TEXT
-                return _Term(token.column, kind, lambda _: constant)
+                text = None if number else token.text
+                return _Term(token.column, kind, lambda _: constant, text=text)
             case ast.Name() if self._token(node).text == "none":
                 return _Term(self._token(node).column, Type.TEXT, lambda _: None)
             case ast.Name():
@@ -315,27 +322,28 @@ class _Parser:
             raise self._error(at, "true and false cannot be compared; use and, or, not")
         if left.type is Type.TEXT and sign not in ("==", "!="):
             raise self._error(at, f"texts have no order; {sign!r} needs numbers")
-        match sign:
-            case ">" | ">=":
-                direction = left.direction.joined(right.direction.opposite)
-            case "<" | "<=":
-                direction = left.direction.opposite.joined(right.direction)
-            case _:
-                steady = left.direction is right.direction is Direction.STEADY
-                direction = Direction.STEADY if steady else Direction.EITHER_WAY
+        left, right = self._as_place(left, right), self._as_place(right, left)
         return _Term(
             at.column,
             Type.BOOLEAN,
             lambda facts: holds(left.value(facts), right.value(facts)),
-            direction,
+            left.direction.compared(sign, right.direction),
             left.calls + right.calls,
         )
+
+    def _as_place(self, term: _Term, other: _Term) -> _Term:
+        """A text that is compared with a place names one."""
+        text = term.text
+        if text is None or not any(call.function.gives_place for call in other.calls):
+            return term
+        self.compared.append(Mention(Names.PLACE, text, term.column))
+        return replace(term, value=lambda facts: facts.id_of(Names.PLACE, text))
 
     def _call(self, name: ast.Name, arguments: list[ast.expr] | tuple[()]) -> _Term:
         token = self._token(name)
         function = FUNCTIONS.get(token.text)
         if function is None:
-            raise self._error(token, _no_function(token.text))
+            raise self._error(token, no_function(token.text))
         texts = [self._argument(function, node) for node in arguments]
         least = 0 if function.optional else len(function.parameters)
         if not least <= len(texts) <= len(function.parameters):
@@ -390,10 +398,3 @@ def _expected_end(token: _Token, *, in_call: bool = False) -> str:
     if in_call:
         return f"expected ',' between the arguments, not {token}"
     return f"did not expect {token} after a whole expression"
-
-
-def _no_function(name: str) -> str:
-    near = difflib.get_close_matches(name.lower(), FUNCTIONS, n=1)
-    if near:
-        return f"no function {name!r}; did you mean {near[0]!r}?"
-    return f"no function {name!r}; there are {', '.join(sorted(FUNCTIONS))}"

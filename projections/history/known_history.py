@@ -17,6 +17,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError, LogPointError
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent, fold_events
+from projections.map.naming import Kind, NoSuchThing, SeveralThings, Thing, thing_called
 from projections.map.own_events import new_map
 from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
@@ -29,16 +30,14 @@ from projections.store.timeline_cache import TimelineCache
 
 from .bisect import Search, Searcher
 from .command_entries import EntryMaker, object_commands, place_commands, same_place_commands
-from .condition_functions import CountIndex, HistoryFacts
+from .condition_functions import CountIndex, HistoryFacts, Names
 from .conditions import Expression
 from .explanation import Explanation, explain_place, explain_same_place, with_entries
 from .names import (
-    NoSuchThing,
     find_keyframe,
-    find_object,
-    find_place,
     id_of_place,
     keyframe_ordinal,
+    things_at,
 )
 from .object_explanation import explain_object
 
@@ -158,24 +157,26 @@ class KnownHistory:
     def why(self, thing: str, end: Offset | None = None) -> Explanation:
         """The history of a place or an object, and the commands about it.
 
-        ``thing`` is an id, or the name of a place. Raises NoSuchThing with the nearest names.
+        ``thing`` is what `projections.map.naming.matches` takes. Raises NoSuchThing with the
+        nearest names, and SeveralThings.
         """
         last = self._checked(end)
         history = self.covering(last)
-        if thing in history.object_ordinals:
+        _refuse_keyframe(history, thing, last)
+        found = thing_called(thing, self.things(last), ("place", "object"))
+        if found.kind == "object":
             seen = self._whole_view(history).observations.__getitem__
-            explained = explain_object(history, seen, find_object(history, thing), last)
+            explained = explain_object(history, seen, history.objects[found.ordinal], last)
             commands = object_commands(self._entries, history, explained.facts["det_ids"])
             return with_entries(explained, commands)
-        if thing not in history.place_ordinals and thing.startswith("obj-"):
-            raise NoSuchThing("object", thing, history.object_ordinals)
-        try:
-            place = find_place(history, thing, last)
-        except NoSuchThing:
-            _refuse_keyframe(history, thing, last)
-            raise
+        place = history.places[found.ordinal]
         commands = place_commands(self._entries, history, place, last)
         return with_entries(explain_place(history, place, last), commands)
+
+    def things(self, end: Offset) -> list[Thing]:
+        """What may be called by a name after ``end`` events; see `things_at`."""
+        history = self.covering(end)
+        return things_at(history, self._recorder.at(end))
 
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which
@@ -210,9 +211,27 @@ class KnownHistory:
         facts = self.facts(end)
         if self._checked(start) > facts.end:
             raise LogPointError(f"the start ({start}) is after the end ({facts.end}); swap them")
-        _check_names(asked, facts)
+        self._find_names(asked, facts)
         cause_at = self.covering(facts.end).cause_at
         return Searcher(asked, facts, cause_at).search(start, facts.end, scan=scan)
+
+    def _find_names(self, expression: Expression, facts: HistoryFacts) -> None:
+        """Tell ``facts`` what the names in a condition mean. Raises ExpressionError for one that
+        is not in the log: a condition on it would never hold."""
+        things: list[Thing] | None = None
+        for mention in expression.mentions():
+            if facts.has(mention.kind, mention.text):
+                continue
+            if mention.kind not in (Names.PLACE, Names.OBJECT):
+                error = NoSuchThing(mention.kind.value, mention.text, facts.names(mention.kind))
+                raise expression.error_at(mention.column, str(error))
+            things = self.things(facts.end) if things is None else things
+            kind: Kind = "place" if mention.kind is Names.PLACE else "object"
+            try:
+                found = thing_called(mention.text, things, (kind,))
+            except (NoSuchThing, SeveralThings) as unfound:
+                raise expression.error_at(mention.column, str(unfound)) from None
+            facts.ids[mention.kind, mention.text] = found.id
 
     def _checked(self, end: Offset | None) -> Offset:
         return checked_end(self.reader, end)
@@ -220,15 +239,6 @@ class KnownHistory:
 
 def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:
     return [record for record in records if record.cause.offset < end]
-
-
-def _check_names(expression: Expression, facts: HistoryFacts) -> None:
-    """Raise ExpressionError for a name that is not in the log: a condition on it would never
-    hold."""
-    for mention in expression.mentions():
-        if not facts.has(mention.kind, mention.text):
-            error = NoSuchThing(mention.kind.value, mention.text, facts.names(mention.kind))
-            raise expression.error_at(mention.column, str(error))
 
 
 def _refuse_keyframe(history: History, text: str, end: Offset) -> None:

@@ -12,12 +12,12 @@ from eventsrc.envelope.model import DetId, Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
+from projections.map.naming import NoSuchThing
 from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.map.phrases import command_document, command_name
 from projections.store.history import NEVER
 
 from .known_history import Progress
-from .names import NoSuchThing
 from .rule_folds import NO_NUMBER, FoldResult, Rules, fold_all
 
 if TYPE_CHECKING:

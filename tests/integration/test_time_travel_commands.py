@@ -62,7 +62,8 @@ def test_in_a_process_of_its_own(tmp_path: Path) -> None:
     make_log(tmp_path)
     program = Commands.in_folder(tmp_path)
     assert len(program("merges", "log", *RULES, "--json").json) == 1
-    assert program("why", "log", "run-a_p9", code=2).err.startswith("mapfold: no place 'run-a_p9'")
+    said = program("why", "log", "run-a_p9", code=2).err
+    assert said.startswith("mapfold: no place or object 'run-a_p9'")
 
 
 def test_merges(mapfold: InProcess) -> None:

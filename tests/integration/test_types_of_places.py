@@ -102,8 +102,9 @@ def test_query_where_finds_places_by_type_and_by_name(mapfold: Commands, log: Pa
     thing = mapfold("state", log, "--json").json["objects"][0]["object_id"]
     assert where(thing)["object_id"] == thing
     said = mapfold("query", "where", "office", "--log", log, code=2).err
-    assert "no object 'office' in this map, and no place of that type or name" in said
-    assert "there are places of type bathroom, kitchen" in said
+    assert "no place or object 'office' under these settings; there are " in said
+    said = mapfold("query", "where", "bathrom", "--log", log, code=2).err
+    assert "near it: bathroom" in said
 
 
 @pytest.mark.slow

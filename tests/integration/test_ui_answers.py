@@ -202,6 +202,7 @@ def test_search(server: UiServer) -> None:
     found = server.api("search", q="p3", set=WIDE)["found"]
     assert [each["id"] for each in found] == ["sim-7-a_p3"]
     chairs = server.api("search", q="Chair")["found"]
+    assert server.api("search", q=chairs[0]["id"][4:10])["found"][0] == chairs[0]
     assert {each["text"] for each in chairs[:3]} == {"chair"}
     (keyframe,) = server.api("search", q="sim-7-a:310", kind="keyframe")["found"]
     assert (keyframe["id"], keyframe["number"]) == ("sim-7-a/310", 309)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.fold.map_errors import QuestionError
+from projections.map.naming import NoSuchThing
 from projections.postgres.queries.graph_reads import PlaceGraph, PlaceNode
 
 SIZE = 6
@@ -68,5 +68,5 @@ def test_hops_are_the_length_of_the_shortest_way(
 
 
 def test_a_place_that_is_not_there_is_named() -> None:
-    with pytest.raises(QuestionError, match="'nowhere'"):
+    with pytest.raises(NoSuchThing, match="'nowhere'"):
         graph({}).find("nowhere")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from projections.history.condition_functions import FUNCTIONS, Function, functions_help
+from projections.history.condition_functions import FUNCTIONS, Function, Names, functions_help
 from projections.history.conditions import Expression, ExpressionError
 
 
@@ -14,6 +14,9 @@ class FakeFacts:
     """A map written out by hand: three keyframes, two places, one of them absorbed."""
 
     places: dict[str, str] = field(default_factory=lambda: {"a:1": "a_p0", "a:2": "a_p0"})
+
+    def id_of(self, kind: Names, text: str) -> str:
+        return text
 
     def place_count(self) -> int:
         return 2

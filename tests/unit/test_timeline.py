@@ -149,15 +149,15 @@ def test_why_same_before_the_keyframes_are_recorded(corridor: LogTimeline) -> No
 @pytest.mark.parametrize(
     ("thing", "says"),
     [
-        ("run-a_p2", "no place 'run-a_p2' under these settings; near it: run-a_p1, run-a_p0"),
-        ("kitchen", "no place 'kitchen' under these settings; there are run-a_p0, run-a_p1"),
-        ("obj-0000", "no object 'obj-0000' under these settings; "),
+        ("run-a_p2", "place or object 'run-a_p2' under these settings; near it: run-a_p1, run-"),
+        ("kitchen", "place or object 'kitchen' under these settings; there are run-a_p0, run-"),
+        ("obj-0000", "object 'obj-0000' under these settings; "),
     ],
 )
 def test_an_absent_id_lists_the_near_ones(corridor: LogTimeline, thing: str, says: str) -> None:
     with pytest.raises(NoSuchThing) as caught:
         corridor.why(thing)
-    assert str(caught.value).startswith(says)
+    assert str(caught.value).startswith(f"no {says}")
 
 
 def test_a_keyframe_alone_is_refused_with_its_place(corridor: LogTimeline) -> None:
@@ -241,5 +241,5 @@ def test_an_empty_log_has_an_empty_history(tmp_path: Path) -> None:
     with LogTimeline(write_log(tmp_path / "log", []), RULES) as opened:
         assert opened.at().counts()["events"] == 0
         assert opened.merges() == []
-        with pytest.raises(NoSuchThing, match="there is no place at all"):
+        with pytest.raises(NoSuchThing, match="there is no place or object at all"):
             opened.why("run-a_p0")

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import psycopg
 
 from eventsrc.base.text import advised
-from projections.fold.map_errors import ProjectionMissing, QuestionError
+from projections.fold.map_errors import ProjectionMissing
+from projections.map.naming import Thing, thing_called
 from projections.map.view import MapView
 from projections.postgres.connection import Connection, database_errors, describe_target
 from projections.postgres.graph_rows import text
@@ -42,7 +43,6 @@ class PlaceGraph:
 
     def __init__(self, places: Iterable[PlaceNode], edges: Iterable[tuple[int, int, int]]) -> None:
         self.places: Mapping[int, PlaceNode] = {p.ordinal: p for p in places}
-        self._ids = {p.place_id: p.ordinal for p in self.places.values()}
         self._next: dict[int, dict[int, int]] = {ordinal: {} for ordinal in self.places}
         for a, b, shared in edges:
             self._next[a][b] = self._next[b][a] = shared
@@ -61,13 +61,24 @@ class PlaceGraph:
             nodes.append(node)
         return cls(nodes, view.edges())
 
-    def find(self, place_id: str) -> int:
-        """The ordinal of a Place. Raises QuestionError if there is none of that id."""
-        if place_id not in self._ids:
-            raise QuestionError(
-                f"no place {place_id!r} in this map; `{advised('state')}` lists them"
+    def things(self) -> list[Thing]:
+        """The Places, by what they may be called."""
+        return [
+            Thing(
+                "place",
+                p.ordinal,
+                p.place_id,
+                p.type,
+                p.name,
+                count=p.keyframe_count,
+                spot=(p.x, p.y),
             )
-        return self._ids[place_id]
+            for p in self.places.values()
+        ]
+
+    def find(self, text: str) -> int:
+        """The ordinal of the Place that ``text`` names. Raises NoSuchThing and SeveralThings."""
+        return thing_called(text, self.things(), ("place",)).ordinal
 
     def hops_from(self, start: int, most: int) -> dict[int, int]:
         """Places within ``most`` steps of ``start`` (itself: 0), with their number of steps."""
@@ -138,6 +149,11 @@ def read_object(connection: Connection, object_id: str) -> dict[str, Any] | None
     """
     rows = _rows(connection, "object", id=text(object_id))
     return _object_document(rows[0]) if rows else None
+
+
+def read_objects(connection: Connection) -> list[dict[str, Any]]:
+    """All Objects, each with its ``place_id``, in founding order."""
+    return [_object_document(row) for row in _rows(connection, "objects")]
 
 
 def read_objects_of_place(connection: Connection, place_id: str) -> list[dict[str, Any]]:

@@ -8,10 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final, TypeAlias
 
-from eventsrc.base.text import advised
-from projections.fold.map_errors import QuestionError
 from projections.fold.place_types import type_of_name
 from projections.localize.relocalize import CandidatePlace, MapCandidates, QuestionCrop
+from projections.map.naming import Rule, Thing, matches, no_such_thing, thing_called
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 from projections.postgres.connection import Connection
@@ -21,6 +20,7 @@ from .graph_reads import (
     PlaceNode,
     read_object,
     read_object_counts,
+    read_objects,
     read_objects_of_place,
     read_place_graph,
 )
@@ -66,6 +66,10 @@ class LiveMap:
         found = read_object(self._connection, object_id)
         return None if found is None else _ordered(found)
 
+    def all_objects(self) -> list[dict[str, Any]]:
+        """All Objects, each with its place_id."""
+        return [_ordered(thing) for thing in read_objects(self._connection)]
+
     def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
         return [_ordered(thing) for thing in read_objects_of_place(self._connection, place_id)]
@@ -94,6 +98,10 @@ class FoldedMap:
         """An Object with its place_id."""
         objects = self._view.objects.values()
         return next((self._document(o) for o in objects if o.object_id == object_id), None)
+
+    def all_objects(self) -> list[dict[str, Any]]:
+        """All Objects, each with its place_id."""
+        return [self._document(each) for each in self._view.objects.values()]
 
     def objects_in(self, place_id: str) -> list[dict[str, Any]]:
         """The Objects of a Place."""
@@ -128,36 +136,57 @@ def _named(place: PlaceNode | CandidatePlace | None, key: str = "name") -> dict[
 
 
 def where_is(source: MapSource, wanted: str) -> dict[str, Any] | list[dict[str, Any]]:
-    """An Object by its id and the Place it is located in; or the Places that are of this type or
-    have this name, likeliest first. Raises QuestionError if there is neither."""
+    """The Object that ``wanted`` names and the Place it is located in, the Objects of a class, or
+    the Places that are of a type or have a name, likeliest first. Raises NoSuchThing, and
+    SeveralThings for a short id."""
     thing = source.find_object(wanted)
     if thing is not None:
         return thing
-    places = source.place_graph().places.values()
+    graph = source.place_graph()
+    places = graph.things()
+    rule, meant = matches(wanted, places)
+    if rule is Rule.ID or rule is Rule.SHORT:
+        return [_place(graph.places[graph.find(wanted)])]
+    if rule is None:
+        objects = source.all_objects()
+        things = [_thing(number, each) for number, each in enumerate(objects)]
+        rule, meant = matches(wanted, things)
+        if rule is Rule.CLASS and len(meant) > 1:
+            return [objects[each.ordinal] for each in meant]
+        if meant:
+            return objects[thing_called(wanted, things, ("object",)).ordinal]
+        if type_of_name(wanted) not in {each.word for each in places} - {None}:
+            raise no_such_thing(wanted, [*places, *things], ("place", "object"))
+    called = {each.ordinal for each in meant if rule is Rule.NAME}
     kind = type_of_name(wanted)
-    found = [p for p in places if p.name == wanted or (kind is not None and p.type == kind)]
-    if not found:
-        types = sorted({place.type for place in places if place.type is not None})
-        known = f"; there are places of type {', '.join(types)}" if types else ""
-        raise QuestionError(
-            f"no object {wanted!r} in this map, and no place of that type or name{known}; "
-            f"`{advised('state', '--json')}` lists objects and places"
-        )
-    found.sort(key=lambda p: (p.name != wanted, -(p.type_probability or 0.0), p.ordinal))
-    return [
-        {"place_id": p.place_id, "centroid_x": p.x, "centroid_y": p.y}
-        | ({} if p.type is None else {"type": p.type, "type_probability": p.type_probability})
-        | _named(p)
-        for p in found
-    ]
+    found = [p for p in graph.places.values() if p.ordinal in called or (kind and p.type == kind)]
+    found.sort(key=lambda p: (p.ordinal not in called, -(p.type_probability or 0.0), p.ordinal))
+    return [_place(p) for p in found]
 
 
-def objects_of(source: MapSource, place_id: str) -> list[dict[str, Any]]:
-    """The Objects of a Place. Raises QuestionError if there is no such Place."""
-    found = source.objects_in(place_id)
-    if not found:
-        source.place_graph().find(place_id)
-    return found
+def _place(p: PlaceNode) -> dict[str, Any]:
+    kind = {} if p.type is None else {"type": p.type, "type_probability": p.type_probability}
+    return {"place_id": p.place_id, "centroid_x": p.x, "centroid_y": p.y} | kind | _named(p)
+
+
+def _thing(number: int, document: dict[str, Any]) -> Thing:
+    """An Object of a document, by what it may be called."""
+    x, y = (document.get(f"est_{axis}", document[f"mean_{axis}"]) for axis in "xy")
+    return Thing(
+        "object",
+        number,
+        document["object_id"],
+        document["class_name"],
+        count=document["obs_count"],
+        spot=(x, y),
+        place=document["place_id"],
+    )
+
+
+def objects_of(source: MapSource, place: str) -> list[dict[str, Any]]:
+    """The Objects of the Place that ``place`` names. Raises NoSuchThing and SeveralThings."""
+    graph = source.place_graph()
+    return source.objects_in(graph.places[graph.find(place)].place_id)
 
 
 def places_holding(

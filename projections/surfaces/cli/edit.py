@@ -26,13 +26,15 @@ from .options import JsonOption
 from .terminal import display, emit, say
 
 PlaceArgument = Annotated[
-    str, typer.Argument(metavar="PLACE", help="A place's id, or RUN:KEYFRAME for its place.")
+    str,
+    typer.Argument(metavar="PLACE", help="A place: p3, a name, a type of room, or RUN:KEYFRAME."),
 ]
 OtherPlaceArgument = Annotated[
     str, typer.Argument(metavar="PLACE", help="Another one, the same way.")
 ]
 ObjectArgument = Annotated[
-    str, typer.Argument(metavar="OBJECT", help="An object's id, or the det_id of an observation.")
+    str,
+    typer.Argument(metavar="OBJECT", help="An object's first six characters, class or det_id."),
 ]
 OtherObjectArgument = Annotated[
     str, typer.Argument(metavar="OBJECT", help="Another one, the same way.")
@@ -115,7 +117,7 @@ def _different_objects(
 @edit.command("drop-object")
 def _drop_object(
     *,
-    thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.")],
+    thing: Annotated[str, typer.Argument(metavar="OBJECT", help="The object, as its id or class.")],
     options: EditOptions,
 ) -> None:
     """Drop an object from the map, with the observations that it has now.

@@ -33,7 +33,9 @@ query = typer.Typer(
     no_args_is_help=True, help="Ask the map: similar, where, contents, holding, path."
 )
 
-PlaceArgument = Annotated[str, typer.Argument(metavar="PLACE", help="A place's id.")]
+PlaceArgument = Annotated[
+    str, typer.Argument(metavar="PLACE", help="A place: p3, a name, a type of room.")
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +105,7 @@ def where(
         str,
         typer.Argument(
             metavar="WHAT",
-            help="An object's id, a kind of room such as kitchen, or a place's name.",
+            help="An object's id or its first six characters, a class, a place, or a kind of room.",
         ),
     ],
     asked: AskedMap,
@@ -120,22 +122,20 @@ def where(
 @query.command()
 def contents(
     *,
-    place_id: PlaceArgument,
+    place: PlaceArgument,
     asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """List the objects located in a place."""
     with asked.source() as source:
-        _print(objects_of(source, place_id), json_)
+        _print(objects_of(source, place), json_)
 
 
 @query.command()
 def holding(
     *,
     class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
-    start: Annotated[
-        str, typer.Option("--from", metavar="PLACE", help="The id of the place to start from.")
-    ],
+    start: Annotated[str, typer.Option("--from", metavar="PLACE", help="The place to start from.")],
     hops: Annotated[int, typer.Option("--hops", metavar="N", min=0, help="Most steps.")] = 2,
     asked: AskedMap,
     json_: JsonOption = False,
@@ -152,7 +152,7 @@ def holding(
 def path(
     *,
     start: PlaceArgument,
-    goal: Annotated[str, typer.Argument(metavar="GOAL", help="The other place's id.")],
+    goal: Annotated[str, typer.Argument(metavar="GOAL", help="The other place.")],
     asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:

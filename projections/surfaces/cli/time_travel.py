@@ -170,9 +170,9 @@ def why(
     thing: Annotated[
         str | None,
         typer.Argument(
-            metavar="PLACE|OBJECT_ID|RUN:KF",
-            help="A place by its id, also an absorbed one, or by its name; an object; the first"
-            " of two keyframes.",
+            metavar="PLACE|OBJECT|RUN:KF",
+            help="A place, also an absorbed one: p3, its name or id; an object; the first of two"
+            " keyframes.",
         ),
     ] = None,
     other: Annotated[
@@ -277,7 +277,7 @@ def bisect(
 bisect.__doc__ = f"""Find the first event that made a condition over the map true.
 
 EXPR compares numbers and ids, joined by and, or, not and parentheses, for example
-"place_count < 3", "same_place('run:12', 'run:90')", "located_in('obj-…') == 'run_p2'";
+"place_count < 3", "same_place('run:12', 'run:90')", "located_in('couch') == 'p2'";
 none is no place. It may call:
 
 \b

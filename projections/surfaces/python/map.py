@@ -15,6 +15,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import Corrections
+from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import CameraConstants, Settings, preset_assignments, read_settings
 from projections.localize.relocalize import (
@@ -29,6 +30,7 @@ from projections.localize.relocalize import (
 from projections.localize.relocalize.reading import MAX_QUESTION_BYTES
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
+from projections.map.naming import thing_called, things_of
 from projections.map.own_events import read_corrections
 from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
@@ -80,6 +82,21 @@ class Map:
     def adjacency(self) -> list[dict[str, Any]]:
         """Pairs of neighbouring Places, each with its number of transitions."""
         return list(self.state["adjacency"])
+
+    def place(self, text: str) -> dict[str, Any]:
+        """The Place that ``text`` names: an id, a given name, ``p3``, or a type of room that only
+        one has. Raises NoSuchThing with the nearest names, and SeveralThings.
+        """
+        wanted = thing_called(text, things_of(self.view), ("place",))
+        id_ = self.view.place_id(self.view.survivors.find(PlaceOrdinal(wanted.ordinal)))
+        return next(each for each in self.state["places"] if each["place_id"] == id_)
+
+    def object(self, text: str) -> dict[str, Any]:
+        """The Object that ``text`` names: an id, its first six characters or more, or a class that
+        only one has. Raises NoSuchThing with the nearest names, and SeveralThings."""
+        wanted = ObjectOrdinal(thing_called(text, things_of(self.view), ("object",)).ordinal)
+        id_ = self.view.all_objects[self.view.object_survivors.find(wanted)].object_id
+        return next(each for each in self.state["objects"] if each["object_id"] == id_)
 
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""

@@ -100,7 +100,8 @@ class Timeline:
     def why(self, thing: str, point: int | str = "end") -> dict[str, Any]:
         """The history of a place or an object, as ``mapfold why --json``.
 
-        Raises NoSuchThing with the nearest names.
+        It may be named as in `Map.place` and `Map.object`. Raises NoSuchThing with the nearest
+        names, and SeveralThings.
         """
         return self._timeline.why(thing, self._offset(point)).document()
 

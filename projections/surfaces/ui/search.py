@@ -11,6 +11,7 @@ from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, ObservationO
 from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
 from projections.history.names import find_keyframe, keyframe_name
+from projections.map.naming import matches
 from projections.map.records import ObservationRecord
 from projections.store.history import History
 
@@ -99,19 +100,23 @@ large kinds only those whose name contains the wanted text."""
 
 
 def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The things whose name matches ``q``, best first: equal names, then names that begin or end
-    with it, then names that contain it. Letter case does not matter. ``kind`` asks for one kind
-    only."""
+    """The things whose name matches ``q``, best first: those that a command would take it for
+    (`projections.map.naming`), then equal names, names that begin or end with it, and names that
+    contain it. Letter case does not matter. ``kind`` asks for one kind only."""
     asked = AskedPoint.of(shown, query)
-    wanted = text_of(query, "q")[:_MOST_TEXT].casefold().strip()
+    text = text_of(query, "q")[:_MOST_TEXT].strip()
+    wanted = text.casefold()
     kind = query.get("kind")
     if kind is not None and kind not in _SOURCES:
         raise QuestionError(f"kind is {kind[:40]!r}; give one of {', '.join(_SOURCES)}")
     sources = _SOURCES.values() if kind is None else [_SOURCES[kind]]
     named = chain.from_iterable(source(asked, wanted) for source in sources) if wanted else ()
+    things = asked.known.things(asked.end) if wanted else []
+    meant = {(thing.kind, thing.id) for thing in matches(text, things)[1]}
     found: list[_Found] = []
     for number, each in enumerate(named):
         rank = min(_rank(name.casefold(), wanted) for name in each.pop("names"))
+        rank = -1 if (each["kind"], each["id"]) in meant else rank
         if rank < _NOT:
             found.append((rank, number, each))
     found.sort(key=lambda item: item[:2])

@@ -1,0 +1,128 @@
+"""Places and objects by short ids, names, types of room and classes, wherever one is asked for."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.log import LogReader
+from projections.fold.settings import Settings
+from projections.map.fold import fold_log
+from projections.map.naming import NoSuchThing, SeveralThings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.postgres.cypher import connect_for_cypher
+from projections.postgres.queries.candidate_search import prepare_graph
+from projections.postgres.queries.map_queries import (
+    FoldedMap,
+    LiveMap,
+    objects_of,
+    path_between,
+    places_holding,
+    where_is,
+)
+from projections.surfaces.python import Timeline, fold
+from tests.integration.test_types_of_places import BATHROOM, DOCUMENTS, KITCHEN, SHED
+from tests.support.commands import Commands
+from tests.support.logs import write_log
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    return Commands.in_folder(tmp_path)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log", DOCUMENTS)
+
+
+def test_why_takes_what_a_person_types(mapfold: Commands, log: Path) -> None:
+    def why(text: str) -> Any:
+        return mapfold("why", log, text, "--json").json["subject"]
+
+    box = why("Box")
+    assert [why(box), why(box[:10]), why(box[4:11])] == [box, box, box]
+    assert [why("p1"), why("Bathroom"), why("wc")] == [BATHROOM, BATHROOM, BATHROOM]
+    mapfold("edit", log, "name-place", "p2", "Anna's p1", "--reason", "hers")
+    mapfold("edit", log, "name-place", "p0", "P2", "--reason", "a bad name")
+    assert [why("anna's P1"), why("p1"), why("p2"), why(SHED)] == [SHED, BATHROOM, KITCHEN, SHED]
+    said = mapfold("why", log, "sink", code=2).err
+    assert "'sink' means 2 objects: obj-" in said
+    assert f"(sink, in {KITCHEN}, seen 4 times at (" in said
+    said = mapfold("why", log, "p7", code=2).err
+    assert "no place or object 'p7' under these settings; near it: " in said
+    assert "`mapfold state" in said
+    said = mapfold("why", log, "run-a:3", code=2).err
+    assert f"run-a:3 is a keyframe, in {KITCHEN}" in said
+
+
+def test_a_short_id_of_several_runs_lists_them(mapfold: Commands, log: Path) -> None:
+    again = [{**each, "run_id": "run-b", "map_x": each["map_x"] + 90} for each in DOCUMENTS]
+    for each in again:
+        each["detections"] = []
+    write_log(log.with_name("two"), [*DOCUMENTS, *again])
+    said = mapfold("edit", "two", "join", "p1", "p0", "--dry-run", code=2).err
+    assert "'p1' means 2 places: run-a_p1 (bathroom, 4 keyframes at (9.15, 0.00)); run-b_p" in said
+
+
+def test_edits_and_conditions_take_them(mapfold: Commands, log: Path) -> None:
+    def made(*words: str) -> Any:
+        return mapfold("edit", log, *words, "--dry-run", "--json").json["command"]
+
+    anchors = made("keep-apart", "kitchen", "p2")["places"]
+    assert [anchor["keyframe_id"] for anchor in anchors] == [0, 20]
+    assert len(made("drop-object", "box")["det_ids"]) == 4
+    pair = made("different-objects", "Refrigerator", "toilet")["det_ids"]
+    assert pair == ["run-a_kf0_d0", "run-a_kf10_d0"]
+
+    def turns(condition: str) -> Any:
+        return mapfold("bisect", log, condition, "--json").json["found"]["offset"]
+
+    whole = turns(f"located_in('box') == '{SHED}'")
+    assert turns("located_in('box') == 'p2'") == whole == turns("'p2' == located_in('BOX')")
+    assert turns("size('bathroom') == 4") == turns(f"size('{BATHROOM}') == 4")
+    said = mapfold("bisect", log, "located_in('box') == 'p9'", code=2).err
+    assert "expression, column 22: no place 'p9' under these settings; near it: " in said
+    said = mapfold("bisect", log, "sightings('sink') > 2", code=2).err
+    assert "expression, column 11: 'sink' means 2 objects: " in said
+
+
+def test_the_live_map_and_the_log_take_the_same(log: Path, one_database: Targets) -> None:
+    rebuild(log, one_database, Settings())
+    with LogReader(log) as reader:
+        view = fold_log(reader, Settings())[1]
+    (box,) = (each.object_id for each in view.objects.values() if each.class_name == "box")
+    with connect_for_cypher(one_database.graph_url) as connection:
+        prepare_graph(connection)
+        answers: list[list[Any]] = []
+        for source in (LiveMap(connection), FoldedMap(view)):
+            answers.append(
+                [where_is(source, t) for t in ("BOX", box, box[4:10], "p1", "sink", "wc")]
+            )
+            answers[-1].append(objects_of(source, "p2"))
+            answers[-1].append(path_between(source, "kitchen", "p1"))
+            answers[-1].append(places_holding(source, "toilet", "kitchen", 1))
+            for text in ("p'; drop table x; --", "obj-0000000", "%", "\\"):
+                with pytest.raises(NoSuchThing, match="under these settings"):
+                    where_is(source, text)
+    assert answers[0] == answers[1]
+    by_class, by_id, by_digits, place, sinks, rooms, inside, way, holding = answers[0]
+    assert by_class == by_id == by_digits == inside[0]
+    assert place[0]["place_id"] == rooms[0]["place_id"] == BATHROOM
+    assert [sink["place_id"] for sink in sinks] == [KITCHEN, BATHROOM]
+    assert [step["place_id"] for step in way] == [KITCHEN, BATHROOM]
+    assert [each["place_id"] for each in holding] == [BATHROOM]
+
+
+def test_python_takes_them(log: Path) -> None:
+    house = fold(log)
+    assert house.place("bathroom") == house.place("p1") == house.places[1]
+    box = house.object("box")
+    assert house.object(box["object_id"][:10]) == box
+    with pytest.raises(SeveralThings, match="'sink' means 2 objects"):
+        house.object("sink")
+    with pytest.raises(NoSuchThing, match="no place 'cellar'"):
+        house.place("cellar")
+    with Timeline(log) as timeline:
+        assert timeline.why("box")["subject"] == box["object_id"]
