@@ -11,26 +11,20 @@ then are fold and tables kept, both by one assignment. Until then there are the 
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import islice
 from typing import Final, NamedTuple, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from eventsrc.base.errors import LogError
-from eventsrc.base.machine import crc32, gc_paused
+from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.commands import NamePlace
-from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from eventsrc.log import Event, LogReader
+from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
-from projections.fold.exact import Units
 from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_into, fold_log
-from projections.map.own_events import new_map, vectors_of
+from projections.map.own_events import new_map
 from projections.map.parsing import READ_AHEAD, parse_events
 from projections.map.view import MapView
 
@@ -40,6 +34,7 @@ from .history import History
 from .stored_view import StoredView
 from .tables import DamagedPart, Tables
 from .timeline_cache import TimelineCache
+from .vectors import RecordedVectors
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with (events folded, events in all) from time to time."""
@@ -85,12 +80,12 @@ class HistoryRecorder:
 
     def at(self, end: Offset, *, embeddings: bool = False) -> StoredView:
         """The map after ``end`` events; the caller may change it. Its observations carry no
-        embeddings, only their checksums; with ``embeddings`` its `vectors` are read from the log.
-        Raises as `up_to`."""
+        embeddings, only their checksums; with ``embeddings`` it has `vectors`. Raises as
+        `up_to`."""
         history = self.history(end)
-        vectors = RecordedVectors(self._reader, history).of if embeddings else None
+        vectors = RecordedVectors(self._reader, history, end, self._cache) if embeddings else None
         with gc_paused():
-            return StoredView(history, end, self._cache, vectors)
+            return StoredView(history, end, self._cache, vectors.of if vectors else None)
 
     def resumed(self, limit: Offset) -> tuple[SemanticMap, StoredView] | None:
         """The latest cached fold of at most ``limit`` events, and its map; None if there is none.
@@ -272,65 +267,3 @@ def map_at(reader: LogReader, offset: Offset) -> OccupancyMap:
     if not isinstance(event.parsed, OccupancyMap):
         raise FoldError(offset, "its history says that it is an occupancy map")
     return event.parsed
-
-
-_Vectors = NDArray[np.int32]
-
-
-class RecordedVectors:
-    """The unit vectors of the observations of a history of this log; for many threads."""
-
-    def __init__(self, reader: LogReader, history: History) -> None:
-        self._log, self._log_id = reader.path, reader.log_id
-        self._history = history
-
-    def of(self, observations: NDArray[np.int64]) -> _Vectors:
-        """The vectors of these observations, which have one, in units of 2⁻²⁰, shape (n, dim).
-
-        Raises LogError if the log has them no more.
-        """
-        tables = self._history.tables
-        order = np.argsort(observations, kind="stable")
-        asked = observations[order]
-        offsets = tables.integers("observation", "offset")[asked]
-        crcs = tables.integers("observation", "crc")[asked].tolist()
-        events, starts = np.unique(offsets, return_index=True)
-        ends = [*starts[1:].tolist(), len(asked)]
-        found: _Vectors = np.zeros((len(asked), 0), np.int32)
-        # With a reader of its own: a map may be asked after its log was closed.
-        with LogReader(self._log) as reader:
-            units = self._units(reader, events) if len(events) else iter(())
-            for event, first, last in zip(events.tolist(), starts.tolist(), ends, strict=True):
-                of_event = next(units, {})
-                for row in range(first, last):
-                    unit = of_event.get(crcs[row])
-                    if unit is None:
-                        raise LogError(
-                            f"the log at {self._log} has other vectors at offset {event} than its"
-                            " history; open it again"
-                        )
-                    if not found.shape[1]:
-                        found = np.empty((len(asked), len(unit)), np.int32)
-                    found[order[row]] = unit
-        return found
-
-    def _units(self, reader: LogReader, events: NDArray[np.int64]) -> Iterator[dict[int, _Vectors]]:
-        """For each of these events its vectors by checksum."""
-        history = self._history
-        added = vectors_of(reader, history.settings, history.corrections)
-        wanted = self._read(reader, events)
-        while stretch := list(islice(wanted, READ_AHEAD)):
-            for event in parse_events(stretch):
-                units: Sequence[Units | None] = event.units
-                if isinstance(event.parsed, Accepted) and added is not None:
-                    units = added.applied(event.parsed, units)[1]
-                yield {crc32(unit[1].data): unit[1] for unit in units if unit is not None}
-
-    def _read(self, reader: LogReader, events: NDArray[np.int64]) -> Iterator[Event]:
-        if reader.log_id != self._log_id:
-            return
-        numbers = events.tolist()
-        wanted = set(numbers)
-        for event in reader.read(Offset(numbers[0]), Offset(numbers[-1] + 1)):
-            if event.offset in wanted:
-                yield event

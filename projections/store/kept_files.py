@@ -21,6 +21,7 @@ import math
 import mmap
 import os
 import re
+import stat
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -76,15 +77,18 @@ def _write_array(archive: zipfile.ZipFile, name: str, array: Array) -> "_ArrayLo
         raise Unwritable(f"{name} has numbers of more than 64 bits")
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(little))
-    member = head.getvalue() + little.tobytes()
-    at = _write_member(archive, name, member)
-    return _ArrayLocation(little.dtype.str, len(little), at, len(head.getvalue()), crc32(member))
+    at = _write_member(archive, name, head.getvalue(), little.data)
+    crc = crc32(little.data, crc32(head.getvalue()))
+    return _ArrayLocation(little.dtype.str, len(little), at, len(head.getvalue()), crc)
 
 
-def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> int:
+def _write_member(archive: zipfile.ZipFile, name: str, *content: bytes | memoryview) -> int:
     """Write a member of the archive and return the byte at which its content begins."""
     info = zipfile.ZipInfo(name, _PLAIN_DATE)
-    archive.writestr(info, content)
+    info.file_size = sum(memoryview(each).nbytes for each in content)
+    with archive.open(info, "w") as member:
+        for each in content:
+            member.write(each)
     return info.header_offset + _LOCAL_HEADER + len(name.encode()) + len(info.extra)
 
 
@@ -234,6 +238,15 @@ def pack(values: State) -> bytes:
     index = json.dumps({"plain": plain, "arrays": arrays}, allow_nan=False).encode()
     body = zlib.compress(b"".join([len(index).to_bytes(_LENGTH_BYTES, "little"), index, *blobs]), 1)
     return MAGIC + hashlib.sha256(body).digest() + body
+
+
+def read_state(path: Path) -> State:
+    """The values that a regular file has as bytes of `pack`. Raises OSError, DamagedPart,
+    MalformedState."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise DamagedPart("it is not a regular file")
+        return unpack(file.read())
 
 
 def unpack(data: bytes) -> State:

@@ -2,9 +2,11 @@
 
 For each choice of settings and commands in force there are parts, ``KEY-START-END.npz``, of which
 each has the history of the events from START to before END, and the folds at the last ENDs,
-``KEY-END.fold``, from which it is folded on. ``KEY-END.VERSION.digest`` has the digest of the map
-after END events, for the ENDs used last. Files are written under another name and renamed, and
-never changed, so any number of processes may read and write: the same log gives the same files.
+``KEY-END.fold``, from which it is folded on. ``KEY-START-END.vectors`` has the unit vectors of the
+observations of the same events, kept by the first question that compares all of them.
+``KEY-END.VERSION.digest`` has the digest of the map after END events, for the ENDs used last. Files
+are written under another name and renamed, and never changed, so any number of processes may read
+and write: the same log gives the same files.
 
 A part is used only if it is of this log, these settings and commands and this version of the fold,
 if the segments that it was made from are as they were, and if the last event that it covers is
@@ -19,11 +21,10 @@ import hashlib
 import json
 import os
 import re
-import stat
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 from eventsrc.base.errors import LogError
 from eventsrc.base.machine import system_clock
@@ -46,7 +47,7 @@ from projections.map.digest import VERSION
 from projections.map.own_events import with_vectors
 
 from .columns import Stripe, joined_short
-from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, unpack, write_part
+from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, read_state, write_part
 from .tables import DamagedPart
 
 FOLD_VERSION: Final = 6
@@ -62,10 +63,11 @@ MOST_FOLDS: Final = 3
 one goes on from one before it."""
 MOST_DIGESTS: Final = 16
 """The most digests of a history that are kept: those made last."""
-_PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.npz")
+PartKind: TypeAlias = Literal["npz", "vectors"]
+_PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.(npz|vectors)")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
 _DIGEST: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.\d+\.digest")
-_OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|fold|digest)")
+_OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|vectors|fold|digest)")
 _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
 """Errors of opening something other than a regular file."""
 _TRIES: Final = 3
@@ -100,16 +102,16 @@ class TimelineCache:
         self._noted: set[str] = set()
         self._kept_at: Offset | None = None  # by this process
 
-    def stripes(self, end: Offset) -> list[Stripe]:
+    def stripes(self, end: Offset, kind: PartKind = "npz") -> list[Stripe]:
         """The cached stripes of at most the first ``end`` events."""
         for _ in range(_TRIES):
             with contextlib.suppress(FileNotFoundError):  # another process replaced parts
-                return self._chain(end)
+                return self._chain(end, kind)
         return []
 
-    def _chain(self, end: Offset) -> list[Stripe]:
+    def _chain(self, end: Offset, kind: PartKind) -> list[Stripe]:
         found: list[Stripe] = []
-        files = self._files()
+        files = self._files(kind)
         at = FIRST_OFFSET
         while after := [file for file in files if file.start == at and at < file.end <= end]:
             for file in sorted(after, key=lambda file: -file.end):
@@ -168,7 +170,7 @@ class TimelineCache:
         """``load`` applied to a file about the first ``end`` events; None if there is none or it is
         unusable."""
         try:
-            state = unpack(_read(path))
+            state = read_state(path)
             self._check(part("about", state), FIRST_OFFSET, end)
             return load(state)
         except (FileNotFoundError, NotADirectoryError):
@@ -187,47 +189,59 @@ class TimelineCache:
 
     def keep(self, stripes: Sequence[Stripe], semantic_map: SemanticMap) -> None:
         """Cache the history of all events that ``semantic_map`` has folded."""
-        end = semantic_map.next_offset
-        try:
+        self._kept_at = end = semantic_map.next_offset
+        with self._writing("npz"):
             make_cache_folder(self._reader.path)
             self._keep_fold(semantic_map)
-            self._keep_part(stripes, end)
+            self._keep_part(stripes, "npz")
             self._tidy(end)
-        except OSError as error:
-            self._not_kept(error.strerror)
-        except (Unwritable, LogError) as error:
-            self._not_kept(error)
+
+    def keep_vectors(self, stripes: Sequence[Stripe], kept: Offset) -> None:
+        """Cache the vectors of the first events, of which ``kept`` are cached, if many are not."""
+        end = stripes[-1].end if stripes else FIRST_OFFSET
+        if end - kept >= MIN_EVENTS:
+            with self._writing("vectors"):
+                self._keep_part(stripes, "vectors")
+                self._tidy_parts(end, "vectors")
+                self._limit()
+
+    @contextlib.contextmanager
+    def _writing(self, kind: PartKind) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, Unwritable, LogError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            self._say(f"{self.folder}: no history was kept: {why}; --no-cache goes without one")
         except DamagedPart as damage:
-            self.forget(damage)
-            return
-        self._kept_at = end
+            self.forget(damage, kind)
 
-    def _not_kept(self, why: object) -> None:
-        self._say(f"{self.folder}: no history was kept: {why}; --no-cache goes without one")
-
-    def forget(self, damage: DamagedPart) -> None:
-        """Delete all parts of this history, after one was found damaged."""
-        self._say(f"{damage}; the history is folded again")
-        for file in self._files():
+    def forget(self, damage: DamagedPart, kind: PartKind = "npz") -> None:
+        """Delete all parts of this kind, after one was found damaged."""
+        done = "history is folded" if kind == "npz" else "vectors are read from the log"
+        self._say(f"{damage}; the {done} again")
+        for file in self._files(kind):
             with contextlib.suppress(OSError):
                 file.path.unlink(missing_ok=True)
-        self._kept_at = None
+        if kind == "npz":
+            self._kept_at = None
 
-    def _keep_part(self, stripes: Sequence[Stripe], end: Offset) -> None:
+    def _keep_part(self, stripes: Sequence[Stripe], kind: PartKind) -> None:
         """Write the stripes that no part has yet, merged with earlier parts that are not longer."""
+        end = stripes[-1].end
         start = FIRST_OFFSET
         while longer := [
             file
-            for file in self._files()
+            for file in self._files(kind)
             if file.start == start and start < file.end < end and file.end - start > end - file.end
         ]:
             start = max(file.end for file in longer)
         new = [stripe for stripe in stripes if stripe.start >= start]
         if not new or new[0].start != start:  # a stripe is in two parts: it was joined in memory
             start, new = FIRST_OFFSET, list(stripes)
-        new = joined_short(new)
+        if kind == "npz":
+            new = joined_short(new)
         write_cache_file(
-            self.folder / f"{self._key}-{start:020d}-{end:020d}.npz",
+            self.folder / f"{self._key}-{start:020d}-{end:020d}.{kind}",
             lambda file: write_part(file, self._about(start, end), new),
         )
 
@@ -286,13 +300,13 @@ class TimelineCache:
         (event,) = self._reader.read(Offset(end - 1), end)
         return event_hash(event)
 
-    def _files(self) -> list[_File]:
+    def _files(self, kind: PartKind) -> list[_File]:
         """The parts of this history."""
         found = [(path, _PART.fullmatch(path.name)) for path in self._paths()]
         return [
             _File(Offset(int(name[2])), Offset(int(name[3])), path)
             for path, name in found
-            if name is not None and name[1] == self._key
+            if name is not None and (name[1], name[4]) == (self._key, kind)
         ]
 
     def _paths(self) -> list[Path]:
@@ -321,8 +335,16 @@ class TimelineCache:
     def _tidy(self, end: Offset) -> None:
         """Delete files that the history of ``end`` events replaces, the histories unused for
         longest, and temporary files of killed processes."""
+        self._tidy_parts(end, "npz")
+        for older in [each for each in self._fold_ends() if each <= end][:-MOST_FOLDS]:
+            self._fold_path(older).unlink(missing_ok=True)
+        delete_left_over_files(self.folder)
+        self._limit()
+
+    def _tidy_parts(self, end: Offset, kind: PartKind) -> None:
+        """Delete the parts that those of the first ``end`` events replace."""
         needed, at = set(), end
-        files = self._files()
+        files = self._files(kind)
         while at > FIRST_OFFSET and (before := [file for file in files if file.end == at]):
             first = min(before, key=lambda file: file.start)
             needed.add(first.path)
@@ -330,10 +352,6 @@ class TimelineCache:
         for file in files:
             if file.path not in needed and file.end <= end:
                 file.path.unlink(missing_ok=True)
-        for older in [each for each in self._fold_ends() if each <= end][:-MOST_FOLDS]:
-            self._fold_path(older).unlink(missing_ok=True)
-        delete_left_over_files(self.folder)
-        self._limit()
 
     def _limit(self) -> None:
         """Delete histories beyond `MOST_KEPT` and `MOST_BYTES`, those unused for longest first."""
@@ -372,14 +390,6 @@ def _key(log_id: str, settings: Settings, corrections: Corrections) -> str:
         "commands": [recorded.offset for recorded in corrections.in_force],
     }
     return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _read(path: Path) -> bytes:
-    """The bytes of a regular file."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise DamagedPart("it is not a regular file")
-        return file.read()
 
 
 def _age_s(path: Path) -> float:

@@ -16,6 +16,7 @@ OWN_WAY = {
     "projections/adapters/drawing/sheet.py": "into memory",
     "projections/adapters/drawing/merge_picture.py": "by Sheet",
     "projections/adapters/drawing/map_picture.py": "by Sheet",
+    "projections/store/kept_files.py": "members of an archive that log_identity.py opened",
     "projections/postgres/embedded.py": "locks and the server's log",
     "projections/postgres/server_user.py": "renamed when it is whole",
     "projections/surfaces/cli/program.py": "/dev/null",

@@ -14,7 +14,7 @@ import zipfile
 from bisect import bisect_left
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
 from unittest.mock import patch
 
 from msgspec.structs import replace
@@ -170,7 +170,7 @@ def answers(log: Path, notes: list[str]) -> str:
 
 def main() -> None:
     """Print the answers of a log to stdout and the notes to stderr. ``full`` limits the size of
-    files, ``killed N`` ends this process by SIGKILL when it writes the N-th array."""
+    files, ``killed N`` ends this process by SIGKILL when it has written the N-th array."""
     log, how = Path(sys.argv[1]), sys.argv[2]
     if how == "full":
         resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_BYTES, FILE_BYTES))
@@ -182,15 +182,15 @@ def main() -> None:
 
 
 def _die_at_array(number: int) -> None:
-    write, written = zipfile.ZipFile.writestr, [0]
+    begin, begun = zipfile.ZipFile.open, [0]
 
-    def count(archive: zipfile.ZipFile, name: zipfile.ZipInfo, content: bytes) -> None:
-        written[0] += 1
-        write(archive, name, content)
-        if written[0] == number:
+    def count(archive: zipfile.ZipFile, name: zipfile.ZipInfo, mode: Literal["w"]) -> IO[bytes]:
+        begun[0] += 1
+        if begun[0] > number:
             os.kill(os.getpid(), signal.SIGKILL)
+        return begin(archive, name, mode)
 
-    patch.object(zipfile.ZipFile, "writestr", count).start()
+    patch.object(zipfile.ZipFile, "open", count).start()
 
 
 def view_at(history: History, latest: MapView, end: Offset) -> MapView:

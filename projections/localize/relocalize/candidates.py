@@ -110,6 +110,12 @@ class MapCandidates:
     by_class: bool = False
 
 
+_MULTIPLIED = 2**19
+"""The most numbers that are multiplied at once: a block stays in a core's cache, and no BLAS starts
+threads for so few."""
+_FEWEST_CROPS = 4
+
+
 class ExactIndex:
     """An index for exact search: the observations of a view that have an embedding, as one
     matrix."""
@@ -135,9 +141,9 @@ class ExactIndex:
         self._walls = {floor: WallMap(given.map) for floor, given in maps.items()}
 
     @cached_property
-    def _matrix(self) -> NDArray[np.float64]:
+    def _matrix(self) -> NDArray[np.int32]:
         """The vectors of all observations that have one; questions by class alone need none."""
-        return self._view.vectors(self._ordinals).astype(np.float64)
+        return self._view.vectors(self._ordinals)
 
     def _different(self) -> Cosines:
         """The statistics of cosines between different things in one picture, over a sample."""
@@ -184,21 +190,30 @@ class ExactIndex:
             crops = [crop.by_class() for crop in crops]
         dropped = np.isin(self._ordinals, list(without)) if without else None
         objects = objects_of_a_class(crops)
+        products = iter(self._products([c.vector for c in crops if c.vector is not None]))
         matches = tuple(
             self._of_class(crop.class_name, objects, without)
             if crop.vector is None
-            else self._nearest(crop.vector, neighbours, dropped)
+            else self._nearest(next(products), neighbours, dropped)
             for crop in crops
         )
         refuse_unknown_classes(crops, matches, self._class_names)
         return MapCandidates(matches, self.places, self.constants, self._walls, by_class)
 
+    def _products(self, vectors: Sequence[Vector]) -> NDArray[np.float64]:
+        """The products of each vector and each observation, in units of 2⁻⁴⁰."""
+        found = np.empty((len(vectors), len(self._ordinals)))
+        if vectors:
+            asked = np.array([quantise(vector) for vector in vectors]).astype(np.float64)
+            rows = max(1, _MULTIPLIED // (asked.shape[1] * max(len(vectors), _FEWEST_CROPS)))
+            for first in range(0, len(self._ordinals), rows):
+                block = self._matrix[first : first + rows].astype(np.float64)
+                found[:, first : first + rows] = asked @ block.T
+        return found
+
     def _nearest(
-        self, vector: Vector, neighbours: int, dropped: NDArray[np.bool_] | None
+        self, products: NDArray[np.float64], neighbours: int, dropped: NDArray[np.bool_] | None
     ) -> tuple[Match, ...]:
-        if not len(self._ordinals):
-            return ()
-        products = self._matrix @ quantise(vector).astype(np.float64)
         if dropped is not None:
             products[dropped] = -np.inf
             neighbours = min(neighbours, len(dropped) - int(dropped.sum()))
