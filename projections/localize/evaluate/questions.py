@@ -96,31 +96,35 @@ def _in_space(keyframe: Accepted, model: str, later: Reembedded | None) -> Accep
 
 
 def make_questions(
-    keyframes: Iterable[Accepted], truth: Truth, crops: int, seed: int = DEFAULT_SEED
+    keyframes: Sequence[Accepted], truth: Truth, crops: int, seed: int = DEFAULT_SEED
 ) -> list[ScoredQuestion]:
-    """One question of ``crops`` crops from each keyframe that has truth and as many embeddings."""
+    """One question of ``crops`` crops from each keyframe that has truth and as many embeddings; as
+    many detections where no keyframe has an embedding."""
     found = []
+    bare = _are_bare(keyframes)
     for keyframe in keyframes:
-        drawn = _draw(keyframe, crops, seed)
+        drawn = _draw(keyframe, crops, seed, bare)
         if _key(keyframe) in truth.keyframes and len(drawn) == crops:
             found.append(_question([(keyframe, drawn)], truth))
     return found
 
 
 def make_view_questions(
-    keyframes: Iterable[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
+    keyframes: Sequence[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
 ) -> list[ScoredQuestion]:
     """One question from each keyframe that has truth and an embedding: it and the keyframes before
-    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each.
+    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each. Where no keyframe
+    has an embedding detections do.
 
     None from one before which there are too few within 4 · ``views`` keyframes of its run.
     """
     found: list[ScoredQuestion] = []
     recent: deque[tuple[int, Accepted, list[int]]] = deque(maxlen=views)
+    bare = _are_bare(keyframes)
     for number, keyframe in enumerate(keyframes):
         if recent and recent[-1][1].envelope.run_id != keyframe.envelope.run_id:
             recent.clear()
-        drawn = _draw(keyframe, VIEW_CROPS, seed)
+        drawn = _draw(keyframe, VIEW_CROPS, seed, bare)
         if not drawn or _key(keyframe) not in truth.keyframes:
             continue
         recent.append((number, keyframe, drawn))
@@ -153,9 +157,18 @@ def _key(keyframe: Accepted) -> Key:
     return keyframe.envelope.run_id, keyframe.envelope.keyframe_id
 
 
-def _draw(keyframe: Accepted, most: int, seed: int) -> list[int]:
-    """Up to ``most`` of the detections that have an embedding."""
-    usable = [i for i, vector in enumerate(keyframe.vectors) if vector is not None]
+def _are_bare(keyframes: Iterable[Accepted]) -> bool:
+    """Whether no detection has an embedding, of whatever space."""
+    return all(
+        vector is None and detection.embedding_model is None
+        for keyframe in keyframes
+        for vector, detection in zip(keyframe.vectors, keyframe.envelope.detections, strict=True)
+    )
+
+
+def _draw(keyframe: Accepted, most: int, seed: int, bare: bool) -> list[int]:
+    """Up to ``most`` of the detections that have an embedding, of all if they are ``bare``."""
+    usable = [i for i, vector in enumerate(keyframe.vectors) if bare or vector is not None]
     return sorted(usable, key=lambda i: draw_key(seed, keyframe.det_ids[i]))[:most]
 
 
@@ -198,9 +211,8 @@ def _moved(
 
 def _crop(keyframe: Accepted, index: int) -> QuestionCrop:
     detection, vector = keyframe.envelope.detections[index], keyframe.vectors[index]
-    assert vector is not None  # noqa: S101 - drawn among those that have one
     return QuestionCrop(
-        to_float32(quantise(vector)),
+        None if vector is None else to_float32(quantise(vector)),
         detection.bbox,
         detection.class_name,
         keyframe.det_ids[index],

@@ -16,9 +16,10 @@ import numpy as np
 
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.log.seek import Note
+from projections.fold.map_errors import QuestionError
 from projections.fold.settings import CameraConstants
 from projections.localize import relocalize
-from projections.localize.relocalize import Answer, ExactIndex, Match, Method, rank
+from projections.localize.relocalize import Answer, ExactIndex, MapCandidates, Match, Method, rank
 from projections.map.view import MapView
 
 from .parallel import call_all
@@ -139,7 +140,11 @@ class Asker:
     def ask(self, question: relocalize.Question) -> Asked:
         """The answer, without the poses that it was chosen from; three places asked for."""
         began = time.perf_counter()
-        candidates = self.index.search(question.crops)
+        try:
+            candidates = self.index.search(question.crops)
+        except QuestionError:  # of none but classes that the map does not have: no answer
+            nothing = ((),) * len(question.crops)
+            candidates = MapCandidates(nothing, self.index.places, self.index.constants)
         answer = rank(question, candidates, top=3, method=self.method, camera=self.camera)
         seconds = time.perf_counter() - began
         plain = rank(question, candidates, top=1, method="plain").pose

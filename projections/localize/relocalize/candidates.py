@@ -286,11 +286,13 @@ def refuse_unknown_classes(
     class_names: Callable[[], Iterable[str]],
 ) -> None:
     """Raise QuestionError for a class that the map does not have, where nothing but classes is
-    asked with. ``class_names`` gives the classes of all Objects."""
+    asked with: for one that was typed, as it has no box, and if no crop of a detector has any
+    match. ``class_names`` gives the classes of all Objects."""
     if any(crop.vector is not None for crop in crops):
         return
+    some = any(matches)
     for crop, row in zip(crops, matches, strict=True):
-        if not row:
+        if not row and (crop.bbox is None or not some):
             names = sorted(class_names())
             near = get_close_matches(crop.class_name or "", names, 3, 0.5)
             there = (

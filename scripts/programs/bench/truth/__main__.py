@@ -6,8 +6,10 @@ scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profil
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
 
-With --no-embeddings the detectors are bare ones; page is then as if all looked alike: the class and
-the radius decide. With --localise another table: where the robot is, asked of the map of run a.
+With --no-embeddings the detectors are bare ones; in the table of Objects page is then as if all
+looked alike: the class and the radius decide.
+
+With --localise another table: where the robot is, asked of the map of run a.
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """
@@ -111,7 +113,12 @@ def _localise(
     generator: ModuleType, chosen: list[tuple[str, str]], options: argparse.Namespace, limit: int
 ) -> None:
     make = functools.partial(
-        make_case, generator, limit=limit, seed=options.seed, cache=options.cache
+        make_case,
+        generator,
+        limit=limit,
+        seed=options.seed,
+        cache=options.cache,
+        embeddings=options.embeddings,
     )
     rows: list[LocaliseRow] = []
     cases = [(p, w, stranger_of(generator, options.half, w)) for p, w in chosen]
@@ -136,7 +143,15 @@ def _localised(
     profile, world, other = case
     generator = load_generator(options.worlds)
     own, stranger = (
-        make_case(generator, profile, each, limit=limit, seed=options.seed, cache=options.cache)
+        make_case(
+            generator,
+            profile,
+            each,
+            limit=limit,
+            seed=options.seed,
+            cache=options.cache,
+            embeddings=options.embeddings,
+        )
         for each in (world, other)
     )
     return localise(own, stranger, options.map, options.every)
@@ -157,7 +172,10 @@ def _options() -> argparse.Namespace:
         "--calibrated", action="store_true", help="the map's own constants beside the priors"
     )
     parser.add_argument(
-        "--no-embeddings", dest="embeddings", action="store_false", help="Objects by bare detectors"
+        "--no-embeddings",
+        dest="embeddings",
+        action="store_false",
+        help="bare detectors: classes and boxes",
     )
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
     parser.add_argument(
