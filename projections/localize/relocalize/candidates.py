@@ -99,8 +99,8 @@ class MapCandidates:
     """``matches[i]`` are those of crop i, most similar first, ties by ordinal.
 
     Those of a crop without an embedding are observations of Objects of its class, with the
-    similarity 1. ``by_class`` is whether the map has no embedding, so that crops were taken by
-    their classes. ``walls`` are those of the occupancy maps in force, by floor.
+    similarity 1. ``by_class`` is whether the map has no embedding, so that crops with one were
+    matched by their classes. ``walls`` are those of the occupancy maps in force, by floor.
     """
 
     matches: tuple[tuple[Match, ...], ...]
@@ -185,8 +185,8 @@ class ExactIndex:
         """The nearest observations of each crop, as if the map had none of those ``without``.
         Raises QuestionError for another space."""
         self.check_spaces(crops)
-        by_class = not len(self._ordinals)
-        if by_class:
+        given = crops
+        if not len(self._ordinals):
             crops = [crop.by_class() for crop in crops]
         dropped = np.isin(self._ordinals, list(without)) if without else None
         objects = objects_of_a_class(crops)
@@ -197,7 +197,8 @@ class ExactIndex:
             else self._nearest(next(products), neighbours, dropped)
             for crop in crops
         )
-        refuse_unknown_classes(crops, matches, self._class_names)
+        refuse_unknown_classes(given, matches, self._class_names)
+        by_class = not len(self._ordinals) and any(matches)
         return MapCandidates(matches, self.places, self.constants, self._walls, by_class)
 
     def _products(self, vectors: Sequence[Vector]) -> NDArray[np.float64]:

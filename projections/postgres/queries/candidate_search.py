@@ -116,11 +116,10 @@ class CandidateSearch:
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: Rows = []
         linked = NO_LINKS
-        by_class = False
+        given = crops
         if looked or not named:
             near, linked = self._nearest([crops[number] for number in looked], neighbours)
-            by_class = bool(looked) and not near
-            if by_class:
+            if looked and not near:
                 crops = [crop.by_class() for crop in crops]
                 named = [number for number, crop in enumerate(crops) if crop.vector is None]
             elif named:
@@ -130,8 +129,8 @@ class CandidateSearch:
             near, linked = near + of_classes, linked.union(more)
         self._memory.known = self._known
         found = assemble(len(crops), near, linked, self._known)
-        refuse_unknown_classes(crops, found.matches, self._class_names)
-        return replace(found, by_class=True) if by_class else found
+        refuse_unknown_classes(given, found.matches, self._class_names)
+        return replace(found, by_class=crops is not given and any(found.matches))
 
     def try_question(self) -> None:
         """Ask a question of one observation that is stored, if there is one. Raises DatabaseError

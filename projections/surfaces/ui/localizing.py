@@ -17,7 +17,7 @@ from starlette.datastructures import QueryParams
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.envelope.forms import read_envelopes
-from eventsrc.envelope.ingest import Rejected
+from eventsrc.envelope.ingest import Rejected, Vector
 from eventsrc.envelope.model import Offset
 from eventsrc.log import Event
 from eventsrc.log.seek import resolve
@@ -166,8 +166,8 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     crops = _crops_of(event)
     if not crops:
         raise QuestionError(
-            f"keyframe {keyframe.run_id}:{keyframe.keyframe_id} has no detection with an embedding,"
-            " so nothing can be asked with it; pick another"
+            f"keyframe {keyframe.run_id}:{keyframe.keyframe_id} has no detection, so nothing can be"
+            " asked with it; pick another"
         )
     return {
         **asked.document(),
@@ -185,20 +185,28 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
 
 
 def _crops_of(event: Event) -> list[dict[str, Any]]:
-    """The detections of an envelope that have an embedding, in the form of a question."""
+    """The detections of an envelope that have an embedding, in the form of a question; where none
+    has, all by their classes."""
     accepted = read_envelopes([event], max_bytes=sys.maxsize)[0]
     if isinstance(accepted, Rejected):
         return []
     rows = zip(accepted.det_ids, accepted.envelope.detections, accepted.vectors, strict=True)
+    is_bare = all(vector is None for vector in accepted.vectors)
     return [
         {
             "det_id": det_id,
             "class": seen.class_name,
             "bbox": list(seen.bbox),
-            "embedding": pybase64.b64encode(vector.astype("<f4").tobytes()).decode(),
-            "embedding_dim": len(vector),
-            **({} if seen.embedding_model is None else {"embedding_model": seen.embedding_model}),
+            **({} if vector is None else _look(vector, seen.embedding_model)),
         }
         for det_id, seen, vector in rows
-        if vector is not None
+        if is_bare or vector is not None
     ]
+
+
+def _look(vector: Vector, model: str | None) -> dict[str, Any]:
+    return {
+        "embedding": pybase64.b64encode(vector.astype("<f4").tobytes()).decode(),
+        "embedding_dim": len(vector),
+        **({} if model is None else {"embedding_model": model}),
+    }
