@@ -31,7 +31,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 RunOrdinal = NewType("RunOrdinal", int)
@@ -77,7 +77,8 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
-    floor that the pose is on, None if the envelope states none."""
+    floor that the pose is on and ``camera`` the one that took the picture, None if the envelope
+    states none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -87,6 +88,7 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     timestamp: float
     pose: Pose | None
     floor: str | None = None
+    camera: StatedCamera | None = None
 
 
 class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):

@@ -165,6 +165,7 @@ class SemanticMap:
                 envelope.timestamp,
                 pose,
                 floor,
+                envelope.camera,
             )
         )
         if units is None:
@@ -183,7 +184,7 @@ class SemanticMap:
             place = self._place(offset, keyframe, run, envelope.run_id, pose, deltas)
             objects, timestamp = self.objects, envelope.timestamp
             if isinstance(objects, EvidenceFusion):
-                camera = camera_of(envelope, self.settings.camera)
+                camera = camera_of(envelope.camera, self.settings.camera)
                 sights = self.floors.sightings(sightings_of(accepted, fusible), ground)
                 facing = with_small_yaw(pose)
                 error = pose_error_of(envelope)

@@ -21,7 +21,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, to_json
 
 from eventsrc.base.user_files import FileFault, parse_json, read_file
 from eventsrc.envelope.model import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_error
@@ -43,6 +43,33 @@ class CameraConstants(BaseModel):
     width_px: Annotated[float, PIXELS] = 640.0
     height_px: Annotated[float, PIXELS] = 400.0
     yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+
+
+class CameraSettings(BaseModel):
+    """What the settings say of the camera; None where they do not say it.
+
+    ``hfov_error_deg`` is the standard error of a field of view that `mapfold calibrate` estimated,
+    None for one that a person gave.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    hfov_deg: Annotated[float, HFOV_DEG] | None = None
+    hfov_error_deg: Annotated[float, Field(ge=0.0, le=90.0)] | None = None
+    width_px: Annotated[float, PIXELS] | None = None
+    height_px: Annotated[float, PIXELS] | None = None
+    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+
+    @property
+    def constants(self) -> CameraConstants:
+        """The camera of envelopes that do not state theirs: defaults for what is not said."""
+        said = self.model_dump(exclude_none=True, exclude={"hfov_error_deg"})
+        return CameraConstants(**said)
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether a person gave the field of view."""
+        return self.hfov_deg is not None and self.hfov_error_deg is None
 
 
 _MOST_CELLS = 20
@@ -132,7 +159,7 @@ class Settings(BaseModel):
     fusion: Literal["page", "evidence"] = "page"
     """The rule that fuses observations into Objects: by ``fusion_radius_m`` and
     ``fusion_similarity``, or by the evidence of bearings and looks."""
-    camera: CameraConstants = CameraConstants()
+    camera: CameraSettings = CameraSettings()
     """The camera of envelopes that do not state theirs; for fusion by evidence."""
     evidence: EvidenceConstants = EvidenceConstants()
     """The constants of fusion by evidence."""
@@ -171,9 +198,19 @@ class Settings(BaseModel):
         return hash(self.fingerprint())
 
     def fingerprint(self) -> str:
-        """16 hex digits that are equal exactly when every setting is."""
-        canonical = self.model_dump_json()
-        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+        """16 hex digits that are equal exactly when every setting is; the camera counts as the fold
+        uses it, so that its default may be said or not."""
+        values, camera = self.model_dump(), self.camera.constants
+        if "camera" in values:
+            values["camera"] = camera.model_dump()
+            if self.fusion == "page" and camera == CameraConstants():
+                del values["camera"]
+        return hashlib.sha256(to_json(values)).hexdigest()[:16]
+
+    @property
+    def wants_camera(self) -> bool:
+        """Whether positions depend on the camera and none is said."""
+        return self.fusion == "evidence" and self.camera.hfov_deg is None
 
     def places_text(self) -> str:
         """The rule of places as a short text: ``ε 1.5 m, min_samples 3``."""
@@ -191,7 +228,10 @@ class Settings(BaseModel):
         that only ``base`` has."""
         before, here = base.by_name(), self.by_name()
         names = [*here, *(name for name in before if name not in here)]
-        return {name: here.get(name) for name in names if here.get(name) != before.get(name)}
+        changed = {name: here.get(name) for name in names if here.get(name) != before.get(name)}
+        if _HFOV in changed and here[_HFOV_ERROR] is not None:
+            changed[_HFOV_ERROR] = here[_HFOV_ERROR]  # which a new value takes away
+        return changed
 
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
         """These settings changed by ``name=value`` texts, as ``option`` takes them. ``preset=NAME``
@@ -334,6 +374,7 @@ def _tree(settings: Settings) -> dict[str, Any]:
     }
 
 
+_HFOV, _HFOV_ERROR = "camera.hfov_deg", "camera.hfov_error_deg"
 _SIZES = "evidence.sizes_m."
 _EXAMPLES = {
     "camera": "camera.hfov_deg=90",
@@ -368,3 +409,5 @@ def _assign(values: dict[str, Any], text: str) -> None:
     if isinstance(inner[key], dict):
         raise SettingsError(f"it has several values; give one of them, such as {_EXAMPLES[name]}")
     inner[key] = given
+    if name == _HFOV:
+        inner["hfov_error_deg"] = None  # it was that of the value before

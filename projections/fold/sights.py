@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.ingest import Accepted
-from eventsrc.envelope.model import MAX_DEPTH_M, Detection, DetId, Envelope
+from eventsrc.envelope.model import MAX_DEPTH_M, Detection, DetId, Envelope, StatedCamera
 
 from .deltas import ObservationOrdinal, Pose
 from .evidence import EvidenceConstants
 from .exact import cos_sin, log, metres_to_um
 from .objects import FusibleObservation
-from .settings import CameraConstants
+from .settings import CameraConstants, CameraSettings
 
 _CUT_PX = 2.0
 _HALF_DEGREE = 0.008726646259971648
@@ -210,11 +210,11 @@ _MANY_TURNS = 1e6
 _TURN = 2.0 * math.pi
 
 
-def camera_of(envelope: Envelope, otherwise: CameraConstants) -> CameraConstants:
-    """The camera that an envelope states, else ``otherwise``."""
-    stated = envelope.camera
+@lru_cache(maxsize=64)
+def camera_of(stated: StatedCamera | None, otherwise: CameraSettings) -> CameraConstants:
+    """The camera of a picture: the one that its envelope states, else that of the settings."""
     if stated is None:
-        return otherwise
+        return otherwise.constants
     return CameraConstants(
         hfov_deg=stated.hfov_deg,
         width_px=stated.width_px,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
 from projections.fold.deltas import (
     KeyframeOrdinal,
     ObjectOrdinal,
@@ -78,7 +78,8 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     """One keyframe. ``offset`` is its event's; ``pose`` is None when the robot had none.
 
     ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
-    name of the floor that the pose is on, where the log states it.
+    name of the floor that the pose is on and ``camera`` the one that took the picture, where the
+    log states them.
     """
 
     ordinal: KeyframeOrdinal
@@ -92,6 +93,7 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     observations: list[ObservationOrdinal] | tuple[()] = ()
     joined: PlaceOrdinal | None = None
     floor: str | None = None
+    camera: StatedCamera | None = None
 
     @property
     def place(self) -> PlaceOrdinal | None:

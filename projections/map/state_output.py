@@ -1,11 +1,13 @@
 """Output of ``mapfold state``: the map as a JSON document or as text, and advice on settings where
-all poses are in one place or hardly any is in one, or no vector is of the space that they name."""
+all poses are in one place or hardly any is in one, no vector is of the space that they name, or
+nothing states the camera."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from eventsrc.base.text import advised, counted, visible
+from eventsrc.base.text import advised, command_line, counted, visible
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import MapGiven, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
@@ -306,6 +308,22 @@ def space_advice(view: MapView) -> str | None:
     return (
         f"no detection has a vector of space {visible(model)}, so there are no Objects; the log's"
         f" spaces: `{visible(advised('log', 'spaces'))}`"
+    )
+
+
+def camera_advice(counts: Mapping[str, int], settings: Settings, log: Path) -> str | None:
+    """One line where positions depend on a camera that nothing states: how to state it in ``log``.
+    ``counts`` are those of `MapView.counts`."""
+    unstated = counts.get("without_camera", 0)
+    if not unstated:
+        return None
+    camera = settings.camera.constants
+    return (
+        f"no camera is stated for {counted(unstated, 'keyframe')}, so boxes are read as if of"
+        f" {camera.hfov_deg:g}° and {camera.width_px:g} × {camera.height_px:g} pixels:"
+        f" `{visible(advised('calibrate', '--write'))}` estimates it, and"
+        f" `{visible(command_line('edit', log, 'use-settings'))} --set camera.hfov_deg=…"
+        " --set camera.width_px=… --set camera.height_px=… --reason …` states it"
     )
 
 

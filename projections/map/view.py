@@ -165,6 +165,7 @@ class MapView:
                 delta.pose,
                 self.survivors,
                 floor=delta.floor,
+                camera=delta.camera,
             )
         )
         if delta.floor is not None:
@@ -351,8 +352,10 @@ class MapView:
 
     def counts(self) -> dict[str, int]:
         """Counts by name; the eight in capitals are of the graph's edges by label. Things that
-        corrections leave out are counted at the end, if there are any."""
+        corrections leave out are counted at the end, if there are any, and the pictures of a camera
+        that neither their envelopes nor the settings state, if positions depend on it."""
         posed, fused, foreign = self._sums()
+        unstated = self.without_camera() if self.settings.wants_camera else 0
         placed = sum(p.keyframe_count for p in self.places.values())
         return {
             "events": self.next_offset,
@@ -378,7 +381,9 @@ class MapView:
             "floors": len(self.floors),
             "buildings": int(bool(self.all_places or self.floors)),
             "PART_OF": len(self.places) + len(self.floors),
-        } | {kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped}
+            **{kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped},
+            **({"without_camera": unstated} if unstated else {}),
+        }
 
     def embedded(self) -> NDArray[np.int64]:
         """The observations that have a vector of the map's space, as ascending ordinals; none in a
@@ -399,3 +404,7 @@ class MapView:
             sum(o.object is not None for o in self.observations),
             sum(o.foreign_space for o in self.observations),
         )
+
+    def without_camera(self) -> int:
+        """The number of keyframes with observations whose envelopes do not state a camera."""
+        return sum(k.camera is None and bool(k.observations) for k in self.keyframes)

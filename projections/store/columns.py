@@ -74,6 +74,8 @@ _LEFT_OUT: Final = {
 }
 _SIGNED: Final = ("similarity_q40",)
 """Optional integers that may be negative."""
+_PREFIXED: Final = ("camera",)
+"""The fields with parts of the same name as another field's: theirs have the field's before it."""
 _UNIQUE: Final = ("det_id", "place_id", "object_id")
 _SCALARS: Final[Mapping[type, Kind]] = {
     inspect.IntType: "int",
@@ -96,6 +98,8 @@ class _Field:
         if isinstance(type_, inspect.StructType):
             self.model = type_.cls
             self.columns = _table_of(map(_Field, type_.fields))
+            if self.name in _PREFIXED:
+                self.columns = {f"{self.name}_{part}": k for part, k in self.columns.items()}
             self._nothing = (0,) * (1 + len(self.columns))
             if self.optional:
                 self.columns = {self.name: "flag", **self.columns}

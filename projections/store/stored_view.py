@@ -152,6 +152,13 @@ class StoredView(MapView):
             int(np.count_nonzero(moment.column("observation", "foreign_space"))),
         )
 
+    def without_camera(self) -> int:
+        """The number of keyframes with observations whose envelopes do not state a camera."""
+        if self._is_changed:
+            return super().without_camera()
+        has_any = np.diff(self._moment.observation_starts) > 0
+        return int(np.count_nonzero(has_any & (self._moment.column("keyframe", "camera") == 0)))
+
     def _make_all(self) -> None:
         """Make every record, so that they can be changed."""
         if not self._is_changed:
@@ -179,6 +186,7 @@ def _keyframes(
             list(map(ObservationOrdinal, range(*span))) or (),
             None if place == NONE else place,
             k.floor,
+            k.camera,
         )
         for k, span, place in zip(added, pairwise(starts), places, strict=True)
     ]

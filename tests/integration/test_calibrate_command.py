@@ -169,8 +169,61 @@ def test_the_camera_of_the_settings_serves_where_envelopes_state_none(tmp_path: 
     given = [word for each in camera for word in ("--set", f"camera.{each}")]
     found = mapfold("calibrate", "log", "--json", *given).json
     assert found["constants"] == mapfold("calibrate", "stated", "--json").json["constants"]
-    wrong = mapfold("calibrate", "log").out
+    wrong = mapfold("calibrate", "log", "--set", "camera.hfov_deg=90").out
     assert "beyond the picture of 640 × 400 pixels: give the camera" in wrong
+
+
+@pytest.mark.seconds
+def test_a_camera_that_nothing_states_is_estimated_and_recorded(tmp_path: Path) -> None:
+    write_room(tmp_path / "log", count=COUNT, camera=False)
+    mapfold = Commands.in_folder(tmp_path)
+    before = mapfold("state", "log", *BY_EVIDENCE)
+    (line,) = (line for line in before.err.splitlines() if line.startswith("no camera is stated"))
+    assert "as if of 69.4° and 640 × 400 pixels" in line
+    assert "`mapfold calibrate --write log --set fusion=evidence` estimates it" in line
+    assert "`mapfold edit log use-settings --set camera.hfov_deg=… " in line
+    counts = mapfold("state", "log", "--json", *BY_EVIDENCE).json["counts"]
+    assert 0 < counts["without_camera"] <= 2 * COUNT
+    assert "without_camera" not in mapfold("state", "log", "--json").json["counts"]
+
+    sized = ("--set", "camera.width_px=800", "--set", "camera.height_px=600")
+    said = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE, *sized).json
+    camera = said["camera"]
+    assert camera["hfov_deg"] == pytest.approx(90.0, abs=4.0)
+    assert abs(camera["hfov_deg"] - 90.0) < 4.0 * camera["hfov_error_deg"] + 0.5
+    assert (camera["size_from"], camera["width_px"], camera["things"]) == ("settings", 800.0, 6)
+    recorded = _settings(tmp_path / "log").camera
+    assert (recorded.hfov_deg, recorded.height_px) == (camera["hfov_deg"], 600.0)
+    after = mapfold("state", "log")
+    assert "no camera is stated" not in after.err
+    assert f"camera.hfov_deg={camera['hfov_deg']}" in after.out
+    answer = mapfold("relocalize", "--class", "lamp", "--log", "log")
+    assert "no camera is stated" not in answer.err
+    again = mapfold("calibrate", "log", "--write").out
+    assert f"field of view {camera['hfov_deg']:g}° ± {camera['hfov_error_deg']:g}°" in again
+    assert again.endswith("the log has these constants already; nothing is recorded\n")
+
+
+@pytest.mark.seconds
+def test_relocalize_names_the_camera_that_nothing_states(tmp_path: Path) -> None:
+    write_room(tmp_path / "log", count=20, camera=False)
+    write_room(tmp_path / "stated", count=20)
+    mapfold = Commands.in_folder(tmp_path)
+    for log, is_named in (("log", True), ("stated", False)):
+        said = mapfold("relocalize", "--class", "lamp", "--log", log, *BY_EVIDENCE)
+        assert ("no camera is stated" in said.err) is is_named
+    few = mapfold("calibrate", "log", "--set", "camera.hfov_deg=none").out
+    assert "field of view" in few
+    stated = mapfold("calibrate", "stated", "--json").json
+    assert stated["camera"] is None
+
+
+@pytest.mark.slow
+def test_replay_names_the_camera_that_nothing_states(tmp_path: Path, pg_url: str) -> None:
+    write_room(tmp_path / "log", count=20, camera=False)
+    mapfold = Commands.in_folder(tmp_path)
+    said = mapfold("replay", "log", "--db", pg_url, *BY_EVIDENCE)
+    assert "no camera is stated for" in said.err
 
 
 THIN: dict[str, tuple[list[dict[str, Any]], str]] = {

@@ -46,6 +46,17 @@ def test_a_log_without_poses(mapfold: Commands, tmp_path: Path) -> None:
         assert replay(header, arrays, 3).poses == [None] * 3
 
 
+def test_a_camera_that_nothing_states_is_named(mapfold: Commands, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", walk(5, detections=1))
+    by_evidence = ("--set", "fusion=evidence")
+    with showing(mapfold, log, *by_evidence) as server:
+        (said,) = problems(server)
+        assert said.startswith("no camera is stated for ")
+        assert f"`mapfold edit {log} use-settings --set camera.hfov_deg=… " in said
+    with showing(mapfold, log, *by_evidence, "--set", "camera.hfov_deg=69.4") as server:
+        assert problems(server) == []
+
+
 def test_a_damaged_log_is_shown_up_to_the_damage(mapfold: Commands, tmp_path: Path) -> None:
     log = tmp_path / "log"
     documents = [payload(envelope(k, k * 0.4, note="x" * 12_000)) for k in range(300)]

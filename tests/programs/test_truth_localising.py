@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from projections.fold.settings import CameraSettings
 from projections.localize import relocalize
 from projections.localize.evaluate.questions import ScoredQuestion, spread
 from projections.localize.evaluate.trials import Trial
@@ -92,9 +93,9 @@ def _scores(p50: float, plain: float) -> Scores:
 
 def test_the_worst_beside_the_plain_baseline_stands_last_below_the_means() -> None:
     rows = [
-        LocaliseRow("rover one", "page", {"1 crop": _scores(1.0, 2.0)}),
-        LocaliseRow("rover two", "page", {"1 crop": _scores(0.9, 1.0)}),
-        LocaliseRow("scout one", "page", {"1 crop": _scores(3.0, 4.0)}),
+        LocaliseRow("rover one", "page", {"1 crop": _scores(1.0, 2.0)}, 90.0, CameraSettings()),
+        LocaliseRow("rover two", "page", {"1 crop": _scores(0.9, 1.0)}, 90.0, CameraSettings()),
+        LocaliseRow("scout one", "page", {"1 crop": _scores(3.0, 4.0)}, 90.0, CameraSettings()),
     ]
     assert rows[0].scores["1 crop"].against_plain == 0.5
     lines = localise_table(rows).splitlines()
@@ -110,6 +111,18 @@ def test_the_worst_beside_the_plain_baseline_stands_last_below_the_means() -> No
         "mean",
         "worst rover two",
     ]
+
+
+def test_estimated_fields_of_view_stand_beside_the_true_ones() -> None:
+    scores = {"1 crop": _scores(1.0, 2.0)}
+    found = CameraSettings(hfov_deg=61.8, hfov_error_deg=0.4)
+    rows = [
+        LocaliseRow("tripod one", "evidence", scores, 62.0, found),
+        LocaliseRow("rover one", "evidence", scores, 69.4, CameraSettings(hfov_deg=69.4)),
+    ]
+    head, *lines = localise_table(rows).split("\n\n")[-1].splitlines()
+    assert head.split()[-4:] == ["true", "map", "error", "off"]
+    assert [line.split() for line in lines] == [["tripod", "one", "62.0", "61.8", "0.4", "-0.2"]]
 
 
 def test_as_many_questions_of_another_building_are_spread_evenly() -> None:

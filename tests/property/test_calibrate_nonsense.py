@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from projections.fold.deltas import Pose
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise
-from projections.fold.settings import CameraConstants
+from projections.fold.settings import CameraConstants, CameraSettings
+from projections.localize.calibrate.field_of_view import field_of_view
 from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import _bounded, read
 from projections.localize.calibrate.sightings import Row, sightings_of
@@ -47,7 +48,7 @@ def rows(draw: st.DrawFn) -> list[Row]:
             class_name=draw(st.sampled_from(["cup", "chair"])),
             bbox=(draw(PIXELS), draw(PIXELS), draw(PIXELS), draw(PIXELS)),
             look=draw(st.sampled_from(LOOKS)),
-            thing=draw(st.integers(0, 2)),
+            thing=draw(st.integers(0, 5)),
         )
         for _ in range(draw(st.integers(0, 40)))
     ]
@@ -57,6 +58,8 @@ def rows(draw: st.DrawFn) -> list[Row]:
 @settings(max_examples=examples(150), deadline=None)
 def test_constants_are_always_such_as_the_settings_take(found: list[Row]) -> None:
     prior = EvidenceConstants()
+    camera = field_of_view(found, CameraSettings(), prior)
+    assert camera is None or CameraSettings(**camera.settings.model_dump()) == camera.settings
     last = read(sightings_of(found), prior, prior)
     EvidenceConstants.model_validate(last.constants.model_dump())
     for each in (*last.readings, *last.sizes):

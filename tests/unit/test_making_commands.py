@@ -32,7 +32,7 @@ from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose, read_trajec
 from projections.edit import make as by
 from projections.edit.correct_poses import Span, by_trajectory, by_transform
 from projections.edit.effect import what
-from projections.fold.settings import CameraConstants, Settings
+from projections.fold.settings import Settings
 from tests.support.logs import FAR, LEFT, MERGE, RIGHT, append, give, make, write_rooms
 
 CUP_LEFT, CUP_RIGHT, LAMP = "obj-2237cc2f33929b56", "obj-dc4cb3fc37c4dc9a", "obj-36156c6b0fcc3c5d"
@@ -267,7 +267,8 @@ def test_settings_of_fusion_by_evidence_are_recorded_in_full_and_listed_by_name(
     made = make(log, by.use_settings, settings)
     assert isinstance(made, UseSettings)
     assert Settings.from_document(made.settings) == settings
-    assert made.settings["camera"] == CameraConstants().model_dump(), "whatever a later default is"
+    assert made.settings["evidence"]["range_m"] == 3.0, "whatever a later default is"
+    assert made.settings["camera"]["hfov_deg"] is None, "nothing states it"
     assert what(made) == "fusion=evidence, evidence.sizes_m.cup=0.1"
     partial = UseSettings(**WHO, settings={"camera": {"hfov_deg": 90}})
     assert what(partial) == "camera.hfov_deg=90"

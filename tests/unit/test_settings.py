@@ -8,6 +8,7 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import (
     CameraConstants,
+    CameraSettings,
     LocalizerConstants,
     RoomsConstants,
     Settings,
@@ -111,7 +112,7 @@ def test_dotted_names_change_one_value_of_a_group() -> None:
         ]
     )
     assert changed.fusion == "evidence"
-    assert changed.camera == CameraConstants(hfov_deg=90.0)
+    assert changed.camera == CameraSettings(hfov_deg=90.0)
     assert changed.evidence.range_m == 1.3
     assert changed.evidence.sizes_m == {"no. 7=x": 0.5, "potted plant": 0.4}
     assert changed.evidence.side_by == "heading"
@@ -176,7 +177,12 @@ _CHANGED = st.builds(
     eps_m=st.floats(0.1, 9.0),
     embedding_model=st.none() | st.just("clip"),
     fusion=st.sampled_from(["page", "evidence"]),
-    camera=st.builds(CameraConstants, hfov_deg=st.floats(1.0, 170.0), yaw_rad=st.floats(-7.0, 7.0)),
+    camera=st.builds(
+        CameraSettings,
+        hfov_deg=st.none() | st.floats(1.0, 170.0),
+        hfov_error_deg=st.sampled_from([None, 0.5]),
+        yaw_rad=st.floats(-7.0, 7.0),
+    ),
     evidence=st.builds(
         EvidenceConstants,
         range_m=st.floats(0.1, 9.0),
@@ -207,14 +213,14 @@ def test_changed_settings_by_name_are_the_assignments_between_two(
 def test_documents_of_page_maps_name_no_younger_setting() -> None:
     younger = {"fusion", "camera", "evidence", "localizer", "places", "rooms"}
     assert not younger & Settings(eps_m=1.0).model_dump().keys()
-    assert Settings(camera=CameraConstants(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
+    assert Settings(camera=CameraSettings(yaw_rad=1.0)).model_dump()["camera"]["yaw_rad"] == 1.0
 
 
 def test_documents_of_evidence_maps_name_every_constant() -> None:
     """So their fingerprint changes with a default, on which the map depends."""
     document = Settings(fusion="evidence").model_dump()
     assert document["evidence"] == EvidenceConstants().model_dump()
-    assert document["camera"] == CameraConstants().model_dump()
+    assert document["camera"] == CameraSettings().model_dump()
     assert not {"places", "rooms"} & document.keys()
 
 
@@ -242,6 +248,27 @@ def test_documents_of_maps_by_rooms_name_every_constant() -> None:
     assert not {"fusion", "camera", "evidence"} & document.keys()
     both = Settings(places="rooms", fusion="evidence").model_dump()
     assert {"rooms", "camera", "evidence"} <= both.keys()
+
+
+def test_a_camera_that_is_given_is_no_estimate() -> None:
+    estimated = CameraSettings(hfov_deg=61.8, hfov_error_deg=0.4, width_px=800.0)
+    settings = Settings(fusion="evidence", camera=estimated)
+    assert not CameraSettings().is_stated
+    assert not estimated.is_stated
+    stated = settings.with_assignments(["camera.hfov_deg=69.4"]).camera
+    assert stated == CameraSettings(hfov_deg=69.4, width_px=800.0)
+    assert stated.is_stated
+    assert stated.constants == CameraConstants(hfov_deg=69.4, width_px=800.0, height_px=400.0)
+    assert settings.with_assignments(["camera.hfov_deg=none"]).camera.hfov_deg is None
+
+
+@pytest.mark.parametrize("fusion", ["page", "evidence"])
+def test_a_default_that_is_said_folds_the_same_map(fusion: str) -> None:
+    plain = Settings.from_document({"fusion": fusion})
+    said = plain.with_assignments(["camera.hfov_deg=69.4", "camera.width_px=640"])
+    assert said != plain
+    assert said.fingerprint() == plain.fingerprint()
+    assert said.with_assignments(["camera.hfov_deg=70"]).fingerprint() != plain.fingerprint()
 
 
 def test_fingerprints_of_evidence_maps_are_those_of_versions_without_rooms() -> None:

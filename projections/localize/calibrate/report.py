@@ -9,6 +9,7 @@ from eventsrc.base.text import counted, table, visible
 from projections.localize.evaluate.own_questions import own_scores
 from projections.localize.relocalize import UNKNOWN_BELOW
 
+from .field_of_view import LEAST_OBSERVATIONS, LEAST_THINGS, FieldOfView
 from .likenesses import FEWEST_DIFFERENT
 from .localiser import CROPS, OwnScores
 from .readings import Reading
@@ -58,6 +59,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
             }
             for each in readings(calibration)
         ],
+        "camera": _camera_document(calibration.field),
         "localiser": localiser_document(calibration.own),
         "hints": list(hints(calibration)),
     }
@@ -85,8 +87,39 @@ def text(calibration: Calibration, *, all_: bool = False) -> str:
     ).splitlines()
     if len(shown) < len(sizes):
         lines.append(f"… and the sizes of {len(sizes) - len(shown):,} more (--all shows them)")
+    lines += _camera_lines(calibration)
     lines += localiser_text(calibration.own).splitlines()
     return "".join(f"{line}\n" for line in [*lines, *hints(calibration)])
+
+
+def _camera_lines(calibration: Calibration) -> list[str]:
+    """The camera that nothing states, as estimated, in a line; none where it is stated."""
+    found = calibration.field
+    if found is None:
+        return []
+    camera, error = found.settings.constants, found.settings.hfov_error_deg
+    size_by = "the extent of the boxes" if found.measured_px else "stated"
+    line = (
+        f"camera of {counted(calibration.unstated, 'keyframe')}, which nothing states: field of"
+        f" view {camera.hfov_deg:g}° ± {error:g}° (the map alone says {found.seen_deg:g}° ±"
+        f" {found.seen_error_deg:g}°) by {found.observations:,} bearings of"
+        f" {counted(found.things, 'thing')}; pictures of {camera.width_px:g} ×"
+        f" {camera.height_px:g} pixels, {size_by}"
+    )
+    return [line]
+
+
+def _camera_document(found: FieldOfView | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        **found.settings.model_dump(),
+        "seen_deg": found.seen_deg,
+        "seen_error_deg": found.seen_error_deg,
+        "size_from": "boxes" if found.measured_px else "settings",
+        "things": found.things,
+        "observations": found.observations,
+    }
 
 
 def _row(reading: Reading) -> tuple[str, ...]:
@@ -115,7 +148,7 @@ def _number(value: float | str | None) -> str:
 
 def hints(calibration: Calibration) -> Iterator[str]:
     """Obstacles to a better calibration, with the next step where there is one."""
-    last, camera = calibration.last, calibration.settings.camera
+    last, camera = calibration.last, calibration.calibrated.camera.constants
     if not calibration.observations:
         yield "no observation with a pose is of an object: all constants are priors"
         return
@@ -144,6 +177,13 @@ def hints(calibration: Calibration) -> Iterator[str]:
         yield (
             f"{boxes} beyond the picture of {camera.width_px:g} × {camera.height_px:g} pixels: give"
             " the camera, --set camera.width_px=… --set camera.height_px=… --set camera.hfov_deg=…"
+        )
+    if calibration.unstated and calibration.field is None:
+        yield (
+            f"no camera is stated for {counted(calibration.unstated, 'keyframe')}, and fewer than"
+            f" {LEAST_THINGS} things were seen {LEAST_OBSERVATIONS} times whole, too few to"
+            f" estimate its field of view: give it, --set camera.hfov_deg=… (now"
+            f" {camera.hfov_deg:g})"
         )
     for fault in last.camera:
         yield _camera_hint(fault, camera.hfov_deg)

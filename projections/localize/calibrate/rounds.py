@@ -6,26 +6,25 @@ the map as its settings make it, with the constants read, is asked its own quest
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from eventsrc.base.machine import gc_paused
-from eventsrc.envelope.ingest import Accepted
-from eventsrc.envelope.model import FIRST_OFFSET, Envelope, Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
-from projections.fold.deltas import Delta, KeyframeAdded, KeyframeOrdinal
 from projections.fold.evidence import EvidenceConstants
-from projections.fold.settings import CameraConstants, LocalizerConstants, Settings
+from projections.fold.settings import CameraSettings, LocalizerConstants, Settings
 from projections.fold.sights import camera_of
 from projections.map.fold import fold_parsed, read_ahead
 from projections.map.own_events import new_map
 from projections.map.parsing import parsed_stretches
 from projections.map.view import MapView
 
+from .field_of_view import FieldOfView, field_of_view, without_estimate
 from .likenesses import different, in_pictures, of_things, same, scale
 from .localiser import NOT_ASKED, OwnScores, read_localiser
 from .qualified_things import qualified
@@ -108,8 +107,9 @@ class Calibration:
     """The calibration of a log. ``settings`` are those that it was calibrated under; `calibrated`
     are the same with its constants. Counts are of the last fold: keyframes with a pose,
     observations that were fused, Objects, runs. ``embedded`` observations have an embedding,
-    ``unboxed`` ones an empty box; ``beyond`` boxes reach beyond the picture. ``own`` are the
-    results of its own questions."""
+    ``unboxed`` ones an empty box; ``beyond`` boxes reach beyond the picture. ``unstated`` keyframes
+    have a camera that nothing states, ``field`` is its estimate, None where it cannot be made.
+    ``own`` are the results of its own questions."""
 
     settings: Settings
     last: Round
@@ -120,6 +120,8 @@ class Calibration:
     embedded: int
     unboxed: int
     beyond: int
+    unstated: int
+    field: FieldOfView | None
     own: OwnScores
 
     @property
@@ -127,13 +129,13 @@ class Calibration:
         """The settings with the constants that were read."""
         text_shift = self.settings.localizer.text_shift
         localizer = self.own.constants.model_copy(update={"text_shift": text_shift})
-        changed = {"evidence": self.last.constants, "localizer": localizer}
+        changed: dict[str, Any] = {"evidence": self.last.constants, "localizer": localizer}
+        if self.field is not None:
+            changed["camera"] = self.field.settings
         return self.settings.model_copy(update=changed)
 
 
-Cameras = dict[KeyframeOrdinal, CameraConstants]
-"""The cameras of keyframes whose envelopes state one."""
-Fold = Callable[[Settings], tuple[MapView, Cameras]]
+Fold = Callable[[Settings], MapView]
 """A function that folds a log under settings; the view has the embeddings."""
 
 
@@ -150,21 +152,18 @@ def calibrate(
     end = reader.end_for(until)
     before = 0
 
-    def fold(used: Settings) -> tuple[MapView, Cameras]:
+    def fold(used: Settings) -> MapView:
         nonlocal before
         semantic_map = new_map(reader, used, corrections)
-        view, cameras = MapView(used, corrections=corrections), Cameras()
+        view = MapView(used, corrections=corrections)
         parsed = parsed_stretches(reader.read(FIRST_OFFSET, end))
         with gc_paused():
             for stretch in read_ahead(parsed, semantic_map):
                 for event in stretch:
-                    deltas = fold_parsed(event, semantic_map)
-                    view.apply_event(event.offset, deltas)
-                    if isinstance(event.parsed, Accepted):
-                        note_camera(cameras, event.parsed.envelope, deltas, used.camera)
+                    view.apply_event(event.offset, fold_parsed(event, semantic_map))
                 progress(before + view.next_offset, (ROUNDS + 1) * end)
         before += end
-        return view, cameras
+        return view
 
     return calibrate_by(fold, settings)
 
@@ -173,16 +172,21 @@ def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibra
     """Calibrate what ``fold`` folds, in rounds. Without ``ask`` the map is asked nothing, and
     re-localisation keeps its defaults."""
     constants = prior = EvidenceConstants()
+    said = without_estimate(settings.camera)
+    camera, field = said, None
     for _ in range(ROUNDS):
-        view, cameras = fold(
-            settings.model_copy(update={"fusion": "evidence", "evidence": constants})
-        )
-        seen = sightings_of(_rows(view, cameras, settings.camera))
+        changed = {"fusion": "evidence", "evidence": constants, "camera": camera}
+        view = fold(settings.model_copy(update=changed))
+        if not said.is_stated:
+            rows = [r for r in _rows(view, said) if view.keyframes[r.picture].camera is None]
+            field = field_of_view(rows, said, prior)
+            camera = said if field is None else field.settings
+        seen = sightings_of(_rows(view, camera))
         last = read(seen, constants, prior)
         constants = last.constants
     plain = LocalizerConstants(text_shift=settings.localizer.text_shift)
-    changed = {"evidence": constants, "localizer": plain}
-    own = read_localiser(fold(settings.model_copy(update=changed))[0]) if ask else NOT_ASKED
+    changed = {"evidence": constants, "localizer": plain, "camera": camera}
+    own = read_localiser(fold(settings.model_copy(update=changed))) if ask else NOT_ASKED
     return Calibration(
         settings,
         last,
@@ -193,22 +197,13 @@ def calibrate_by(fold: Fold, settings: Settings, *, ask: bool = True) -> Calibra
         embedded=int(seen.looked.sum()),
         unboxed=int((~seen.boxed).sum()),
         beyond=seen.beyond,
+        unstated=0 if said.is_stated else view.without_camera(),
+        field=field,
         own=own,
     )
 
 
-def note_camera(
-    cameras: Cameras, envelope: Envelope, deltas: Sequence[Delta], default: CameraConstants
-) -> None:
-    """Keep the camera that an envelope states, if ``deltas`` are those of a new keyframe."""
-    if envelope.camera is None:
-        return
-    for delta in deltas:
-        if isinstance(delta, KeyframeAdded):
-            cameras[delta.keyframe] = camera_of(envelope, default)
-
-
-def _rows(view: MapView, cameras: Cameras, default: CameraConstants) -> Iterator[Row]:
+def _rows(view: MapView, camera: CameraSettings) -> Iterator[Row]:
     for observation in view.observations:
         keyframe = view.keyframes[observation.keyframe]
         if observation.object is None or keyframe.pose is None:
@@ -217,7 +212,7 @@ def _rows(view: MapView, cameras: Cameras, default: CameraConstants) -> Iterator
             picture=keyframe.ordinal,
             run=keyframe.run,
             pose=keyframe.pose,
-            camera=cameras.get(keyframe.ordinal, default),
+            camera=camera_of(keyframe.camera, camera),
             class_name=observation.class_name,
             bbox=observation.bbox,
             look=observation.embedding,

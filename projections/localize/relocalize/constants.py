@@ -84,7 +84,7 @@ class MapConstants:
         square = cosines.number * cosines.deviation**2 + _SPREAD_WEIGHT * usual**2
         return cls(
             evidence,
-            settings.camera,
+            settings.camera.constants,
             settings.localizer,
             round(different, _DIGITS),
             max(round(math.sqrt(square / (cosines.number + _SPREAD_WEIGHT)), _DIGITS), 1e-3),

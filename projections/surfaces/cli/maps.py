@@ -10,7 +10,13 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
 from projections.map.digest import map_digest
-from projections.map.state_output import places_advice, space_advice, state_document, state_text
+from projections.map.state_output import (
+    camera_advice,
+    places_advice,
+    space_advice,
+    state_document,
+    state_text,
+)
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache
@@ -54,7 +60,11 @@ def state(
         display(f"{hexdigits}\n")
     else:
         display(state_text(view, hexdigits, known))
-    for advice in () if digest else (places_advice(view.counts(), settings), space_advice(view)):
+    if digest:
+        return
+    counts = view.counts()
+    of_camera = camera_advice(counts, settings, source.log)
+    for advice in (places_advice(counts, settings), space_advice(view), of_camera):
         if advice is not None:
             say(advice)
 

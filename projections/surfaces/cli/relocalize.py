@@ -35,6 +35,7 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.track import Track, movement_of
 from projections.map.own_events import read_corrections
+from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults
@@ -116,6 +117,8 @@ def relocalize(
                 )
             search = ExactIndex(view).search
             say_defaults(settings)
+            if (advice := camera_advice(view.counts(), settings, log)) is not None:
+                say(advice)
         if track:
             print_tracked(lines, search, top=top, camera=camera)
         else:

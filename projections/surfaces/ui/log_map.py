@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, MapfoldError
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
@@ -25,6 +27,7 @@ from projections.fold.settings import Settings
 from projections.history import LogTimeline, Progress
 from projections.history.timeline import SettingsChoice
 from projections.localize.evaluate.truth import Truth
+from projections.map.state_output import camera_advice
 
 from .log_events import MOST_REPORTS, LogEvents
 
@@ -209,7 +212,18 @@ class LogMap:
                 f"none of the {counted(len(history.keyframes), 'keyframe')} has a pose, so there"
                 " are no places and there is nothing to draw"
             )
+        counts, settings = {"without_camera": self._without_camera()}, self.timeline.settings
+        if (advice := camera_advice(counts, settings, self.opened.log)) is not None:
+            found.append(advice)
         return found
+
+    def _without_camera(self) -> int:
+        """The number of keyframes whose camera nothing states, if positions depend on it."""
+        if not self.timeline.settings.wants_camera:
+            return 0
+        tables = self.timeline.history.tables
+        seen = np.unique(tables.column("observation", "keyframe"))
+        return int(np.count_nonzero(tables.column("keyframe", "camera")[seen] == 0))
 
     @property
     def key(self) -> str:

@@ -4,7 +4,8 @@ scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profil
     [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
-scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--jobs N] …
+scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
+    [--jobs N] …
 
 With --no-embeddings the detectors are bare ones; in the table of Objects page is then as if all
 looked alike: the class and the radius decide.
@@ -154,7 +155,7 @@ def _localised(
         )
         for each in (world, other)
     )
-    return localise(own, stranger, options.map, options.every)
+    return localise(own, stranger, options.map, options.every, stated=not options.no_camera)
 
 
 def _options() -> argparse.Namespace:
@@ -183,6 +184,9 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--types", action="store_true", help="types of places against room names")
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
+    parser.add_argument(
+        "--no-camera", action="store_true", help="with --localise: maps estimate the field of view"
+    )
     parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
     parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")
     parser.add_argument("--brief", action="store_true", help="with --localise: means only")
@@ -226,7 +230,8 @@ def _cases(
 def _row(case: Case, options: argparse.Namespace) -> tables.Row:
     plain = case.events if options.embeddings else list(map(as_if_alike, case.events))
     page, page_s = fold_timed(plain, Settings())
-    settings = Settings(fusion="evidence", camera=case.camera).with_assignments(options.set)
+    settings = Settings(fusion="evidence", camera=case.camera_settings)
+    settings = settings.with_assignments(options.set)
     evidence, evidence_s = fold_timed(case.events, settings)
     calibrated, calibrated_s = None, 0.0
     if options.calibrated:

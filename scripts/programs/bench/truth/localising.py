@@ -13,7 +13,7 @@ from typing import Any
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.ingest import Accepted
-from projections.fold.settings import Settings
+from projections.fold.settings import CameraSettings, Settings
 from projections.localize.evaluate.questions import (
     ScoredQuestion,
     make_questions,
@@ -76,11 +76,14 @@ class Scores:
 
 @dataclass(frozen=True, slots=True)
 class LocaliseRow:
-    """A robot in a building, mapped by one rule; scores by kind of question."""
+    """A robot in a building, mapped by one rule; scores by kind of question. ``hfov_deg`` is the
+    true field of view of its camera and ``camera`` what the settings of the map say of it."""
 
     name: str
     map: str
     scores: Mapping[str, Scores]
+    hfov_deg: float
+    camera: CameraSettings
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
@@ -88,6 +91,8 @@ class LocaliseRow:
             "name": self.name,
             "map": self.map,
             "scores": {kind: asdict(scores) for kind, scores in self.scores.items()},
+            "hfov_deg": self.hfov_deg,
+            "camera": self.camera.model_dump(),
         }
 
 
@@ -108,11 +113,12 @@ def later_runs(case: Case) -> list[Accepted]:
     return [each for each in case.events if each.envelope.run_id != case.first_run]
 
 
-def make_map(case: Case, rule: str, *, ask: bool = True) -> MapView:
+def make_map(case: Case, rule: str, *, ask: bool = True, stated: bool = True) -> MapView:
     """Run a with fusion=page, uncalibrated, or by evidence with the map's own constants; those of
-    re-localisation too, unless the map is not to be asked."""
+    re-localisation too, unless the map is not to be asked. A camera that is not ``stated`` is
+    estimated."""
     events = first_run(case)
-    settings = Settings(camera=case.camera, **PLACES)
+    settings = Settings(camera=case.camera_settings if stated else CameraSettings(), **PLACES)
     if rule == "evidence":
         settings = settings.model_copy(update={"fusion": "evidence"})
         settings, _ = calibrated_settings(events, settings, ask=ask)
@@ -139,20 +145,24 @@ def asked(
     return found
 
 
-def localise(case: Case, stranger: Case, rules: Sequence[str], every: int) -> list[LocaliseRow]:
-    """Map, ask and score."""
-    camera = case.camera
+def localise(
+    case: Case, stranger: Case, rules: Sequence[str], every: int, *, stated: bool = True
+) -> list[LocaliseRow]:
+    """Map, ask and score. If the camera is not ``stated``, neither questions nor map know it."""
+    camera = case.camera if stated else None
     kinds = asked(case, stranger, every)
     rows = []
     for rule in rules:
-        runner = TrialRunner(make_map(case, rule), case.truth, camera=camera, method="joint")
+        view = make_map(case, rule, stated=stated)
+        runner = TrialRunner(view, case.truth, camera=camera, method="joint")
         scores = {}
         for kind, (own, others) in kinds.items():
             start = time.process_time()
             trials = runner.run([*own, *others])
             spent = time.process_time() - start
             scores[kind] = score(trials, 1000.0 * spent / max(1, len(trials)))
-        rows.append(LocaliseRow(case.name, rule, scores))
+        said = view.settings.camera
+        rows.append(LocaliseRow(case.name, rule, scores, case.camera.hfov_deg, said))
     return rows
 
 

@@ -37,7 +37,22 @@ def localise_table(rows: Sequence[LocaliseRow], *, lines: bool = True) -> str:
     for rule in dict.fromkeys(row.map for row in rows):
         own = [row for row in rows if row.map == rule]
         parts += [_part(rule, kind, own, lines=lines) for kind in own[0].scores]
+    estimated = [row for row in rows if row.camera.hfov_error_deg is not None]
+    if estimated:
+        parts.append(_fields_of_view(estimated))
     return "\n\n".join(parts)
+
+
+def _fields_of_view(rows: Sequence[LocaliseRow]) -> str:
+    """Of each map the true field of view, the estimated one with its error, and how far it is
+    off."""
+    heads = ("field of view, estimated", "true", "map", "error", "off")
+    lines = ["{:<26} {:>6} {:>6} {:>6} {:>6}".format(*heads)]
+    for row in rows:
+        found, error = row.camera.hfov_deg or 0.0, row.camera.hfov_error_deg or 0.0
+        off = found - row.hfov_deg
+        lines.append(f"{row.name:<26} {row.hfov_deg:6.1f} {found:6.1f} {error:6.1f} {off:+6.1f}")
+    return "\n".join(lines)
 
 
 def _part(rule: str, kind: str, rows: Sequence[LocaliseRow], *, lines: bool) -> str:

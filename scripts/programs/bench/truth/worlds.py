@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest_all
-from projections.fold.settings import CameraConstants
+from projections.fold.settings import CameraConstants, CameraSettings
 from projections.localize.evaluate.truth import Truth, read_truth
 from tests.support.shared_data import DATA, WORLDS
 
@@ -66,6 +66,11 @@ class Case:
     things: dict[str, TrueThing]
     first_run: str
     looks_again: dict[str, int]
+
+    @property
+    def camera_settings(self) -> CameraSettings:
+        """The camera as settings state it."""
+        return CameraSettings.model_validate(self.camera.model_dump())
 
 
 def load_generator(folder: Path = WORLDS) -> ModuleType:
