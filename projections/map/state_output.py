@@ -299,10 +299,16 @@ _MOSTLY: Final = 0.8
 
 
 def space_advice(view: MapView) -> str | None:
-    """One line where the settings name a space of which the map has no vector."""
+    """One line where nothing is fused: the settings name a space of which the map has no vector, or
+    detections have none and the rule needs them."""
     model = view.settings.embedding_model
-    if model is None or not view.observations:
+    if not view.observations or view.all_objects:
         return None
+    if model is None:
+        by_evidence = view.settings.fusion == "evidence"
+        if by_evidence or any(o.embedding_crc is not None for o in view.observations):
+            return None
+        return "no detection has an embedding, so there are no Objects; --preset full needs none"
     if any(o.embedding_crc is not None and not o.foreign_space for o in view.observations):
         return None
     return (

@@ -192,6 +192,12 @@ class TestCommands:
         assert "similarity" not in text
         assert mapfold("merges", bare, "--objects", "--json", *BY_EVIDENCE).json
 
+    def test_state_says_which_rule_needs_no_embedding(self, mapfold: Commands, bare: Path) -> None:
+        advice = "no detection has an embedding, so there are no Objects; --preset full needs none"
+        assert advice in mapfold("state", bare).err.splitlines()
+        assert advice not in mapfold("state", bare, "--preset", "full").err
+        assert advice not in mapfold("state", bare, "--at", "0").err
+
     def test_a_map_without_looks_is_calibrated_but_for_likenesses(
         self, mapfold: Commands, bare: Path
     ) -> None:
