@@ -12,7 +12,6 @@ elevation   likewise that of the box's centre above the camera; another thing: a
             boxes in one picture are (`Slopes`)
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import State
-from .exact import log
+from .exact import log, log_of, logs
 from .sights import Sight
 from .spots import LEAST_ELEVATION_M2, LEAST_M, SLOPE, Estimate
 
@@ -284,30 +283,3 @@ class Agreement:
         whole *= 0.5
         whole += _ANYWHERE
         return whole
-
-
-def log_of(value: float) -> float:
-    """`logs` of one number, to the last bit."""
-    mantissa, twos = math.frexp(value)
-    s = (mantissa - 0.7071067811865476) / (mantissa + 0.7071067811865476)
-    square = s * s
-    series = (square * 0.4 + 2.0 / 3.0) * square + 2.0
-    return (twos - 0.5) * 0.6931471805599453 + s * series
-
-
-def logs(values: Floats) -> Floats:
-    """Natural logarithms of positive numbers, right to some 10⁻⁵, the same bits everywhere."""
-    mantissas, twos = np.frexp(values)
-    s = mantissas - 0.7071067811865476
-    mantissas += 0.7071067811865476
-    s /= mantissas
-    square = s * s
-    series = square * 0.4
-    series += 2.0 / 3.0
-    series *= square
-    series += 2.0
-    series *= s
-    result: Floats = twos - 0.5
-    result *= 0.6931471805599453
-    result += series
-    return result

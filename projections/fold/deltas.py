@@ -2,16 +2,14 @@
 
 Sinks, the view and time travel are built from deltas and never look into a reducer. A delta carries
 *absolute* new values (a count, not an increment): the last one per thing is enough, and applying
-one twice does no harm. ``offset`` is that of the event that caused it, which need not be a
-keyframe.
+one twice does no harm. ``offset`` is that of the event that caused it, perhaps no keyframe.
 
 Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
 They are never reused, and a database's ids are computed from them. They are ints at run time; mypy
 keeps those of one kind apart from the others.
 
-Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are
-exact; `projections.fold.exact` says why and where the bounds are. Timestamps are the robot's, float
-seconds.
+Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are exact
+(`projections.fold.exact`). Timestamps are the robot's, float seconds.
 
 The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
 (PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), Objects
@@ -34,6 +32,8 @@ from numpy.typing import NDArray
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
+from .exact import UnitVector
+
 RunOrdinal = NewType("RunOrdinal", int)
 KeyframeOrdinal = NewType("KeyframeOrdinal", int)
 ObservationOrdinal = NewType("ObservationOrdinal", int)
@@ -41,8 +41,8 @@ PlaceOrdinal = NewType("PlaceOrdinal", int)
 ObjectOrdinal = NewType("ObjectOrdinal", int)
 SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused", "forgotten", "dropped"]
 """Why an envelope, or an observation of it, is left out of the map; see `EventSkipped`."""
-UnitVector: TypeAlias = NDArray[np.int32]
-"""A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,); see `projections.fold.exact`."""
+FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
+"""Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
 
 
 class Pose(msgspec.Struct, frozen=True, gc=False):

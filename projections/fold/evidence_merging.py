@@ -23,9 +23,8 @@ import numpy as np
 
 from eventsrc.envelope.model import DetId
 
-from .agreement import log_of
 from .deltas import MergeEvidence, ObjectOrdinal
-from .exact import exp, log
+from .exact import exp, log, log_of
 from .looks import LookRatios, LookScale
 from .pair_groups import PairGroups
 from .spots import COMMON_M2

@@ -33,7 +33,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .deltas import UnitVector
+UnitVector: TypeAlias = NDArray[np.int32]
+"""A unit vector as multiples of 2⁻²⁰, int32 of shape (dim,)."""
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
 _HALF_PI = 1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21
@@ -300,3 +301,30 @@ def distance_um(ax: int, ay: int, bx: int, by: int) -> int:
     """The distance of two points, rounded down to whole micrometres."""
     dx, dy = ax - bx, ay - by
     return math.isqrt(dx * dx + dy * dy)
+
+
+def log_of(value: float) -> float:
+    """`logs` of one number, to the last bit."""
+    mantissa, twos = math.frexp(value)
+    s = (mantissa - 0.7071067811865476) / (mantissa + 0.7071067811865476)
+    square = s * s
+    series = (square * 0.4 + 2.0 / 3.0) * square + 2.0
+    return (twos - 0.5) * 0.6931471805599453 + s * series
+
+
+def logs(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Natural logarithms of positive numbers, right to some 10⁻⁵, the same bits everywhere."""
+    mantissas, twos = np.frexp(values)
+    s = mantissas - 0.7071067811865476
+    mantissas += 0.7071067811865476
+    s /= mantissas
+    square = s * s
+    series = square * 0.4
+    series += 2.0 / 3.0
+    series *= square
+    series += 2.0
+    series *= s
+    result: NDArray[np.float64] = twos - 0.5
+    result *= 0.6931471805599453
+    result += series
+    return result

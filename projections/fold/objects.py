@@ -46,12 +46,17 @@ from numpy.typing import NDArray
 from eventsrc.envelope.model import DetId, Offset
 
 from . import State
-from .deltas import ObjectFound, ObjectOrdinal, ObjectSeen, ObjectsMerged, ObservationOrdinal
+from .deltas import (
+    FusibleObservation,
+    ObjectFound,
+    ObjectOrdinal,
+    ObjectSeen,
+    ObjectsMerged,
+    ObservationOrdinal,
+)
 from .exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, dot_of_sums, long_dot, metres_to_um
 from .pair_groups import PairGroups
 
-FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
-"""Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
 NO_VECTOR: Final = np.zeros(0)
 """The vector of an observation without an embedding, which only fusion by evidence fuses."""
 Bucket = tuple[str, int, int]

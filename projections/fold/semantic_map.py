@@ -10,8 +10,7 @@ Per keyframe, in this order:
 3.  With a pose, the keyframe goes to places, and its observations in the map's embedding space go
     to Objects: one by one under `fusion = "page"`, all together, with those that have no embedding,
     by evidence. Without one it is only added. Floors are laid out beside each other (`floors`).
-4.  Names of places, located-in and adjacency get the changes of places and Objects, in order, and
-    return the deltas that follow from them.
+4.  Names of places, located-in and adjacency add what follows from changes of places and Objects.
 
 The fold has no clock, chance, disk, network or database. The same events give the same deltas.
 """
@@ -32,6 +31,7 @@ from .corrections import NO_CORRECTIONS, Corrections, Keyframe
 from .deltas import (
     Delta,
     EventSkipped,
+    FusibleObservation,
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
@@ -53,7 +53,7 @@ from .evidence_fusion import EvidenceFusion
 from .exact import Units, metres_to_um, unit_vectors
 from .floors import CurrentMap, Floors
 from .folded_ids import FoldedIds, content_digest
-from .objects import NO_VECTOR, ConstrainedObjects, FusibleObservation, Objects
+from .objects import NO_VECTOR, ConstrainedObjects, Objects
 from .pair_groups import PairGroups
 from .place_members import PosedKeyframe
 from .places import Places

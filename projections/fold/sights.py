@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import MAX_DEPTH_M, Detection, DetId, Envelope, StatedCamera
 
-from .deltas import ObservationOrdinal, Pose
+from .deltas import FusibleObservation, ObservationOrdinal, Pose
 from .evidence import EvidenceConstants
 from .exact import cos_sin, log, metres_to_um
-from .objects import FusibleObservation
 from .settings import CameraConstants, CameraSettings
 
 _CUT_PX = 2.0

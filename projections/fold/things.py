@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import State
-from .agreement import log_of
 from .deltas import ObjectOrdinal
+from .exact import log_of
 from .looks import Exemplar
 from .spots import Estimate, Spots
 

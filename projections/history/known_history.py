@@ -16,9 +16,8 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError, LogPointError
 from projections.fold.settings import Settings
-from projections.map.fold import FoldedEvent, fold_events
+from projections.map.fold import FoldedEvent, fold_events, new_map
 from projections.map.naming import Kind, NoSuchThing, SeveralThings, Thing, thing_called
-from projections.map.own_events import new_map
 from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 from projections.store.history import History

@@ -41,8 +41,7 @@ from projections.fold.deltas import (
 )
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import fold_parsed, read_ahead
-from projections.map.own_events import new_map
+from projections.map.fold import fold_parsed, new_map, read_ahead
 from projections.map.parsing import ParsedEvent, parsed_stretches
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter

@@ -15,7 +15,7 @@ from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 
-from .own_events import new_map
+from .own_events import vectors_of
 from .parsing import READ_AHEAD, ParsedEvent, parsed_stretches
 from .view import MapView
 
@@ -28,6 +28,21 @@ class FoldedEvent(NamedTuple):
 
     offset: Offset
     deltas: list[Delta]
+
+
+def new_map(
+    reader: LogReader, settings: Settings, corrections: Corrections = NO_CORRECTIONS
+) -> SemanticMap:
+    """A fold of this log that has folded nothing yet. Raises FoldError, LogDamaged."""
+    return with_vectors(SemanticMap(settings, corrections), reader)
+
+
+def with_vectors(semantic_map: SemanticMap, reader: LogReader) -> SemanticMap:
+    """The map, with the vectors of its space that the log has beside those in envelopes. Raises
+    FoldError, LogDamaged."""
+    known = vectors_of(reader, semantic_map.settings, semantic_map.corrections)
+    semantic_map.reembedded = known
+    return semantic_map
 
 
 def fold_events(

@@ -32,14 +32,12 @@ from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import (
-    NO_CORRECTIONS,
     Corrections,
     RecordedCommand,
     compile_corrections,
 )
 from projections.fold.edited_events import Reembedded
 from projections.fold.map_errors import FoldError, SettingsError
-from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 
 
@@ -82,21 +80,6 @@ def read_corrections(reader: LogReader, known_at: Offset | None = None) -> Corre
     """The corrections of the commands before ``known_at``, of all for None. Raises FoldError,
     LogDamaged."""
     return compile_corrections(read_commands(reader, known_at))
-
-
-def new_map(
-    reader: LogReader, settings: Settings, corrections: Corrections = NO_CORRECTIONS
-) -> SemanticMap:
-    """A fold of this log that has folded nothing yet. Raises FoldError, LogDamaged."""
-    return with_vectors(SemanticMap(settings, corrections), reader)
-
-
-def with_vectors(semantic_map: SemanticMap, reader: LogReader) -> SemanticMap:
-    """The map, with the vectors of its space that the log has beside those in envelopes. Raises
-    FoldError, LogDamaged."""
-    known = vectors_of(reader, semantic_map.settings, semantic_map.corrections)
-    semantic_map.reembedded = known
-    return semantic_map
 
 
 def vectors_of(

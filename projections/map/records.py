@@ -20,9 +20,8 @@ from projections.fold.deltas import (
     PlaceOrdinal,
     Pose,
     RunOrdinal,
-    UnitVector,
 )
-from projections.fold.exact import UM_PER_M, mean_m
+from projections.fold.exact import UM_PER_M, UnitVector, mean_m
 from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.place_types import ONCE
 

@@ -17,8 +17,7 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.deltas import Delta, PlacesMerged
 from projections.fold.settings import Settings
 
-from .fold import fold_event
-from .own_events import new_map
+from .fold import fold_event, new_map
 from .view import MapView
 
 

@@ -33,7 +33,8 @@ from projections.map.view import MapView
 from . import checkpoints
 from .checkpoints import DeadLetter
 from .connection import Connection, database_errors
-from .sink import Checkpoint, PreparedWrite, SinkName
+from .labels import SinkName
+from .sink import Checkpoint, PreparedWrite
 from .stores import Store
 from .tail_progress import TailPlan
 

@@ -39,11 +39,11 @@ from .connection import (
 from .cypher import PARENTS, refuse_without_age
 from .graph_rows import Row, expected_rows
 from .inputs import LogInputs, SettingsOf
-from .labels import GRAPH, LABELS, MAP_TABLE, TABLE, VERTEX_LABELS
+from .labels import GRAPH, LABELS, MAP_TABLE, SINKS, TABLE, VERTEX_LABELS, SinkName
 from .live_fold import LiveFold, batches
 from .map_table import MapRow, map_of, map_rows
 from .origin import command_for, refuse_mismatch, rows_dropped
-from .sink import SINKS, Checkpoint, SinkName
+from .sink import Checkpoint
 from .statements import statements
 from .vector_rows import VectorRow, new_rows
 

@@ -14,7 +14,8 @@ from eventsrc.log import Event
 from projections.fold.map_errors import CheckpointMoved, DatabaseError, ProjectionBusy
 
 from .connection import Connection, describe_connection
-from .sink import SINKS, Checkpoint, SinkName
+from .labels import SINKS, SinkName
+from .sink import Checkpoint
 from .statements import statements
 
 _COMMENT_PREFIX: Final = "mapfold"

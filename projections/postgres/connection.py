@@ -27,7 +27,7 @@ from projections.fold.map_errors import DatabaseError, DatabaseUnavailable, Exte
 
 from .data_folder import SUPERUSER, reset_advice
 from .embedded import EmbeddedServer, embedded_log
-from .sink import SinkName
+from .labels import SinkName
 
 Connection = psycopg.Connection[TupleRow]
 

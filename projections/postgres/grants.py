@@ -7,8 +7,7 @@ from psycopg import sql
 
 from .connection import Connection
 from .cypher import FIRST_ENFORCING_VERSION
-from .labels import Label
-from .sink import SINKS
+from .labels import SINKS, Label
 from .statements import statements
 
 _PRIVILEGES: Final = {

@@ -39,11 +39,12 @@ from .labels import (
     OLD_GRAPH,
     VERTEX_LABELS,
     Label,
+    SinkName,
 )
 from .loader import Load, LoaderName, graph_statement, load_of_graph, unnest_columns
 from .map_table import MapRow, map_rows
 from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
-from .sink import PreparedWrite, SinkName
+from .sink import PreparedWrite
 from .statements import statements
 
 EARLY: Final[frozenset[Label]] = frozenset({"Observation"})

@@ -1,4 +1,4 @@
-"""Names of the graph, its labels and the table of vectors; ids of vertices and edges.
+"""Names of the graph, its labels, the table of vectors and the sinks; ids of vertices and edges.
 
 A graph of AGE is a schema and each label a table. The id of a vertex or edge is its graphid,
 ``label id << 48 | number``. AGE numbers labels per graph in the order in which they are created,
@@ -18,6 +18,7 @@ the fold's ordinals, so every id follows from the log alone and no write has to 
 The last three labels are younger than the others and so come after the edges.
 """
 
+from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
 GRAPH: Final = "semantic_map"
@@ -108,3 +109,31 @@ def adjacency_number(a: int, b: int) -> int:
     if not 0 <= a < b < (1 << 24) - 1:
         raise ValueError(f"places {a} and {b} cannot be an edge: want 0 ≤ a < b < 2²⁴ - 1")
     return (a + 1) << 24 | (b + 1)
+
+
+SinkName: TypeAlias = Literal["graph", "vectors"]
+"""The ``name`` of a sink of the databases: the key of its checkpoint, dead letters and locks."""
+
+
+@dataclass(frozen=True, slots=True)
+class SinkTraits:
+    """What this folder's modules know of a sink of the databases: the numbers of the lock of its
+    writer and of the one that drops replaced tables; its tables, each schema and name; whether its
+    name is plural; whether a refold keeps its rows if no correction changes observations."""
+
+    writer_lock: int
+    drop_lock: int
+    tables: tuple[tuple[str, str], ...]
+    is_plural: bool = False
+    is_kept: bool = False
+
+    @property
+    def was(self) -> str:
+        """The verb of messages about it."""
+        return "were" if self.is_plural else "was"
+
+
+SINKS: Final[dict[SinkName, SinkTraits]] = {
+    "graph": SinkTraits(1, 17, (*((GRAPH, each) for each in LABELS), ("mapfold", MAP_TABLE))),
+    "vectors": SinkTraits(2, 18, (("public", TABLE),), is_plural=True, is_kept=True),
+}

@@ -9,8 +9,7 @@ from projections.fold.map_errors import FoldError, FoldInterrupted
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.changes import ChangeTracker
-from projections.map.fold import fold_events, fold_parsed
-from projections.map.own_events import with_vectors
+from projections.map.fold import fold_events, fold_parsed, with_vectors
 from projections.map.parsing import READ_AHEAD, ParsedEvent
 from projections.map.view import MapView
 from projections.store.column_rows import TableWriter

@@ -2,8 +2,7 @@
 
 A tail folds the log from its start, or from the latest fold that was kept below the checkpoints,
 and writes to each sink from its own checkpoint on. One pass (`TailPass`) lasts until the tail is
-stopped, unless the server loses commits that it had not flushed: then the fold is ahead of the
-databases, and another pass begins at their checkpoints.
+stopped, unless the server loses unflushed commits: then another begins at the checkpoints.
 
 A batch has the events since the last one: a single event at a low rate, up to `BATCH_EVENTS` when
 the tail is behind. Each batch is one transaction per database (`batch_writer`).
@@ -41,12 +40,13 @@ from .batch_writer import AWAY, Backoff, LostCommits, Writer
 from .checkpoints import DeadLetter, dead_letter
 from .connection import Targets, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
+from .labels import SinkName
 from .live_fold import LiveFold, batches
 from .loader import LoaderName
 from .map_table import maps_key
 from .origin import is_under_other_corrections, replay_advice, rows_dropped
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
-from .sink import Checkpoint, SinkName
+from .sink import Checkpoint
 from .stores import DatabaseSink, Only, Store, open_stores
 from .tail_progress import TailPlan, TailProgress, TailReport
 

@@ -16,7 +16,8 @@ from projections.fold.map_errors import ProjectionMismatch, ProjectionMissing
 from projections.fold.settings import Settings, settings_by_name
 
 from .inputs import LogInputs, MapInputs
-from .sink import SINKS, Checkpoint, SinkName
+from .labels import SINKS, SinkName
+from .sink import Checkpoint
 
 _SETTINGS_OPTIONS: Final = ("--settings", "--preset", "--set")
 

@@ -31,11 +31,11 @@ from . import checkpoints
 from .checkpoints import DeadLetter
 from .connection import Targets, connect, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf
+from .labels import SINKS, SinkName
 from .live_fold import LiveFold
 from .loader import LoaderName
 from .origin import command_for, refuse_mismatch
 from .shadows import FoldedLog, ShadowWriter, drop_replaced, stream, swap_in_new_map
-from .sink import SINKS, SinkName
 from .stores import Only, open_stores
 from .vector_sink import HnswReport
 

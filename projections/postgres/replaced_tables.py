@@ -20,7 +20,7 @@ from typing import Final
 from psycopg import sql
 
 from .connection import Connection
-from .sink import SINKS, SinkName
+from .labels import SINKS, SinkName
 from .statements import statements
 
 WAIT_SECONDS: Final = 10.0

@@ -20,45 +20,17 @@ returns a function that gets one, so that the fold can go on while a thread call
 
 Each event's changes reach a sink once. Ordinals are the same in every fold of a log: a sink that
 computes its ids from them has the same rows after a tail and a rebuild, and never looks an id up.
-`SINKS` is the table of the sinks of the databases; `stores` makes them.
+`labels.SINKS` is the table of the sinks of the databases; `stores` makes them.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from eventsrc.envelope.model import Offset
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
-from .labels import GRAPH, LABELS, MAP_TABLE, TABLE
-
-SinkName: TypeAlias = Literal["graph", "vectors"]
-"""The ``name`` of a sink of the databases: the key of its checkpoint, dead letters and locks."""
-
-
-@dataclass(frozen=True, slots=True)
-class SinkTraits:
-    """What this folder's modules know of a sink of the databases: the numbers of the lock of its
-    writer and of the one that drops replaced tables; its tables, each schema and name; whether its
-    name is plural; whether a refold keeps its rows if no correction changes observations."""
-
-    writer_lock: int
-    drop_lock: int
-    tables: tuple[tuple[str, str], ...]
-    is_plural: bool = False
-    is_kept: bool = False
-
-    @property
-    def was(self) -> str:
-        """The verb of messages about it."""
-        return "were" if self.is_plural else "was"
-
-
-SINKS: Final[dict[SinkName, SinkTraits]] = {
-    "graph": SinkTraits(1, 17, (*((GRAPH, each) for each in LABELS), ("mapfold", MAP_TABLE))),
-    "vectors": SinkTraits(2, 18, (("public", TABLE),), is_plural=True, is_kept=True),
-}
 Conn = TypeVar("Conn", contravariant=True)
 
 

@@ -30,8 +30,9 @@ from .connection import (
 )
 from .cypher import unwanted_writers
 from .inputs import LogInputs, SettingsOf
+from .labels import SINKS, SinkName
 from .origin import command_for, refuse_other_origin, replay_advice
-from .sink import SINKS, Checkpoint, SinkName
+from .sink import Checkpoint
 
 STALLED_S: Final = 20.0
 """A live tail's heartbeat comes every 5 s."""

@@ -20,8 +20,8 @@ from .connection import (
     pin_session_settings,
 )
 from .graph_sink import GraphSink
+from .labels import SinkName
 from .loader import LoaderName
-from .sink import SinkName
 from .vector_sink import VectorSink
 
 Only: TypeAlias = SinkName | None

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.fold.deltas import ObservationAdded, Pose, UnitVector
-from projections.fold.exact import UM_PER_M, to_float32
+from projections.fold.deltas import ObservationAdded, Pose
+from projections.fold.exact import UM_PER_M, UnitVector, to_float32
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 

@@ -23,8 +23,7 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_co
 from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
-from projections.map.fold import fold_events, fold_into, fold_log
-from projections.map.own_events import new_map
+from projections.map.fold import fold_events, fold_into, fold_log, new_map
 from projections.map.parsing import READ_AHEAD, parse_events
 from projections.map.view import MapView
 

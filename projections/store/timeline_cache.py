@@ -44,7 +44,7 @@ from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.digest import VERSION
-from projections.map.own_events import with_vectors
+from projections.map.fold import with_vectors
 
 from .columns import Stripe, joined_short
 from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, read_state, write_part

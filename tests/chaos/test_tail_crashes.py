@@ -17,7 +17,8 @@ from projections.fold.settings import Settings
 from projections.postgres import TailProgress, TailReport, checkpoints, rebuild, tail
 from projections.postgres.connection import Connection, Targets, connect
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.sink import Checkpoint, SinkName
+from projections.postgres.labels import SinkName
+from projections.postgres.sink import Checkpoint
 from tests.support import prefork
 from tests.support.logs import bridge, walk, write_log
 from tests.support.rows import all_rows

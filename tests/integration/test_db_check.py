@@ -13,7 +13,8 @@ from projections.fold.settings import Settings
 from projections.postgres import checkpoints, rebuild, tail
 from projections.postgres.check import NAMED, check
 from projections.postgres.connection import Connection, Targets
-from projections.postgres.sink import Checkpoint, SinkName
+from projections.postgres.labels import SinkName
+from projections.postgres.sink import Checkpoint
 from projections.postgres.status import projection_status
 from tests.support.commands import Commands
 from tests.support.logs import append_raw, bridge, walk, write_log

@@ -13,8 +13,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.history import LogTimeline
 from projections.map.digest import map_digest
-from projections.map.fold import fold_events, fold_log
-from projections.map.own_events import new_map
+from projections.map.fold import fold_events, fold_log, new_map
 from projections.map.view import MapView
 from projections.store.timeline_cache import MOST_DIGESTS
 from tests.integration.test_timeline_cache_attacked import EVENTS, drive

@@ -32,8 +32,7 @@ from projections.history.merge_reasons import (
     refusal_document,
 )
 from projections.map.digest import map_digest
-from projections.map.fold import fold_events
-from projections.map.own_events import new_map
+from projections.map.fold import fold_events, new_map
 from projections.map.records import (
     KeyframeRecord,
     ObjectRecord,

@@ -28,9 +28,9 @@ from projections.postgres.connection import (
     describe_target,
     url_without_secrets,
 )
+from projections.postgres.labels import SINKS
 from projections.postgres.loader import LoaderName
 from projections.postgres.origin import refuse_other_events
-from projections.postgres.sink import SINKS
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .engines import Progress

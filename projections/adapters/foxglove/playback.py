@@ -34,8 +34,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.deltas import PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import fold_events
-from projections.map.own_events import new_map
+from projections.map.fold import fold_events, new_map
 from projections.map.parsing import READ_AHEAD
 from projections.map.phrases import change_lines
 from projections.map.scenes import Moments

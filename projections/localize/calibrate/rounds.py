@@ -19,8 +19,7 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraSettings, LocalizerConstants, Settings
 from projections.fold.sights import camera_of
-from projections.map.fold import fold_parsed, read_ahead
-from projections.map.own_events import new_map
+from projections.map.fold import fold_parsed, new_map, read_ahead
 from projections.map.parsing import parsed_stretches
 from projections.map.view import MapView
 

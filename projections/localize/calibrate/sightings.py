@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from projections.fold.deltas import Pose, UnitVector
-from projections.fold.exact import Q40
+from projections.fold.deltas import Pose
+from projections.fold.exact import Q40, UnitVector
 from projections.fold.settings import CameraConstants
 from projections.localize.relocalize.camera import box_rows, focal_px, views
 

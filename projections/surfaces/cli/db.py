@@ -13,9 +13,9 @@ from projections.postgres.check import CheckReport
 from projections.postgres.check import check as check_projections
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.grants import roles_sql
+from projections.postgres.labels import SinkName
 from projections.postgres.queries.candidate_search import question_error
 from projections.postgres.rebuild import retry
-from projections.postgres.sink import SinkName
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .folded_log import LogSettings

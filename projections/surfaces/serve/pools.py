@@ -24,6 +24,7 @@ from projections.postgres.connection import (
     database_errors,
     describe_target,
 )
+from projections.postgres.labels import SinkName
 from projections.postgres.queries.candidate_rows import ConstantsMemory
 from projections.postgres.queries.candidate_search import (
     CandidateReader,
@@ -31,7 +32,6 @@ from projections.postgres.queries.candidate_search import (
     prepare_graph,
     prepare_vectors,
 )
-from projections.postgres.sink import SinkName
 
 OUTAGE_TIMEOUT_S: Final = 10.0
 """Questions in the first seconds of an outage wait for its end, later ones fail at once."""
