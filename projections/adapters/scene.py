@@ -14,6 +14,7 @@ from eventsrc.envelope.model import RunId
 from projections.adapters import palette
 from projections.fold.deltas import Pose
 from projections.fold.exact import UM_PER_M
+from projections.map.place_regions import Region, place_regions
 from projections.map.records import (
     EstimatedPosition,
     KeyframeRecord,
@@ -40,13 +41,21 @@ _MOST_POSES: Final = 2_000
 
 @dataclass(frozen=True, slots=True)
 class ShownPlace:
-    """A place: the corners of the hull of its poses, none where these are on one line; ``label`` is
-    its name or likely type, and its id."""
+    """A place: its region, where walls are known, and the corners of the hull of its poses, none
+    where these are on one line; ``label`` is its name or likely type, and its id."""
 
     record: PlaceRecord
     floor: str | None
-    outline: tuple[Point, ...]
+    region: Region | None
+    hull: tuple[Point, ...]
     label: str
+
+    @property
+    def outlines(self) -> tuple[tuple[Point, ...], ...]:
+        """The closed outlines of the region or hull, the last point the first one."""
+        if self.region is not None:
+            return tuple(ring for rings in self.region.polygons for ring in rings)
+        return ((*self.hull, self.hull[0]),) if self.hull else ()
 
     @property
     def centroid(self) -> Point:
@@ -84,14 +93,14 @@ class Way:
 
 def places_of(view: MapView) -> list[ShownPlace]:
     """The places of a map, in the order in which they were founded."""
-    found = []
+    found, regions = [], place_regions(view)
     for place in view.places.values():
         ring = hull(view.keyframes[member].pose for member in place.members)
         kind = view.type_of(place.ordinal)
         name = place.name or (kind.type if kind is not None else None)
         label = place.place_id if name is None else f"{name} ({place.place_id})"
-        outline = tuple(ring) if len(ring) > 2 else ()
-        found.append(ShownPlace(place, view.floor_of(place.ordinal), outline, label))
+        corners, region = tuple(ring) if len(ring) > 2 else (), regions.get(place.ordinal)
+        found.append(ShownPlace(place, view.floor_of(place.ordinal), region, corners, label))
     return found
 
 

@@ -18,7 +18,7 @@ import hashlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -222,10 +222,16 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
 NO_CORRECTIONS = Corrections()
 
 
+EVIDENCE_VERSION: Final = 2
+"""To be raised with every change of fusion by evidence, or of where its Objects are located, that
+changes the map of some log: databases of such maps are then to be rebuilt."""
+
+
 def map_fingerprint(settings: Settings, corrections: Corrections) -> str:
-    """16 hex digits that are equal for maps of the same settings and corrections."""
+    """16 hex digits that are equal for maps of the same settings, corrections and rules."""
     vectors = (each.sha256 for each in corrections.reembedded_for(settings))
-    own = " ".join((corrections.fingerprint(), *vectors)).strip()
+    rules = f"rules {EVIDENCE_VERSION} " if settings.fusion == "evidence" else ""
+    own = rules + " ".join((corrections.fingerprint(), *vectors)).strip()
     if not own:
         return settings.fingerprint()
     return hashlib.sha256(f"{settings.fingerprint()} {own}".encode()).hexdigest()[:16]

@@ -42,7 +42,8 @@ from .deltas import (
 )
 from .driven_cells import StraightWay
 from .exact import metres_to_um
-from .occupancy import OccupancyGrid, Point
+from .free_floor import FreeFloor, free_floor
+from .occupancy import Point
 from .pair_groups import PairGroups
 from .settings import Settings
 from .sights import Sighting
@@ -193,6 +194,7 @@ class CurrentMap:
         self._floors = floors
         self.given: dict[str | None, MapGiven] = {}
         # By number of the floor; only those already computed.
+        self._grounds: dict[int, FreeFloor | None] = {}
         self._ways: dict[int, StraightWay | None] = {}
 
     def fold(self, offset: Offset, given: OccupancyMap) -> MapGiven | None:
@@ -201,6 +203,7 @@ class CurrentMap:
         if before is not None and before.map.digest() == given.digest():
             return None
         delta = self.given[given.floor] = MapGiven(offset, given)
+        self._grounds.clear()
         self._ways.clear()
         return delta
 
@@ -217,12 +220,28 @@ class CurrentMap:
             self._ways[number] = self._way_on(number)
         return self._ways[number]
 
-    def _way_on(self, number: int) -> StraightWay | None:
-        given = map_in_force(self.given, self._floors.names[number], is_first=number == 0)
-        if given is None:
+    def floor_at(self, at: Point) -> tuple[int, FreeFloor, Point] | None:
+        """The number of the floor of a laid-out position, its free floor, and where on it that is;
+        None where the floor has no map."""
+        number = self._floors.number_at(*at)
+        ground = self._ground(number)
+        if ground is None:
             return None
-        way = OccupancyGrid(given.map).straight_way_um
+        dx, dy = shift_um(number)
+        return number, ground, (at[0] - dx, at[1] - dy)
+
+    def _way_on(self, number: int) -> StraightWay | None:
+        ground = self._ground(number)
+        if ground is None:
+            return None
+        way = ground.grid.straight_way_um
         return partial(_moved_back, way, *shift_um(number)) if number else way
+
+    def _ground(self, number: int) -> FreeFloor | None:
+        if number not in self._grounds:
+            given = map_in_force(self.given, self._floors.names[number], is_first=number == 0)
+            self._grounds[number] = None if given is None else free_floor(given.map)
+        return self._grounds[number]
 
     def dump(self) -> State:
         """The whole state, to be kept; nothing without a map."""

@@ -164,14 +164,22 @@ class OccupancyGrid:
         block_m = self.block * source.resolution
         self.walls = walls & _cells(kept, self.block, walls.shape)
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
-        inside = regions(kept, block_m)
-        self._small = _small_regions(inside, self.block * self.side_um)
-        self.regions: Labels = _spread(inside, _SPREAD)
+        self.inside: Labels = regions(kept, block_m)
+        """The region of each block, `NOWHERE` for those with a wall."""
+        self._small = _small_regions(self.inside, self.block * self.side_um)
+        self.regions: Labels = _spread(self.inside, _SPREAD)
 
     def cell(self, point: Point) -> tuple[int, int]:
         """Column and row of a point; they may lie outside the grid."""
         u, v = self._to_grid(point)
         return u // self.side_um, v // self.side_um
+
+    def in_map(self, column: int, row: int) -> Point:
+        """The position of the lower left corner of a cell in the map frame, µm."""
+        u, v = column * self.side_um, row * self.side_um
+        x = (u * self._cos - v * self._sin) >> _TURN_BITS
+        y = (u * self._sin + v * self._cos) >> _TURN_BITS
+        return x + self._x0, y + self._y0
 
     def is_wall(self, point: Point) -> bool:
         """Whether a point lies in a wall."""

@@ -5,9 +5,10 @@ place, and which places are next to each other.
 place the newest command's counts; so a name survives merges. An anchor that is in no place, or was
 not folded yet, names nothing.
 
-*Located-in.* An Object is in the place where most of its observations were made. One observation is
-one vote for the place of its keyframe, as labelled now; noise does not vote, and votes once it is
-promoted. Ties go to the place founded first. An Object none of whose observations has a place is
+*Located-in.* An Object is in the place on whose floor it stands, where that is known (`standing`),
+else in the place where most of its observations were made. One observation is one vote for the
+place of its keyframe, as labelled now; noise does not vote, and votes once it is promoted. Ties go
+to the place founded first. An Object none of whose observations has a place is
 nowhere. The votes of an absorbed Object are its survivor's. An Object that was relocated to where
 another was found, and absorbs that, has only the votes of the absorbed one.
 
@@ -43,6 +44,7 @@ from .deltas import (
     RunOrdinal,
 )
 from .pair_groups import ObjectSurvivors, PlaceSurvivors
+from .standing import Standing
 
 
 class PlaceNames:
@@ -120,9 +122,10 @@ class PlaceNames:
 
 class LocatedIn:
     """The reducer of located-in. Merges, placings and sightings are reported to it in order, before
-    `collect_moves`."""
+    `collect_moves`; `decide_standing` where walls are known."""
 
-    def __init__(self) -> None:
+    def __init__(self, standing: Standing) -> None:
+        self._standing = standing
         self.votes: list[dict[PlaceOrdinal, int]] = []  # per Object: place → observations there
         self.located: list[PlaceOrdinal | None] = []  # per Object
         # place → Objects with votes there
@@ -135,6 +138,7 @@ class LocatedIn:
     def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
         """Count the votes for absorbed places for the survivor."""
         for place in absorbed:
+            self._touched.update(self._standing.place_absorbed(survivor, place))
             voters = self.voters.pop(place, {})
             for ordinal in voters:
                 votes = self.votes[ordinal]
@@ -188,13 +192,19 @@ class LocatedIn:
             else:
                 del self.waiting[keyframe]
 
+    def decide_standing(self) -> None:
+        """Decide where Objects stand whose estimate, or whose surroundings, changed."""
+        self._touched.update(dict.fromkeys(self._standing.decide()))
+
     def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
         """Recount the Objects whose votes changed; returns those that moved, ascending."""
         if not self._touched:
             return []
         moved = []
         for ordinal in sorted(self._touched):
-            place = _winner(self.votes[ordinal])
+            place = self._standing.place_of(ordinal)
+            if place is None:
+                place = _winner(self.votes[ordinal])
             if place != self.located[ordinal]:
                 self.located[ordinal] = place
                 moved.append(ObjectMoved(offset, ordinal, place))
@@ -223,8 +233,9 @@ class LocatedIn:
 
     def _vote(self, ordinal: ObjectOrdinal, place: PlaceOrdinal) -> None:
         votes = self.votes[ordinal]
-        votes[place] = votes.get(place, 0) + 1
-        if self.located[ordinal] == place and ordinal not in self._touched:
+        before = votes.get(place, 0)
+        votes[place] = before + 1
+        if before and self.located[ordinal] == place and ordinal not in self._touched:
             return  # one more vote for its own place cannot move it
         self.voters.setdefault(place, {})[ordinal] = None
         self._touched[ordinal] = None

@@ -35,6 +35,7 @@ from .deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    ObjectEstimated,
     ObjectRelocated,
     ObjectSeen,
     ObjectsMerged,
@@ -61,6 +62,7 @@ from .relations import Adjacency, LocatedIn, PlaceNames
 from .rooms import Rooms
 from .settings import Settings
 from .sights import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
+from .standing import Standing
 
 Reducer: TypeAlias = (
     FoldedIds
@@ -70,6 +72,7 @@ Reducer: TypeAlias = (
     | Objects
     | EvidenceFusion
     | LocatedIn
+    | Standing
     | Adjacency
     | CurrentMap
 )
@@ -97,9 +100,10 @@ class SemanticMap:
         self.places = places_by(settings, self._grouped)
         self._named = PairGroups(corrections.same, corrections.different)
         self.objects = objects_by(settings, self._named)
-        self.located_in = LocatedIn()
-        self.adjacency = Adjacency()
         self.current_map = CurrentMap(settings, self.floors)
+        self.standing = Standing(self.current_map.floor_at, self.places.survivors)
+        self.located_in = LocatedIn(self.standing)
+        self.adjacency = Adjacency()
         self.observation_count = 0
         self.reembedded: Reembedded | None = None  # by `projections.map.own_events`
         self._has_vectors = bool(corrections.reembedded_for(settings))
@@ -108,8 +112,11 @@ class SemanticMap:
         """Put an occupancy map into force for the events after it; returns the deltas."""
         self.next_offset = Offset(offset + 1)
         given_map = self.current_map.fold(offset, given)
+        if given_map is None:
+            return []
         self._use_walls()
-        return [] if given_map is None else [given_map]
+        self.standing.use_other_map()
+        return [given_map]
 
     def _use_walls(self) -> None:
         if self.current_map.has_walls and isinstance(self.places, Rooms):
@@ -190,6 +197,8 @@ class SemanticMap:
                 error = pose_error_of(envelope)
                 fused = objects.fold(offset, run, timestamp, facing, camera, sights, error)
                 self._locate(fused, keyframe, place)
+                if isinstance(self.places, Rooms) and place is not None:
+                    self._stand(fused, pose, place)
                 deltas += fused
             else:
                 x_um, y_um = pose.x_um, pose.y_um
@@ -205,6 +214,18 @@ class SemanticMap:
             deltas += self.located_in.collect_moves(offset)
             deltas += self.adjacency.collect_changes(offset)
         return self.floors.put_back(deltas)
+
+    def _stand(self, fused: Sequence[Delta], pose: Pose, place: PlaceOrdinal) -> None:
+        """Report the pose and estimates to the reducer of where Objects stand."""
+        standing, at = self.standing, (pose.x_um, pose.y_um)
+        standing.pose_placed(*at, place)
+        for delta in fused:
+            if type(delta) is ObjectEstimated:
+                standing.object_estimated(delta, at)
+            elif type(delta) is ObjectsMerged:
+                standing.object_absorbed(delta.absorbed)
+        if self.current_map.has_walls:
+            self.located_in.decide_standing()
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
         """Replace the names of places, as if they had been known from the start; returns the
@@ -261,6 +282,7 @@ class SemanticMap:
             ("places", self.places),
             ("landmarks", self.objects),
             ("located_in", self.located_in),
+            ("standing", self.standing),
             ("adjacency", self.adjacency),
             ("current_map", self.current_map),
         )

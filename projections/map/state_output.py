@@ -15,6 +15,7 @@ from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
 from .phrases import command_document
+from .place_regions import Region, place_regions
 from .records import ObjectRecord
 from .view import MapView
 
@@ -101,6 +102,7 @@ def _keyframes(view: MapView) -> list[dict[str, Any]]:
 
 
 def _places(view: MapView) -> list[dict[str, Any]]:
+    regions = place_regions(view)
     return [
         {
             "place_id": p.place_id,
@@ -110,6 +112,7 @@ def _places(view: MapView) -> list[dict[str, Any]]:
             **({} if p.name is None else {"name": p.name}),
             **_floor(view.floor_of(p.ordinal)),
             **_type(view.type_of(p.ordinal)),
+            **_region(regions.get(p.ordinal)),
         }
         for p in view.places.values()
     ]
@@ -129,6 +132,13 @@ def _type(found: PlaceType | None) -> dict[str, Any]:
         "type_probability": found.probability,
         "type_candidates": [{"type": t, "probability": p} for t, p in found.candidates],
     }
+
+
+def _region(region: Region | None) -> dict[str, Any]:
+    """The free floor, where walls are known."""
+    if region is None:
+        return {}
+    return {"region": region.geometry(), "area_m2": region.area_m2}
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:

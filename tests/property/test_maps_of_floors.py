@@ -11,17 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold import floors
+from projections.fold import free_floor
 from projections.fold.settings import Settings
 from projections.localize.relocalize import CandidatePlace, MapCandidates, Match
 from projections.localize.relocalize.ground import WallMap
 from projections.localize.relocalize.layout import STEP_M, Layout
 from projections.map.digest import map_digest
-from tests.support.envelopes import envelope
-from tests.support.folds import Folded, resumed
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded, resumed, state_bytes
 from tests.support.thorough import examples
 
 ROOMS = Settings(places="rooms")
+FULL = Settings(places="rooms", fusion="evidence")
+LOOKS = dict(zip(("bed", "cup", "tv"), np.eye(3, 8), strict=True))
 Item = dict[str, Any] | OccupancyMap
 
 
@@ -50,12 +52,18 @@ def _items(seed: int) -> list[Item]:
                 items.append(items[-1])  # published again
         for axis in (0, 1):
             at[floor][axis] = max(-5.5, min(5.5, at[floor][axis] + rng.uniform(-1.2, 1.2)))
-        items.append(envelope(number, *at[floor], floor=floor, run_id=f"run-{floor}"))
+        seen = [
+            detection(name, LOOKS[name], bbox=[left, 200.0, left + 80.0, 290.0])
+            for name in rng.sample(sorted(LOOKS), rng.randrange(3))
+            for left in [rng.uniform(50.0, 500.0)]
+        ]
+        fields = {"floor": floor, "run_id": f"run-{floor}", "detections": seen}
+        items.append(envelope(number, *at[floor], **fields))
     return items
 
 
-def _fold(items: Iterable[Item]) -> Folded:
-    folded = Folded.start(ROOMS)
+def _fold(items: Iterable[Item], settings: Settings = ROOMS) -> Folded:
+    folded = Folded.start(settings)
     for item in items:
         if isinstance(item, OccupancyMap):
             offset = folded.map.next_offset
@@ -100,8 +108,8 @@ def test_each_floor_is_folded_as_if_it_were_alone(seed: int) -> None:
 @settings(max_examples=examples(10), deadline=None)
 @given(st.integers(0, 10**6))
 def test_kept_folds_have_the_maps_of_all_floors(seed: int) -> None:
-    items = _items(seed)
-    half = _fold(items[: len(items) // 2])
+    items, rules = _items(seed), (ROOMS, FULL)[seed % 2]
+    half = _fold(items[: len(items) // 2], rules)
     again = resumed(half)
     for item in items[len(items) // 2 :]:
         if isinstance(item, OccupancyMap):
@@ -109,8 +117,9 @@ def test_kept_folds_have_the_maps_of_all_floors(seed: int) -> None:
             again.view.apply_event(offset, again.map.use_map(offset, item))
         else:
             again.extend([item])
-    whole = _fold(items)
+    whole = _fold(items, rules)
     assert map_digest(again.view) == map_digest(whole.view)
+    assert state_bytes(again) == state_bytes(whole)
     offsets = [
         {f: g.offset for f, g in v.maps_in_force().items()} for v in (again.view, whole.view)
     ]
@@ -120,12 +129,12 @@ def test_kept_folds_have_the_maps_of_all_floors(seed: int) -> None:
 def test_walls_are_worked_out_when_a_pose_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     built = []
 
-    class Counted(floors.OccupancyGrid):
+    class Counted(free_floor.OccupancyGrid):
         def __init__(self, source: OccupancyMap) -> None:
             built.append(source)
             super().__init__(source)
 
-    monkeypatch.setattr(floors, "OccupancyGrid", Counted)
+    monkeypatch.setattr(free_floor, "OccupancyGrid", Counted)
     rng = random.Random(1)
     maps = [_map(rng, None) for _ in range(20)] + [_map(rng, "1") for _ in range(20)]
     folded = _fold([*maps, envelope(0, None, None)])

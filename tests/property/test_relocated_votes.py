@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, PlaceOrdinal
+from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.relations import LocatedIn
+from projections.fold.standing import Standing
 
 STEPS = st.lists(
     st.tuples(
@@ -39,10 +41,10 @@ class Recount:
 def test_votes_are_void_when_an_object_stands_elsewhere(
     steps: list[tuple[str, int, int, int | None]], reload_at: int
 ) -> None:
-    located, recount = LocatedIn(), Recount()
+    located, recount = LocatedIn(Standing(lambda _: None, PlaceSurvivors())), Recount()
     for number, (kind, a, b, place) in enumerate(steps):
         if number == reload_at:
-            fresh = LocatedIn()
+            fresh = LocatedIn(Standing(lambda _: None, PlaceSurvivors()))
             fresh.load(located.dump())
             located = fresh
         keyframe = KeyframeOrdinal(number)

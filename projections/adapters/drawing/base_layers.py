@@ -1,6 +1,7 @@
 """The lower layers of a picture: floor, place regions, drives, walls.
 
-A place's region is all that lies within ``REACH_M`` of one of its keyframes and nearer to it than
+Where walls are known a place's region is its free floor (`projections.map.place_regions`). Else it
+is all that lies within ``REACH_M`` of one of its keyframes and nearer to it than
 to any other place's. It is drawn from a raster of distances to the place's keyframes. Beyond
 ``REACH_M`` a point is in no region, so distances are computed only around each keyframe, and the
 cost of a keyframe does not grow with the sheet. They are exact up to two steps beyond, because the
@@ -17,7 +18,8 @@ from typing import Final
 
 import numpy as np
 from matplotlib.colors import to_rgba
-from matplotlib.patches import Rectangle
+from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
@@ -25,6 +27,7 @@ from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, Occupan
 from projections.adapters import palette
 from projections.adapters.scene import Box, HousePlan, drives, place_spots
 from projections.fold.occupancy import pooled
+from projections.map.place_regions import place_regions
 from projections.map.view import MapView
 
 from .sheet import Extent, Sheet
@@ -109,8 +112,17 @@ def draw_walls(sheet: Sheet, plan: HousePlan) -> None:
 
 def draw_regions(sheet: Sheet, view: MapView) -> None:
     """Each place's region, in its colour."""
+    regions = place_regions(view)
+    for owner, region in regions.items():
+        rings = [ring for rings in region.polygons for ring in rings]
+        colour = palette.place_colour(owner)
+        path = Path.make_compound_path(*(Path(ring, closed=True) for ring in rings))
+        sheet.axes.add_patch(PathPatch(path, facecolor=colour, lw=0, alpha=0.28, zorder=2))
+        sheet.axes.add_patch(PathPatch(path, facecolor="none", edgecolor=colour, lw=1.1, zorder=3))
     raster = Raster(sheet.bounds)
-    patches = {p: raster.distances(spots) for p, spots in place_spots(view).items()}
+    patches = {
+        p: raster.distances(spots) for p, spots in place_spots(view).items() if p not in regions
+    }
     nearest = np.full((len(raster.ys), len(raster.xs)), np.inf)
     for patch in patches.values():
         own = nearest[patch.rows, patch.columns]

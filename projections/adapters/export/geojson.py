@@ -48,7 +48,8 @@ class Origin:
 
 
 def geojson(view: MapView, origin: Origin | None = None) -> str:
-    """A FeatureCollection: each Place as the convex hull of its poses, each Object as a point, each
+    """A FeatureCollection: each Place as its region, where walls are known, or the convex
+    hull of its poses; each Object as a point, each
     pair of adjacent Places as the line between their centroids, each run as its path.
 
     The property ``kind`` of a feature is place, object, adjacency or run.
@@ -83,11 +84,17 @@ def _places(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
             "floor": shown.floor,
             "keyframe_count": place.keyframe_count,
         }
-        if not shown.outline:
-            yield _feature("place", "Point", at(*shown.centroid), **values)
+        if (region := shown.region) is not None:
+            parts = [[[at(*p) for p in ring] for ring in rings] for rings in region.polygons]
+            if len(parts) > 1:
+                yield _feature("place", "MultiPolygon", parts, area_m2=region.area_m2, **values)
+            else:
+                yield _feature("place", "Polygon", parts[0], area_m2=region.area_m2, **values)
+        elif shown.outlines:
+            closed = [[at(*p) for p in ring] for ring in shown.outlines]
+            yield _feature("place", "Polygon", closed, **values)
         else:
-            closed = [at(x, y) for x, y in [*shown.outline, shown.outline[0]]]
-            yield _feature("place", "Polygon", [closed], **values)
+            yield _feature("place", "Point", at(*shown.centroid), **values)
 
 
 def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:

@@ -243,14 +243,25 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
     for shown in places:
         place, z = shown.record, height(view, shown.floor)
         colour = _colour(place.ordinal)
-        corners = [Point3(x=x, y=y, z=z) for x, y in shown.outline]
+        corners = [Point3(x=x, y=y, z=z) for x, y in shown.hull]
         shapes: _Shapes = {
             "metadata": _metadata(
                 place_id=place.place_id, keyframes=place.keyframe_count, name=place.name
             ),
             "texts": [_text(shown.label, shown.centroid, z + 0.3, 0.35)],
         }
-        if corners:
+        if shown.outlines:
+            shapes["lines"] = [
+                LinePrimitive(
+                    type=LinePrimitiveLineType.LineStrip,
+                    pose=_at(0.0, 0.0, 0.0),
+                    thickness=0.05,
+                    points=[Point3(x=x, y=y, z=z) for x, y in ring],
+                    color=colour,
+                )
+                for ring in shown.outlines
+            ]
+        if shown.region is None and corners:
             fan = [i for corner in range(1, len(corners) - 1) for i in (0, corner, corner + 1)]
             shapes["triangles"] = [
                 TriangleListPrimitive(
@@ -260,16 +271,7 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
                     color=_colour(place.ordinal, 0.3),
                 )
             ]
-            shapes["lines"] = [
-                LinePrimitive(
-                    type=LinePrimitiveLineType.LineLoop,
-                    pose=_at(0.0, 0.0, 0.0),
-                    thickness=0.05,
-                    points=corners,
-                    color=colour,
-                )
-            ]
-        else:
+        if not shown.outlines:
             shapes["spheres"] = [
                 SpherePrimitive(
                     pose=_at(*shown.centroid, z),

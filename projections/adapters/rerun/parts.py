@@ -3,7 +3,8 @@
 | path | what |
 |---|---|
 | ``map/walls`` | the outline of an occupancy map's walls |
-| ``map/regions``, ``map/places`` | the hull of each Place's poses, and its centroid with its name |
+| ``map/regions`` | each Place's region, or the hull of its poses |
+| ``map/places`` | the centroid of each, with its name |
 | ``map/objects`` | Objects where they stand, with their class |
 | ``map/ways`` | adjacency, from centroid to centroid |
 | ``map/keyframes``, ``map/path/RUN`` | poses in the colours of their Places, and each run's path |
@@ -124,12 +125,12 @@ def _floor(
     all_ways: Sequence[Way],
 ) -> Iterator[tuple[Path, Part]]:
     places = [p for p in all_places if p.floor == floor]
-    regions = [p for p in places if p.outline]
+    regions = [(p.colour, outline) for p in places for outline in p.outlines]
     yield (
         ("regions",),
         Lines(
-            tuple((*p.outline, p.outline[0]) for p in regions),
-            tuple(p.colour for p in regions),
+            tuple(outline for _, outline in regions),
+            tuple(colour for colour, _ in regions),
             (0.04,) * len(regions),
         ),
     )

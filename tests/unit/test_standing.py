@@ -1,0 +1,107 @@
+"""The place of an Object where walls are known: the one on whose floor it stands."""
+
+import pytest
+
+from projections.fold.deltas import ObjectEstimated, ObjectOrdinal, PlaceOrdinal
+from projections.fold.free_floor import FreeFloor
+from projections.fold.occupancy import OccupancyGrid, Point
+from projections.fold.pair_groups import PlaceSurvivors
+from projections.fold.standing import Standing
+from tests.support.maps import drawn_map
+
+WALL = "#" * 40
+ROOM = "#" + "." * 18 + "#" + "." * 19 + "#"
+DOOR = "#" + "." * 38 + "#"
+TWO_ROOMS = "\n".join([WALL, *[ROOM] * 8, *[DOOR] * 4, *[ROOM] * 8, WALL])
+"""Two rooms of 3.8 by 4 m, of cells of 0.2 m, and a door of 0.8 m in the wall at x = 3.9."""
+LEFT, RIGHT, CUP = PlaceOrdinal(0), PlaceOrdinal(1), ObjectOrdinal(0)
+IN_LEFT, IN_RIGHT = (2_000_000, 2_000_000), (6_000_000, 2_000_000)
+
+
+@pytest.fixture
+def survivors() -> PlaceSurvivors:
+    return PlaceSurvivors()
+
+
+@pytest.fixture
+def standing(survivors: PlaceSurvivors) -> Standing:
+    """A robot was in both rooms."""
+    ground = FreeFloor(OccupancyGrid(drawn_map(TWO_ROOMS, 0.2)))
+    reducer = Standing(lambda at: (0, ground, at), survivors)
+    reducer.pose_placed(*IN_LEFT, LEFT)
+    reducer.pose_placed(*IN_RIGHT, RIGHT)
+    return reducer
+
+
+def see(standing: Standing, x_m: float, y_m: float, seen_from: Point, error_m: float = 0.1) -> None:
+    variance = round(error_m * 1e6) ** 2
+    at = round(x_m * 1e6), round(y_m * 1e6)
+    standing.object_estimated(ObjectEstimated(0, CUP, *at, variance, 0, variance, 1), seen_from)
+    standing.decide()
+
+
+def test_an_object_is_in_the_room_that_it_stands_in_wherever_it_was_seen_from(
+    standing: Standing,
+) -> None:
+    see(standing, 6.5, 2.0, IN_LEFT)
+    assert standing.place_of(CUP) == RIGHT
+
+
+def test_a_picture_on_a_wall_is_on_the_side_that_it_was_seen_from(standing: Standing) -> None:
+    see(standing, 3.95, 3.5, IN_LEFT)
+    assert standing.place_of(CUP) == LEFT
+
+
+def test_an_estimate_just_behind_a_wall_is_in_front_of_it(standing: Standing) -> None:
+    see(standing, 4.15, 3.5, (2_000_000, 3_500_000))
+    assert standing.place_of(CUP) == LEFT
+
+
+def test_an_object_changes_place_only_when_it_surely_stands_elsewhere(standing: Standing) -> None:
+    see(standing, 3.0, 2.0, IN_LEFT)
+    see(standing, 4.1, 2.0, IN_LEFT, error_m=0.5)
+    assert standing.place_of(CUP) == LEFT, "the point one error to the left is in the left room"
+    see(standing, 4.7, 2.0, IN_LEFT, error_m=0.1)
+    assert standing.place_of(CUP) == RIGHT
+
+
+def test_an_object_outside_the_map_stays_where_it_was(standing: Standing) -> None:
+    see(standing, 3.0, 2.0, IN_LEFT)
+    see(standing, 30.0, 20.0, (29_000_000, 20_000_000))
+    assert standing.place_of(CUP) == LEFT
+
+
+def test_a_room_that_no_robot_was_in_has_no_objects_until_one_comes(
+    survivors: PlaceSurvivors,
+) -> None:
+    ground = FreeFloor(OccupancyGrid(drawn_map(TWO_ROOMS, 0.2)))
+    standing = Standing(lambda at: (0, ground, at), survivors)
+    standing.pose_placed(*IN_LEFT, LEFT)
+    see(standing, 6.5, 2.0, IN_LEFT)
+    assert standing.place_of(CUP) is None
+    standing.pose_placed(*IN_RIGHT, RIGHT)
+    assert standing.decide() == [CUP]
+    assert standing.place_of(CUP) == RIGHT
+
+
+def test_a_hall_of_two_places_is_parted_where_their_poses_are_equally_near(
+    survivors: PlaceSurvivors,
+) -> None:
+    hall = "\n".join(["#" * 42, *["#" + "." * 40 + "#"] * 10, "#" * 42])
+    ground = FreeFloor(OccupancyGrid(drawn_map(hall, 0.2)))
+    standing = Standing(lambda at: (0, ground, at), survivors)
+    standing.pose_placed(1_100_000, 1_100_000, LEFT)
+    standing.pose_placed(7_100_000, 1_100_000, RIGHT)
+    see(standing, 3.9, 1.1, (1_100_000, 1_100_000))
+    assert standing.place_of(CUP) == LEFT
+    see(standing, 4.6, 1.1, (1_100_000, 1_100_000))
+    assert standing.place_of(CUP) == RIGHT
+
+
+def test_objects_of_an_absorbed_place_are_in_its_survivor(
+    standing: Standing, survivors: PlaceSurvivors
+) -> None:
+    see(standing, 6.5, 2.0, IN_RIGHT)
+    survivors.merge(LEFT, (RIGHT,))
+    assert list(standing.place_absorbed(LEFT, RIGHT)) == [CUP]
+    assert standing.place_of(CUP) == LEFT
