@@ -38,6 +38,8 @@ from .model import (
 MAX_REASON = 2_000
 MAX_NAMED = 100_000
 """Bound of the keyframes or det_ids in one command."""
+MAX_LABELS = 10_000
+"""Bound of the labels in one command."""
 MAX_YAW_RAD = 10_000.0
 """Bound of a corrected yaw and of a turn: a larger one is no angle but a mistake."""
 _MOST_SHOWN = 80
@@ -232,6 +234,25 @@ class CorrectPoses(_Command):
         return self
 
 
+class Relabel(_Command):
+    """Names of classes: a detection that was recorded with the first text of a pair as its class
+    has the second one in the map."""
+
+    kind: Literal["relabel"] = "relabel"
+    labels: Annotated[
+        tuple[tuple[Text, Text], ...], Field(min_length=1, max_length=MAX_LABELS), FailFast()
+    ]
+
+    @model_validator(mode="after")
+    def _check_once(self) -> "Relabel":
+        seen: set[str] = set()
+        for label, _ in self.labels:
+            if label in seen:
+                raise ValueError(f"label {label!r} is named twice")
+            seen.add(label)
+        return self
+
+
 class UseSettings(_Command):
     """The map's settings from here on; ``settings`` as `projections.fold.settings` reads them."""
 
@@ -272,6 +293,7 @@ Command: TypeAlias = (
     | ForgetRun
     | ForgetKeyframes
     | CorrectPoses
+    | Relabel
     | UseSettings
     | Reembed
     | Undo

@@ -22,6 +22,7 @@ from eventsrc.envelope.commands import (
     KeepApart,
     NamePlace,
     Reembed,
+    Relabel,
     SameObject,
     Undo,
     UndoMerge,
@@ -280,6 +281,9 @@ def what(command: Command) -> str:
             return f"{command.run_id}:{command.first}..{command.last}"
         case CorrectPoses():
             return f"{command.run_id}: {_poses(command)}"
+        case Relabel():
+            (label, name), *others = command.labels
+            return f"{label} is {name}" + (f" and {len(others):,} more" if others else "")
         case UseSettings():
             plain, given = _default_settings(), settings_by_name(command.settings)
             changed = {name: value for name, value in given.items() if plain.get(name) != value}

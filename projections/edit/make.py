@@ -7,7 +7,7 @@ contradicts it, or when the map would not change.
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ValidationError
@@ -25,6 +25,7 @@ from eventsrc.envelope.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Relabel,
     SameObject,
     Undo,
     UndoMerge,
@@ -222,6 +223,30 @@ def keyframes_of(current: MapToEdit, run_id: str) -> str:
     """``it has 912 keyframes, 1 to 912``."""
     ids = [k.keyframe_id for k in current.run(run_id)]
     return f"it has {counted(len(ids), 'keyframe')}, {min(ids)} to {max(ids)}"
+
+
+def labels_of(assignments: Sequence[str]) -> dict[str, str]:
+    """The names by label of texts ``17=chair``. Raises MisuseError."""
+    labels: dict[str, str] = {}
+    for text in assignments:
+        label, sign, name = text.partition("=")
+        if not (label and sign and name):
+            raise MisuseError(f"{text!r} gives no name to a label; write it as 17=chair")
+        if labels.setdefault(label, name) != name:
+            raise MisuseError(f"label {label!r} is given two names; give one")
+    return labels
+
+
+def relabel(current: MapToEdit, stamp: Stamp, labels: Mapping[str, str]) -> Relabel:
+    """The command that names the classes of recorded labels."""
+    named = current.corrections.labels
+    if all(named.get(label, label) == name for label, name in labels.items()):
+        raise EditRefused("these labels have these names already")
+    classes = {each.class_name for each in current.view.observations}
+    if not any(named.get(label, label) in classes for label in labels):
+        there = [label for label in named if named[label] in classes]
+        raise NoSuchThing("label", next(iter(labels)), dict.fromkeys([*sorted(classes), *there]))
+    return build(Relabel, stamp, labels=tuple(labels.items()))
 
 
 def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> UseSettings:

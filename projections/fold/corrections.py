@@ -9,7 +9,8 @@ had always been known, but only from the offset where it was recorded.
     one is kept apart from them all. A ``keep-apart`` or ``join`` that contradicts later ones does
     not count. So too for ``different-objects`` and ``same-object`` of det_ids.
 3.  Pose corrections of a keyframe apply in the order of the commands.
-4.  Of two names of one place, and of two ``use-settings``, the later one counts.
+4.  Of two names of one place or of one recorded label, and of two ``use-settings``, the later one
+    counts.
 
 `Corrections` has a fingerprint, which with that of the settings is part of a map's identity.
 """
@@ -36,6 +37,7 @@ from eventsrc.envelope.commands import (
     KeepApart,
     NamePlace,
     Reembed,
+    Relabel,
     SameObject,
     Undo,
     UndoMerge,
@@ -91,6 +93,8 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     names: tuple[PlaceName, ...] = ()
     settings: Settings | None = None
     reembedded: tuple[Reembed, ...] = ()
+    labels: dict[str, str] = {}
+    """Names of classes by recorded label."""
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal for equal corrections; empty if there are none that change
@@ -153,6 +157,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
             and self.joined == other.joined
             and self.different == other.different
             and self.same == other.same
+            and self.labels == other.labels
         )
 
     def is_forgotten(self, run_id: RunId, keyframe_id: KeyframeId) -> bool:
@@ -206,7 +211,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     def _canonical(self) -> list[object]:
         # In the order of the commands, for two anchors may come to be in one place.
         newest = {name.anchor: name for name in self.names}
-        return [
+        rows: list[object] = [
             sorted(self.forgotten_runs),
             sorted(self.forgotten_ranges.items()),
             sorted(self.dropped),
@@ -217,6 +222,8 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
             sorted(self.same),
             [(n.anchor, n.name) for n in self.names if newest[n.anchor] is n],
         ]
+        renamed = sorted((label, name) for label, name in self.labels.items() if label != name)
+        return [*rows, renamed] if renamed else rows  # as it was before there were labels
 
 
 NO_CORRECTIONS = Corrections()
@@ -271,6 +278,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     names: list[PlaceName] = []
     document: Mapping[str, object] | None = None
     reembedded: list[Reembed] = []
+    labels: dict[str, str] = {}
     for offset, command in in_force:
         match command:
             case NamePlace():
@@ -290,6 +298,8 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
                 ranges.setdefault(command.run_id, []).append((command.first, command.last))
             case CorrectPoses():
                 poses.setdefault(command.run_id, []).append(PoseCorrection.of(command))
+            case Relabel():
+                labels.update(command.labels)
             case UseSettings():
                 document = command.settings
             case Reembed():
@@ -311,6 +321,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         names=tuple(names),
         settings=None if document is None else Settings.from_document(document),
         reembedded=tuple(reembedded),
+        labels=labels,
     )
 
 

@@ -1,14 +1,15 @@
-"""Events as the map has them, with keyframes and detections left out, poses corrected and vectors
-added; and the map's embedding space, which decides which vectors are compared.
+"""Events as the map has them, with keyframes and detections left out, poses corrected, classes
+named and vectors added; and the map's embedding space, which decides which vectors are compared.
 
 An event is corrected before it is folded, so the map is that of a log with the corrected events:
-without forgotten keyframes, without dropped detections, with the corrected poses written in. A
+without forgotten keyframes, without dropped detections, with the corrected poses and the names of
+classes written in. A
 detection's position was computed from the recorded pose, so it moves and turns with that pose; in a
 keyframe without a pose it is left out.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,7 +41,8 @@ class EventEdits:
 
     def __init__(self, corrections: Corrections) -> None:
         c = self._corrections = corrections
-        self.any = bool(c.forgotten_runs or c.forgotten_ranges or c.dropped or c.poses)
+        changing = c.forgotten_runs, c.forgotten_ranges, c.dropped, c.poses, c.labels
+        self.any = any(map(bool, changing))
         """Whether any event can be changed."""
         self.expects = any(poses.are_many for poses in c.poses.values())
         """Whether `expect` saves time."""
@@ -85,7 +87,19 @@ class EventEdits:
             expected = self._expected
             pose = expected[offset] if offset in expected else corrections.pose(envelope)
             accepted = _with_pose(corrections, offset, accepted, pose)
+        if corrections.labels:
+            accepted = relabelled(accepted, corrections.labels)
         return EditedEvent(accepted, units, gone)
+
+
+def relabelled(accepted: Accepted, labels: Mapping[str, str]) -> Accepted:
+    """The envelope with the names of ``labels`` as the classes of its detections."""
+    detections = accepted.envelope.detections
+    if all(detection.class_name not in labels for detection in detections):
+        return accepted
+    named = (replace(d, class_name=labels.get(d.class_name, d.class_name)) for d in detections)
+    envelope = replace(accepted.envelope, detections=tuple(named))
+    return Accepted(envelope, accepted.det_ids, accepted.vectors)
 
 
 def _with_pose(

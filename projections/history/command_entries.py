@@ -15,6 +15,7 @@ from eventsrc.envelope.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Relabel,
     SameObject,
     UndoMerge,
 )
@@ -157,8 +158,10 @@ def _both(anchors: Sequence[Anchor]) -> str:
     return " and ".join(f"{anchor.run_id}:{anchor.keyframe_id}" for anchor in anchors)
 
 
-def object_commands(maker: EntryMaker, history: History, det_ids: Iterable[str]) -> list[Entry]:
-    """Commands that fuse or keep apart detections of an object."""
+def object_commands(
+    maker: EntryMaker, history: History, det_ids: Iterable[str], class_name: str
+) -> list[Entry]:
+    """Commands that fuse or keep apart detections of an object, or gave its class the name."""
     own = set(det_ids)
     entries = []
     for recorded in history.corrections.in_force:
@@ -166,6 +169,12 @@ def object_commands(maker: EntryMaker, history: History, det_ids: Iterable[str])
         if isinstance(command, SameObject | DifferentObjects) and own & set(command.det_ids):
             word = "fused" if isinstance(command, SameObject) else "kept apart"
             entries.append(maker.entry(recorded, f"{word} {' and '.join(command.det_ids)}"))
+        elif isinstance(command, Relabel):
+            labels = history.corrections.labels
+            given = [a for a, b in command.labels if b == class_name == labels[a] != a]
+            if given:
+                text = f"label {' and '.join(given)} called {class_name}"
+                entries.append(maker.entry(recorded, text))
     return entries
 
 

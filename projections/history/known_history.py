@@ -166,7 +166,9 @@ class KnownHistory:
         if found.kind == "object":
             seen = self._whole_view(history).observations.__getitem__
             explained = explain_object(history, seen, history.objects[found.ordinal], last)
-            commands = object_commands(self._entries, history, explained.facts["det_ids"])
+            commands = object_commands(
+                self._entries, history, explained.facts["det_ids"], explained.facts["class_name"]
+            )
             return with_entries(explained, commands)
         place = history.places[found.ordinal]
         commands = place_commands(self._entries, history, place, last)

@@ -83,6 +83,7 @@ KINDS: Sequence[tuple[str, ...]] = [
     ("forget-keyframes", "run-a", "2..4"),
     ("correct-poses", "run-b", "--dx", "-0.5", "--dyaw", "0.1", "--from", "1"),
     ("use-settings", "--set", "min_samples=6"),
+    ("relabel", "cup=mug"),
 ]
 
 

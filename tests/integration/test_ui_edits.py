@@ -73,6 +73,7 @@ def test_every_kind_says_what_the_command_says(
         ("drop-detection", det_id, objects[1]["det_ids"][0]),
         ("forget-run", "run-b"),
         ("forget-keyframes", "run-a", "3..9"),
+        ("relabel", "cup=mug", "17=chair"),
         ("undo", "nothing"),
         ("undo-merge", "9999"),
     ]

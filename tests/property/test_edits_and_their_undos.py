@@ -40,6 +40,14 @@ EDITS: st.SearchStrategy[tuple[Callable[..., Command], tuple[Any, ...]]] = st.on
     st.tuples(st.just(by.different_objects), st.tuples(OBJECTS, OBJECTS)),
     st.tuples(st.just(by.drop_object), st.tuples(OBJECTS)),
     st.tuples(st.just(by.drop_detection), st.tuples(st.lists(OBJECTS, min_size=1, max_size=2))),
+    st.tuples(
+        st.just(by.relabel),
+        st.tuples(
+            st.dictionaries(
+                st.sampled_from(["cup", "lamp", "17"]), st.sampled_from(["cup", "mug"]), min_size=1
+            )
+        ),
+    ),
     st.tuples(st.just(by.forget_run), st.tuples(st.sampled_from(["run-a", "run-b"]))),
     st.tuples(
         st.just(by.forget_keyframes),

@@ -18,6 +18,7 @@ from eventsrc.envelope.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Relabel,
     RigidTransform,
     SameObject,
     Undo,
@@ -54,7 +55,7 @@ def command(rng: random.Random, number: int, documents: list[dict[str, Any]]) ->
         for i, d in enumerate(e["detections"])
     ] or ["none"]
     run, k = keyframe()
-    if (kind := rng.randrange(14)) == 0:
+    if (kind := rng.randrange(15)) == 0:
         return ForgetRun(**head, run_id=run)
     if kind == 1:
         return ForgetKeyframes(**head, run_id=run, first=k, last=k + rng.randrange(5))
@@ -77,6 +78,10 @@ def command(rng: random.Random, number: int, documents: list[dict[str, Any]]) ->
         return KeepApart(**head, places=anchors(2))
     if kind == 10:
         return Join(**head, places=anchors(2))
+    if kind == 14:
+        classes = sorted({d["class"] for e in documents for d in e["detections"]}) or ["cup"]
+        label, name = rng.choice(classes), rng.choice([*classes, "other"])
+        return Relabel(**head, labels=((label, name), ("17", "other")))
     pair = rng.choice(det_ids), rng.choice(det_ids)
     return (SameObject if kind < 13 else DifferentObjects)(**head, det_ids=pair)
 

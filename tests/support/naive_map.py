@@ -282,6 +282,8 @@ def corrected(document: dict[str, Any], corrections: Corrections) -> dict[str, A
         for index, detection in enumerate(document["detections"])
     ]
     detections = [d for d in detections if d["det_id"] not in corrections.dropped]
+    labels = corrections.labels
+    detections = [{**d, "class": labels.get(d["class"], d["class"])} for d in detections]
     written = dict(zip(("map_x", "map_y", "map_yaw"), pose, strict=True))
     return {**document, **written, "detections": detections}
 

@@ -22,6 +22,7 @@ from eventsrc.envelope.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Relabel,
     RigidTransform,
     SameObject,
     Undo,
@@ -109,7 +110,7 @@ def write_mixed_log(path: Path, items: Iterable[dict[str, Any] | Command]) -> Pa
 
 
 PLACES = ("name", "apart", "join", "undo-merge")
-OBJECTS = ("same", "same", "different", "drop", "drop-object")
+OBJECTS = ("same", "same", "different", "drop", "drop-object", "relabel")
 EVENTS = ("forget", "forget-run", "poses", "transform", "settings")
 
 
@@ -163,6 +164,9 @@ def commands(
             return SameObject(det_ids=pair(), **said)
         case "different":
             return DifferentObjects(det_ids=pair(), **said)
+        case "relabel":
+            label, name = (draw(st.sampled_from(sorted(VECTORS))) for _ in range(2))
+            return Relabel(labels=((label, name),), **said)
         case "drop":
             return DropDetection(det_ids=(pair()[0],), **said)
         case "drop-object":

@@ -81,7 +81,7 @@ def read_map_yaml(path: Path, floor: str | None = None) -> OccupancyMap:
 def _described(path: Path) -> _MapFile:
     text = _content(path, MAX_YAML_BYTES)
     try:
-        document = _parse_yaml(text)
+        document = parse_yaml(text)
     except FileFault as fault:
         raise MisuseError(f"{path}: no YAML: {fault}; give a map server's map.yaml") from None
     if not isinstance(document, dict):
@@ -137,7 +137,7 @@ def _content(path: Path, limit: int) -> bytes:
         raise MisuseError(f"{visible(str(path))}: {fault}; check the path") from None
 
 
-def _parse_yaml(text: bytes) -> Any:
+def parse_yaml(text: bytes) -> Any:
     """A YAML document by the rules of `base.user_files`. Aliases are refused, as a short text
     with them can be a document without end. Raises FileFault."""
     try:

@@ -185,6 +185,8 @@ class ExactIndex:
         """The nearest observations of each crop, as if the map had none of those ``without``.
         Raises QuestionError for another space."""
         self.check_spaces(crops)
+        if labels := self._view.corrections.labels:
+            crops = [crop.called(labels) for crop in crops]
         given = crops
         if not len(self._ordinals):
             crops = [crop.by_class() for crop in crops]

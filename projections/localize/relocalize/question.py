@@ -9,7 +9,7 @@ the last view add up, and a turn's error moves what lies behind it sideways.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -51,6 +51,11 @@ class QuestionCrop:
     def by_class(self) -> "QuestionCrop":
         """The crop without its embedding, if it has a class."""
         return self if self.class_name is None else replace(self, vector=None)
+
+    def called(self, names: Mapping[str, str]) -> "QuestionCrop":
+        """The crop with the map's name of its class, where a detector has its own."""
+        name = names.get(self.class_name or "")
+        return self if name is None else replace(self, class_name=name)
 
     @property
     def sort_key(self) -> tuple[bytes, Box, str, str]:

@@ -11,8 +11,8 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
-from eventsrc.base.user_files import read_label_file
 from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.label_files import read_labels
 from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
@@ -34,7 +34,7 @@ def ros_option(panel: str, name: str, metavar: str, text: str) -> typer.models.O
 
 def labels_option(panel: str) -> typer.models.OptionInfo:
     """``--labels``."""
-    text = "Names of numbered classes, one a line; the first is that of class 0."
+    text = "Names of numbered classes: JSON, YAML, or one a line, the first that of class 0."
     return ros_option(panel, "--labels", "FILE", text)
 
 
@@ -145,7 +145,7 @@ class BagChoice:
             self.base_frame,
             check_run_id(self.run_id),
             self.embedding_model,
-            labels_by_number(self.labels),
+            {} if self.labels is None else read_labels(self.labels),
             self.heights,
             max_gap_ns(self.max_gap),
         )
@@ -166,19 +166,6 @@ def max_gap_ns(seconds: float) -> int:
     if not (math.isfinite(seconds) and 0.0 < seconds <= MAX_GAP_S):
         raise MisuseError(f"--max-gap {seconds:g}: give seconds above 0, up to {MAX_GAP_S:g}")
     return round(seconds * _NS)
-
-
-def labels_by_number(path: Path | None) -> dict[str, str]:
-    """Class names by number, of ``--labels``. Empty lines name nothing."""
-    if path is None:
-        return {}
-    names = read_label_file(path)
-    if not all(isinstance(name, str) for name in names):
-        raise MisuseError(f"--labels {path}: not a list of names; write one a line")
-    labels = {str(number): name for number, name in enumerate(names) if name}
-    if not labels:
-        raise MisuseError(f"--labels {path}: names no class; write one a line")
-    return labels
 
 
 def bag_lines(report: BagReport) -> Iterator[str]:

@@ -14,6 +14,7 @@ from eventsrc.base.text import counted, visible
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.importers.label_files import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport
@@ -24,7 +25,6 @@ from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from .bag_text import (
     check_run_id,
     heights_option,
-    labels_by_number,
     labels_option,
     max_gap_ns,
     max_gap_option,
@@ -157,7 +157,8 @@ def recording_of(
     )
     run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
     by_transforms = choice.pose == TF_POSE
-    labels, gap_ns = labels_by_number(choice.labels), max_gap_ns(choice.max_gap)
+    labels = {} if choice.labels is None else read_labels(choice.labels)
+    gap_ns = max_gap_ns(choice.max_gap)
     streams = []
     for topic in detections:
         run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")

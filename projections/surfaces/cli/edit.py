@@ -14,6 +14,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import KeyframeId
 from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.log import LogReader
+from eventsrc.record.importers.label_files import read_labels
 from projections.edit import make
 from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
 from projections.edit.current import MapToEdit
@@ -219,6 +220,34 @@ def _correct_poses(
 
 def _keyframe_id(number: int | None) -> KeyframeId | None:
     return None if number is None else KeyframeId(number)
+
+
+@edit.command("relabel")
+def _relabel(
+    *,
+    named: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="LABEL=NAME", help="A recorded label and its name: 17=chair."),
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(
+            "--labels",
+            metavar="FILE",
+            help="Names by label: JSON, YAML, or a name in each line, the first that of 0.",
+        ),
+    ] = None,
+    options: EditOptions,
+) -> None:
+    """Give classes names, where a detector recorded numbers or words of its own.
+
+    A label is what the log has, whatever it was called since.
+    """
+    labels = {} if file is None else read_labels(file)
+    labels |= make.labels_of(named or ())
+    if not labels:
+        raise MisuseError("give LABEL=NAME or --labels FILE")
+    options.record(lambda current, stamp: make.relabel(current, stamp, labels))
 
 
 @edit.command("use-settings")

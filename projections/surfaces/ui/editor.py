@@ -20,7 +20,7 @@ from projections.edit import make
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.current import MapToEdit
 from projections.edit.effect import cache_effect, edits_document, edits_text, effects_of
-from projections.edit.make import Stamp
+from projections.edit.make import Stamp, labels_of
 from projections.edit.record import (
     Made,
     MakeCommand,
@@ -104,6 +104,11 @@ def _use_settings(*assignments: str) -> MakeCommand:
     return command
 
 
+def _relabel(*assignments: str) -> MakeCommand:
+    labels = labels_of(assignments)
+    return lambda current, stamp: make.relabel(current, stamp, labels)
+
+
 KINDS: Final = {
     "name-place": _Kind("place name", _of(make.name_place)),
     "keep-apart": _Kind("place place", _of(make.keep_apart)),
@@ -116,6 +121,7 @@ KINDS: Final = {
     "forget-run": _Kind("run", _of(make.forget_run)),
     "forget-keyframes": _Kind("run a..b", _of(make.forget_keyframes)),
     "correct-poses": _Kind("run dx dy dyaw", _correct_poses),
+    "relabel": _Kind("label=name…", _relabel),
     "use-settings": _Kind("name=value…", _use_settings),
     "undo": _Kind("command_id", _of(make.undo)),
 }
