@@ -47,7 +47,7 @@ def test_the_three_terminals_say_what_the_page_says(
     start: Start, start_code: Start, endpoint: str, tmp_path: Path
 ) -> None:
     log = str(tmp_path / "log")
-    recorder = start("record", log, "--connect", endpoint)
+    recorder = start("record", log, "--preset", "full", "--connect", endpoint)
     recorder.wait_for("recording")
     code = _block("python").replace(DEFAULT_ENDPOINT, endpoint)
     robot = start_code(code.replace("spool.sqlite", str(tmp_path / "spool.sqlite")))

@@ -296,7 +296,8 @@ def test_the_command_says_what_it_took_for_what(mapfold: Commands) -> None:
         ["/detections", "3", "vision_msgs/msg/Detection2DArray:", "keyframes", "of", "run", RUN],
     ]
     assert "  … and 2 more topics that are not used" in lines
-    assert lines[-1].startswith("imported 3 envelopes into log, offsets 0 to 2, 12 messages")
+    assert lines[-1].startswith("imported 3 envelopes into log, offsets 0 to 3, 12 messages")
+    assert lines[-2] == "log: a new log with --preset full, for input of ROS, said at offset 0"
     document = mapfold("import", "other", "drive", "--json").json
     assert document["bags"][0]["streams"]["/detections"]["keyframes"] == 3
     assert document["accepted"] == 3

@@ -31,11 +31,12 @@ def test_rejections_are_printed_with_file_line_and_reason_and_the_rest_counted(
         f"b.jsonl: line {n}" for n in (1, 2, 3)
     ]
     assert said[5] == "… and 5 more rejected"
-    assert said[6].startswith("imported 2 envelopes into L, offsets 0 to 11, 10 rejected; ")
-    assert len(said) == 7
+    assert said[6].startswith("L: a new log of --preset classic; with --preset full places are")
+    assert said[7].startswith("imported 2 envelopes into L, offsets 0 to 11, 10 rejected; ")
+    assert len(said) == 8
     said = mapfold("import", "again", "-", stdin=b"\njunk", code=3).err.splitlines()
     assert said[0].startswith("standard input: line 2: rejected: not JSON")
-    assert len(said) == 2
+    assert len(said) == 3
 
 
 def test_a_byte_order_mark_at_the_start_of_a_file_is_passed_over(mapfold: Commands) -> None:

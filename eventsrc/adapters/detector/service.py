@@ -14,6 +14,9 @@ from urllib.parse import quote
 from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, TransportError
 from eventsrc.base.text import counted
 from eventsrc.base.user_files import written_whole
+from eventsrc.envelope.commands import UseSettings
+from eventsrc.envelope.model import stamp_ns
+from eventsrc.record.importers.json_lines import command_record
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Session
 
@@ -42,11 +45,13 @@ class Delivered:
 
 class FileOutput:
     """Envelopes as JSON lines in a new file, which gets its name when it is closed, or when a write
-    fails: then it has the whole lines before. Raises MisuseError if the file exists already or
-    cannot be made, MapfoldError where writing fails."""
+    fails: then it has the whole lines before. A log that it is imported into begins with
+    ``settings``. Raises MisuseError if the file exists already or cannot be made, MapfoldError
+    where writing fails."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, settings: UseSettings | None = None) -> None:
         self.delivered = Delivered()
+        self._settings = settings
         if path.is_file():
             raise MisuseError(f"--out {path}: there is such a file; remove it, or choose another")
         self._path, self._stack = path, ExitStack()
@@ -56,6 +61,10 @@ class FileOutput:
         """Write its envelope."""
         whole = self._file.tell() if self._file.seekable() else None
         try:
+            if self._settings is not None:
+                first = command_record(self._settings, stamp_ns(keyframe.envelope["timestamp"]))
+                self._file.write(_encode(first) + b"\n")
+                self._settings = None
             self._file.write(_encode(keyframe.envelope) + b"\n")
         except MapfoldError as error:
             if whole is not None:  # keyframes of a camera cannot be had a second time

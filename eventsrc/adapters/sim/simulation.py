@@ -24,7 +24,9 @@ from eventsrc.base.errors import MisuseError, TransportError
 from eventsrc.base.progress import reported
 from eventsrc.base.text import advised
 from eventsrc.base.user_files import write_files
-from eventsrc.envelope.model import KeyframeId, RunId, default_det_id
+from eventsrc.envelope.commands import UseSettings
+from eventsrc.envelope.model import KeyframeId, RunId, default_det_id, stamp_ns
+from eventsrc.record.importers.json_lines import command_record
 from eventsrc.record.transport.session import Publisher, Session
 
 from .detector import detect, visible_objects
@@ -235,15 +237,19 @@ def paced(
         yield item
 
 
-def write_run(run: SimulatedRun, out: Path) -> Path:
+def write_run(run: SimulatedRun, out: Path, settings: UseSettings | None = None) -> Path:
     """Write ``run`` as JSON lines to ``out`` (gzip if it ends in .gz); returns the truth's path.
+    A log that ``out`` is imported into begins with ``settings``.
 
     A file that is there stays as it is, since it may be a recorded run: it must hold the same bytes
     already. Raises MisuseError where it holds others or no file can be made, MapfoldError where
     writing it fails.
     """
     truth = truth_path(out)
-    contents = {out: _lines(out, run.envelopes), truth: _lines(truth, run.truth)}
+    lines = list(run.envelopes)
+    if settings is not None:
+        lines.insert(0, command_record(settings, stamp_ns(run.envelopes[0]["timestamp"])))
+    contents = {out: _lines(out, lines), truth: _lines(truth, run.truth)}
     missing = {path: text for path, text in contents.items() if not _holds(path, text)}
     write_files(missing)
     return truth

@@ -23,11 +23,12 @@ import zlib
 from collections.abc import Iterator
 from decimal import Decimal, InvalidOperation
 from json.decoder import JSONDecodeError
-from typing import BinaryIO, TypeGuard
+from typing import Any, BinaryIO, TypeGuard
 
 from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.envelope.commands import Command
 from eventsrc.envelope.ingest import check_cost
-from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
+from eventsrc.envelope.system_events import COMMAND_KEY, MAX_KEPT_BYTES, Excerpt
 
 from .sources import ImportedMessage, Source
 
@@ -36,6 +37,14 @@ _SPACE = " \t\r\n"
 _PAYLOAD_FIELDS = ("payload", "detections")
 _SHOWN_FIELDS = frozenset({"offset", "logged_ns", "stamp_ns", "key", "payload"})
 _MAX_NS = 2**63
+
+
+def command_record(command: Command, stamp_ns: int) -> dict[str, Any]:
+    """A command as a line of ``mapfold log cat --json`` has it: the first line of a file that says
+    the settings of the log that it is imported into."""
+    payload = command.model_dump(mode="json", exclude_none=True)
+    times = {"logged_ns": stamp_ns, "stamp_ns": stamp_ns}
+    return {"offset": 0, **times, "key": COMMAND_KEY, "payload": payload}
 
 
 def read_line(line: bytes) -> ImportedMessage:

@@ -4,36 +4,44 @@ An import only appends. A file that is imported twice is in the log twice; the f
 duplicate keyframes, so the map is the same.
 """
 
-import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import BinaryIO
+from typing import NamedTuple
 
-from eventsrc.base.errors import MisuseError
+from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.envelope.commands import (
+    Command,
+    InvalidCommand,
+    UseSettings,
+    encode_command,
+    parse_command,
+)
 from eventsrc.envelope.forms import BARE_LIST_VERSION
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
 from eventsrc.envelope.model import Offset, RunId, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
-from eventsrc.envelope.system_events import EMBEDDINGS_KEY, LOSS_KEY, MAP_KEY, REJECTED_KEY, ROS_KEY
+from eventsrc.envelope.system_events import (
+    COMMAND_KEY,
+    EMBEDDINGS_KEY,
+    LOSS_KEY,
+    MAP_KEY,
+    REJECTED_KEY,
+    ROS_KEY,
+)
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
-from eventsrc.log.format import list_segments
 from eventsrc.record.append import NewMap, check_payloads, checked_event, rejected_event
 
-from .bag_files import MCAP_MAGIC, METADATA, START_BYTES, is_bag, is_file_of_a_bag
 from .bag_streams import BagOptions
-from .json_lines import JsonLines
+from .opening import open_source
 from .ros_bags import BagReport, RosBag
 from .sources import (
     NO_ENVELOPES,
     NOT_CHOSEN,
     ImportedMessage,
     LogTimes,
-    McapFile,
-    OtherLog,
     PassedOver,
     Source,
     TopicChoice,
@@ -41,7 +49,6 @@ from .sources import (
 )
 
 DEFAULT_KEY = "tb/detections"
-STDIN = "-"
 IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
 """Larger commits than a recorder's: the source can be read again after a crash."""
 
@@ -49,9 +56,25 @@ ALL_TOPICS = TopicChoice()
 _PROGRESS_EVERY = 64
 _DEFAULT_BAGS = BagOptions()
 
+SETTINGS_KNOWN = "settings that the log has already"
+SETTINGS_CHOSEN = "other settings than were chosen for the new log"
+
 Progress = Callable[[Source], None]
 OnReject = Callable[[str, str], None]
 """Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
+
+
+class LogSettings(NamedTuple):
+    """The settings that a log says: ``begins`` is the command that a new log begins with, None for
+    one that says nothing yet; ``known`` is the document of settings in force. ``check`` raises
+    MapfoldError for a command that no fold can use."""
+
+    begins: UseSettings | None = None
+    known: Mapping[str, object] | None = None
+    check: Callable[[Command], None] = lambda _: None
+
+
+_NO_SETTINGS = LogSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +107,8 @@ class ImportReport:
     repeated: int | None = None
     """How many accepted envelopes are of keyframes that the log had already and the fold ignores;
     None if no ledger was given."""
+    began_as_source: bool = False
+    """Whether a new log began with the settings that its first source begins with."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -105,24 +130,30 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
+    settings: LogSettings = _NO_SETTINGS,
     topics: TopicChoice = ALL_TOPICS,
     bags: BagOptions = _DEFAULT_BAGS,
     ledger: GapLedger[RunId] | None = None,
 ) -> ImportReport:
-    """Append ``given_map``, if there is one, then every message of ``names`` in order. Messages
-    without a key get ``key``. Without a time of receipt the log time of an envelope is its stamp
-    (`LogTimes`), that of anything else the log time of the message before it.
+    """Append what ``settings`` begins with and ``given_map``, if there are such, then every message
+    of ``names`` in order. Messages without a key get ``key``. Without a time of receipt the log
+    time of an envelope is its stamp (`LogTimes`), that of anything else the log time of the message
+    before it.
 
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
-    envelopes. ``bags`` has the choices for bags of ROS 2. The map is appended when the first
-    message was read. ``ledger`` is the gap ledger of the log, to which new keyframes are added.
+    envelopes. ``bags`` has the choices for bags of ROS 2. Settings and map are appended when the
+    first message was read. A new log to which ``settings`` gives none begins with those that its
+    first source begins with. ``ledger`` is the gap ledger of the log, to which new keyframes are
+    added.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
     refused = on_reject or (lambda _place, _reason: None)
-    run = _Import(writer, key, refused, topics, ledger, given_map)
+    given = [] if settings.begins is None else [(COMMAND_KEY, encode_command(settings.begins))]
+    given += [] if given_map is None else [(MAP_KEY, given_map.encode())]
+    run = _Import(writer, key, refused, topics, ledger, settings, given)
     try:
         with ExitStack() as files:
             for name in names:
@@ -141,7 +172,7 @@ def import_files(
                 run.skipped += source.skipped
                 if isinstance(source, RosBag) and source.report is not None:
                     run.bags.append(source.report)
-        run.append_given_map(None)
+        run.append_given(None)
     except KeyboardInterrupt:
         raise ImportInterrupted(run.report(), run.place) from None
     return run.report()
@@ -156,7 +187,9 @@ class _Import:
     on_reject: OnReject
     topics: TopicChoice
     ledger: GapLedger[RunId] | None
-    given_map: OccupancyMap | None
+    settings: LogSettings
+    given: list[tuple[str, bytes]]
+    """Keys and payloads that are appended before the first message."""
     begins: bool = False
     """Whether no message of the source had a time yet. If log times go back there, a new segment
     is begun."""
@@ -166,6 +199,7 @@ class _Import:
     skipped: int = 0
     maps: int = 0
     verbatim: int = 0
+    began_as_source: bool = False
     bags: list[BagReport] = field(default_factory=list)
     passed_over: Counter[tuple[str, str]] = field(default_factory=Counter)
     times: LogTimes = field(default_factory=LogTimes)
@@ -195,24 +229,25 @@ class _Import:
             self._append_system_event(message.key or "", message)
         elif message.key == MAP_KEY:
             self._append_map_event(source, message)
+        elif message.key == COMMAND_KEY and (command := self._settings_of(message)) is not None:
+            self._append_settings(source, message, command)
         else:
             self._append_envelope(source, message)
         self.last = source, source.at
 
-    def append_given_map(self, next_ns: int | None) -> None:
-        """Append the given map, once. ``next_ns`` is the log time of the message after it, which
-        the map gets too unless it is in the future, so that log times do not go back."""
-        if self.given_map is None:
-            return
-        now_ns = self.writer.now_ns()
+    def append_given(self, next_ns: int | None) -> None:
+        """Append what was given, once. ``next_ns`` is the log time of the message after it, which
+        it gets too unless that is in the future, so that log times do not go back."""
+        now_ns = self.writer.now_ns() if self.given else 0
         logged_ns = now_ns if next_ns is None else min(now_ns, next_ns)
-        self.writer.append(MAP_KEY, self.given_map.encode(), logged_ns=logged_ns)
-        self.maps += 1
-        self.given_map = None
+        for key, payload in self.given:
+            self.writer.append(key, payload, logged_ns=logged_ns)
+            self.maps += key == MAP_KEY
+        self.given = []
 
     def _time_of(self, message: ImportedMessage, keyframe: tuple[RunId, int] | None = None) -> int:
-        """The log time of the next message, of which ``keyframe`` is run and stamp. Appends the
-        given map before it."""
+        """The log time of the next message, of which ``keyframe`` is run and stamp. Appends
+        what was given before it."""
         if message.logged_ns is not None:
             logged_ns = self.times.add(message.logged_ns)
         elif keyframe is not None:
@@ -226,7 +261,7 @@ class _Import:
         if message.logged_ns is not None or keyframe is not None:
             self.begins = False
         self.logged_ns = logged_ns
-        self.append_given_map(logged_ns)
+        self.append_given(logged_ns)
         return logged_ns
 
     def _append_map_event(self, source: Source, message: ImportedMessage) -> None:
@@ -238,6 +273,32 @@ class _Import:
         else:
             self._append_system_event(MAP_KEY, message)
             self.maps += 1
+
+    def _settings_of(self, message: ImportedMessage) -> UseSettings | None:
+        """The ``use-settings`` in an event of another log; None for other commands, which name
+        things of their own log, and for settings that no fold can use."""
+        try:
+            command = parse_command(message.payload)
+            self.settings.check(command)
+        except (InvalidCommand, MapfoldError):
+            return None
+        return command if isinstance(command, UseSettings) else None
+
+    def _append_settings(
+        self, source: Source, message: ImportedMessage, command: UseSettings
+    ) -> None:
+        """Begin a new log with the settings of another one, unless some were chosen for it. Reject
+        others than a log has."""
+        if self.writer.next_offset == 0 and self.settings.begins is None:
+            self._append_system_event(COMMAND_KEY, message)
+            self.settings = self.settings._replace(known=command.settings)
+            self.began_as_source = True
+        elif command.settings == self.settings.known:
+            self.passed_over[COMMAND_KEY, SETTINGS_KNOWN] += 1
+        elif self.settings.begins is not None:
+            self.passed_over[COMMAND_KEY, SETTINGS_CHOSEN] += 1
+        else:
+            self._append_envelope(source, message)  # which rejects a key of mapfold's own
 
     def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
         if self._is_for_others(message):
@@ -323,46 +384,5 @@ class _Import:
             tuple(PassedOver(*what, count) for what, count in self.passed_over.items()),
             tuple(self.bags),
             None if self.ledger is None else self.ledger.duplicates - self.repeated_before,
+            self.began_as_source,
         )
-
-
-def check_sources(names: Sequence[str]) -> None:
-    """Raise MisuseError for the first source that cannot be read; call it before a log is
-    created."""
-    for name in names:
-        if name == STDIN:
-            continue
-        path = Path(name)
-        try:
-            path.stat()
-            is_source = not path.is_dir() or is_bag(path) or bool(list_segments(path))
-        except FileNotFoundError:
-            raise MisuseError(f"{name}: no such file; check the path") from None
-        except OSError as error:
-            raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
-        if not is_source:
-            raise MisuseError(f"{name}: neither a bag of ROS 2 nor a log; check the path")
-
-
-def open_source(name: str, files: ExitStack, bags: BagOptions = _DEFAULT_BAGS) -> Source:
-    """Open the source ``name``: a folder is a bag of ROS 2 or a log, ``-`` is standard input, a
-    file is JSON lines, MCAP or part of a bag. Raises MisuseError."""
-    if name != STDIN and Path(name).is_dir():
-        return RosBag(Path(name), files, bags) if is_bag(Path(name)) else OtherLog(Path(name))
-    if Path(name).name == METADATA:
-        raise MisuseError(f"{name}: it describes a bag of ROS 2; give its folder")
-    file: BinaryIO
-    try:
-        if name == STDIN:
-            label, file, size = "standard input", sys.stdin.buffer, None
-        else:
-            path, label = Path(name), name
-            file, size = files.enter_context(path.open("rb")), path.stat().st_size
-        start: bytes = file.peek(START_BYTES)  # type: ignore[attr-defined]
-    except OSError as error:
-        raise MisuseError(f"{name}: {error.strerror or error}; check the path") from None
-    if name != STDIN and is_file_of_a_bag(start):
-        return RosBag(Path(name), files, bags)
-    if start.startswith(MCAP_MAGIC):
-        return McapFile(label, file, size)
-    return JsonLines(label, file, size, start)

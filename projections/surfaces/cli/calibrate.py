@@ -21,9 +21,9 @@ from projections.localize.calibrate.report import document, text
 from projections.localize.calibrate.rounds import Calibration, calibrate
 from projections.map.own_events import read_corrections
 
-from .edit_command import keep_effect, recorded_document, recorded_text, user_at_host
+from .edit_command import keep_effect, recorded_document, recorded_text
 from .folded_log import LogSettings
-from .options import JsonOption, ZenohClient
+from .options import JsonOption, ZenohClient, user_at_host
 from .terminal import Bar, display, emit, say
 
 

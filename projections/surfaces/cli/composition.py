@@ -50,6 +50,9 @@ _CARRIED: Final = (
 )
 """The options that are added, in order."""
 _DATABASES: Final = frozenset({"--db", "--vector-db"})
+_SETTINGS: Final = frozenset({"--settings", "--preset", "--set"})
+_MAKES_LOGS: Final = frozenset({"import", "record", "simulate", "detect"})
+"""Commands whose settings are what a new log says, not those of a fold."""
 _ANSWERS_OTHERS: Final = frozenset({"serve", "ui"})
 """Commands whose messages are also sent to other machines, which must not get the databases'
 URLs."""
@@ -287,6 +290,8 @@ def _options_in_force(words: Sequence[str], without: Collection[str]) -> list[st
     known = {option for param in command.params for option in param.opts}
     given = {param.opts[-1]: param.name for param in context.command.params}
     left_out = {*words, *without}
+    if not _MAKES_LOGS.isdisjoint({context.info_name, words[0]}):
+        left_out |= _SETTINGS
     if context.info_name in _ANSWERS_OTHERS:
         left_out |= _DATABASES
     for option in _CARRIED:

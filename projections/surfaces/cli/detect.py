@@ -56,6 +56,7 @@ from .detect_checks import (
     timing_of,
 )
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
+from .new_log import NewLogOptions
 from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
@@ -265,6 +266,7 @@ def detect(
             metavar="FILE", help="Write JSON lines for `import` into a new file; publish nothing."
         ),
     ] = None,
+    new_log: NewLogOptions,
     keep_crops: Annotated[
         bool,
         typer.Option(
@@ -311,6 +313,7 @@ def detect(
     if out is not None and keep_crops:
         raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
     check_key(key, "--key")
+    settings = new_log.for_file(out)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     name = run_id_of(run_id)
     check_installed()
@@ -322,9 +325,7 @@ def detect(
         None if labels is None else read_labels(labels),
         options,
     )
-    preparation = read_preparation(encoder)
-    opened = Encoder(OnnxModel(encoder, wanted, threads), preparation)
-    limits = limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
+    opened = Encoder(OnnxModel(encoder, wanted, threads), read_preparation(encoder))
     zenoh = peer.zenoh
     with stop_on_signals() as stop, ExitStack() as stack:
         session = None
@@ -341,7 +342,7 @@ def detect(
         keyframes = Keyframes(
             finder,
             opened,
-            KeyframeGate(limits),
+            KeyframeGate(limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))),
             live.poses if live is not None and live.poses is not None else given_poses,
             name,
             hfov_deg=hfov,
@@ -350,7 +351,7 @@ def detect(
         )
         output = _output(
             stack,
-            out,
+            None if out is None else FileOutput(out, settings),
             zenoh,
             spool or spool_path(),
             key,
@@ -378,7 +379,7 @@ def detect(
 
 def _output(
     stack: ExitStack,
-    out: Path | None,
+    file: FileOutput | None,
     options: ZenohOptions,
     spool: Path,
     key: str,
@@ -387,8 +388,7 @@ def _output(
     *,
     patient: bool,
 ) -> Output:
-    if out is not None:
-        file = FileOutput(out)
+    if file is not None:
         stack.callback(file.close, 0.0)
         return file
     publisher = stack.enter_context(EnvelopePublisher(options, spool, key))

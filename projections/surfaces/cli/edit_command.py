@@ -1,8 +1,5 @@
 """Common parts of all kinds of `mapfold edit`: options, recording a command, and its report."""
 
-import getpass
-import os
-import socket
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +18,7 @@ from projections.fold.settings import Settings
 from projections.history.rendering import difference_text
 
 from .folded_log import FoldSettings, settings_from
-from .options import JsonOption, ZenohClient
+from .options import JsonOption, ZenohClient, user_at_host
 from .terminal import display, emit, say
 
 _MOST_LINES = 5
@@ -156,12 +153,3 @@ def _say_void(made: Made) -> None:
     """Report commands that have no effect any more."""
     for recorded, why in made.outcome.void:
         say(void_text(recorded, why))
-
-
-def user_at_host() -> str:
-    """``user@host``: who gives a command."""
-    try:
-        name = getpass.getuser()
-    except (OSError, KeyError):  # a user id without a name
-        name = str(os.getuid())
-    return f"{name}@{socket.gethostname()}"

@@ -56,12 +56,18 @@ def known_point(reader: LogReader, text: str | None, end: Offset) -> Offset:
 
 # Settings of the fold
 
+
+def complete_preset() -> list[str]:
+    """What completes ``--preset``."""
+    return list(PRESETS)
+
+
 PresetOption = Annotated[
     str | None,
     typer.Option(
         "--preset",
         metavar="|".join(PRESETS),
-        autocompletion=lambda: list(PRESETS),
+        autocompletion=complete_preset,
         help="Named settings: classic, places by DBSCAN; rooms, places that are rooms; full, rooms"
         " and objects by evidence. --set goes on top.",
     ),

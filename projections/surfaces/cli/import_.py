@@ -15,18 +15,19 @@ from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import fold_and_save_ledger
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.map_yaml import read_map_yaml
+from eventsrc.record.importers.opening import check_sources, is_ros
 from eventsrc.record.importers.run import (
     DEFAULT_KEY,
     IMPORT_FSYNC,
     ImportInterrupted,
     ImportReport,
-    check_sources,
     import_files,
 )
 from eventsrc.record.importers.sources import NOT_CHOSEN, Source, TopicChoice
 from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines
+from .new_log import LogStart, NewLogOptions
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -74,6 +75,7 @@ def import_(
             help="Only topics (keys) that match this, such as 'tb/*'; may be repeated.",
         ),
     ] = None,
+    new_log: NewLogOptions,
     choice: BagChoice,
     json_: JsonOption = False,
 ) -> None:
@@ -100,12 +102,15 @@ def import_(
     topics = TopicChoice.of(topic or ())
     given_map = None if map_ is None else read_map_yaml(map_, floor)
     bags = choice.options()
+    new_log.check()
+    has_ros = any(map(is_ros, names))
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer:
             say_restart(log, writer)
+            start = LogStart.of(log, writer, new_log, is_ros=has_ros)
             ledger = _known_keyframes(log)
-            with FileBars() as bars, ctrl_c_between_steps() as step:
+            with FileBars() as bars, ctrl_c_between_steps() as step, start.said_on_error(writer):
                 report = import_files(
                     writer,
                     names,
@@ -114,6 +119,7 @@ def import_(
                     on_reject=rejects.say,
                     step=step,
                     given_map=given_map,
+                    settings=start.for_import(),
                     topics=topics,
                     bags=bags,
                     ledger=ledger,
@@ -121,10 +127,11 @@ def import_(
     except ImportInterrupted as interrupted:
         rejects.say_rest()
         say(_kept(log, interrupted))
+        start.say_recorded(writer, as_source=interrupted.report.began_as_source)
         raise
     rejects.say_rest()
     if json_:
-        emit({"log": str(log), **_without_bags(report), **restart_as_json(writer)})
+        emit({"log": str(log), **_as_json(report), **restart_as_json(writer)})
     for bag in report.bags:
         for line in bag_lines(bag):
             say(line)
@@ -133,6 +140,7 @@ def import_(
             "no bag of ROS 2 among the files: --detections and the other options for bags are not"
             " used"
         )
+    start.say(as_source=report.began_as_source)
     say(_summary(log, report))
     for line in _passed_over(report):
         say(line)
@@ -150,11 +158,12 @@ def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
         return None
 
 
-def _without_bags(report: ImportReport) -> dict[str, Any]:
-    """The report as JSON; ``bags`` only where there were some."""
+def _as_json(report: ImportReport) -> dict[str, Any]:
+    """The report as JSON; ``bags`` and ``began_as_source`` only where there is something to say."""
     document = asdict(report)
-    if not report.bags:
-        del document["bags"]
+    for name in ("bags", "began_as_source"):
+        if not document[name]:
+            del document[name]
     return document
 
 

@@ -4,6 +4,9 @@ What only some commands need (databases, re-localisation, pictures) is imported 
 function that uses it: the imports of all of them take longer than most commands.
 """
 
+import getpass
+import os
+import socket
 import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -234,3 +237,12 @@ def check_picture(out: Path | None) -> None:
     from projections.adapters.drawing.sheet import check_suffix
 
     check_suffix(out)
+
+
+def user_at_host() -> str:
+    """``user@host``: who gives a command."""
+    try:
+        name = getpass.getuser()
+    except (OSError, KeyError):  # a user id without a name
+        name = str(os.getuid())
+    return f"{name}@{socket.gethostname()}"

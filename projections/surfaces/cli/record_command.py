@@ -33,6 +33,7 @@ from .bridge_options import (
     say_topics,
     warn_of_silence,
 )
+from .new_log import LogStart, NewLogOptions
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
@@ -103,6 +104,7 @@ def record(
             f"{EDIT_PREFIX}/ on this Zenoh network.",
         ),
     ] = False,
+    new_log: NewLogOptions,
     ros2dds: Ros2ddsOption = False,
     choice: BridgeChoice,
     json: JsonOption = False,
@@ -115,6 +117,7 @@ def record(
     """
     if not ros2dds:
         check_unused(choice)
+    new_log.check()
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
         peer.zenoh,
@@ -134,6 +137,7 @@ def record(
         LogWriter(log, fsync=policy, sealing_process=True) as writer,
     ):
         say_restart(log, writer)
+        LogStart.of(log, writer, new_log, is_ros=ros2dds).record(writer)
         ledger = _gap_history(log)
         bridge = open_bridge(choice, writer, ledger) if ros2dds else None
         recorder = Recorder(

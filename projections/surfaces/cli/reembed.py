@@ -20,9 +20,8 @@ from eventsrc.base.user_files import open_file
 from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
 from .detect_checks import device_of
-from .edit_command import user_at_host
 from .folded_log import LogArgument
-from .options import JsonOption
+from .options import JsonOption, user_at_host
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say
 

@@ -20,6 +20,7 @@ from eventsrc.base.text import counted
 from eventsrc.record.transport.config import check_key
 from eventsrc.record.transport.session import ZenohOptions, check_keys, open_session
 
+from .new_log import NewLogOptions
 from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
@@ -78,6 +79,7 @@ def simulate(
             rich_help_panel=_CAMERA,
         ),
     ] = PER_S,
+    new_log: NewLogOptions,
     wait: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
     ] = 30.0,
@@ -94,6 +96,9 @@ def simulate(
     if not run.isprintable() or not 1 <= len(run) <= _MAX_NAME:
         raise MisuseError(f"--run {run!r}: give a name of 1 to {_MAX_NAME} printable characters")
     check_key(key, "--key")
+    settings = new_log.for_file(out)
+    if settings is not None:  # the same file each time
+        settings = settings.model_copy(update={"command_id": f"sim-{seed}-{run}-settings"})
     if camera is not None or zenoh_image is not None:
         if out is not None or (camera is not None and zenoh_image is not None):
             raise MisuseError("--out, --camera and --zenoh-image: give one of them")
@@ -112,7 +117,7 @@ def simulate(
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)
     if out is not None:
-        truth = write_run(simulated, out)
+        truth = write_run(simulated, out, settings)
         say(f"{_summary(document)}: wrote {out}, truth in {truth}")
         document |= {"out": str(out), "truth": str(truth)}
     else:

@@ -168,7 +168,7 @@ def _editor(service: "UiService", client: ZenohClient) -> "Editor":
     """Records commands, through a recorder where one holds the log."""
     from projections.surfaces.ui.editor import Editor
 
-    from .edit_command import user_at_host
+    from .options import user_at_host
 
     return Editor(service.opened, service.log_id, client.session, user_at_host())
 

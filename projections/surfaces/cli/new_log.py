@@ -1,0 +1,203 @@
+"""The settings of a log, said once: when it is made they become its first event.
+
+A log is new as long as it has no events. Who asks for other settings than a log has is told the
+command that changes them.
+"""
+
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError
+from eventsrc.base.text import command_line, visible
+from eventsrc.envelope.commands import UseSettings, encode_command
+from eventsrc.envelope.system_events import COMMAND_KEY
+from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.importers.run import LogSettings
+from projections.fold.corrections import check_settings
+from projections.fold.map_errors import FoldError
+from projections.fold.settings import PRESETS, Settings
+from projections.map.own_events import read_corrections
+
+from .folded_log import NamedSettings, complete_preset
+from .options import user_at_host
+from .terminal import say
+
+ROS_PRESET: Final = "full"
+_ROS_REASON: Final = "the preset of ROS input"
+_TOLD_REASON: Final = "said when the log was made"
+_PANEL: Final = "Settings of a new log"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewLogOptions:
+    """``--preset`` and ``--set`` of commands that make a log."""
+
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            "--preset",
+            metavar="|".join(PRESETS),
+            autocompletion=complete_preset,
+            help="What a new log begins with, and every fold of it uses: classic, places by"
+            " DBSCAN; rooms, places that are rooms; full, rooms and objects by evidence. [default:"
+            f" {ROS_PRESET} for input of ROS, else classic]",
+            rich_help_panel=_PANEL,
+        ),
+    ] = None
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A setting on top, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
+            rich_help_panel=_PANEL,
+        ),
+    ] = None
+
+    @property
+    def assignments(self) -> list[str]:
+        """Settings as NAME=VALUE. Raises SettingsError for a preset that does not exist."""
+        return NamedSettings(preset=self.preset).around(self.set_)
+
+    def check(self) -> None:
+        """Raise SettingsError for settings that no map can have."""
+        Settings().with_assignments(self.assignments)
+
+    def command(self) -> UseSettings | None:
+        """The command that a new log begins with; None where nothing is chosen. Raises
+        SettingsError."""
+        return _command(self.assignments, _TOLD_REASON) if self.assignments else None
+
+    def for_file(self, out: Path | None) -> UseSettings | None:
+        """`command`, as the first line of a file of JSON lines. Raises MisuseError without one."""
+        command = self.command()
+        if command is not None and out is None:
+            raise MisuseError(
+                f"{self.words()[0]} goes into a file of --out; where a recorder makes the log, give"
+                f" it to `{command_line('record', 'LOG')}`"
+            )
+        return command
+
+    def words(self) -> list[str]:
+        """The options as they were typed."""
+        preset = [] if self.preset is None else ["--preset", self.preset]
+        return [*preset, *(word for text in self.set_ or () for word in ("--set", text))]
+
+
+def _command(assignments: Sequence[str], reason: str) -> UseSettings:
+    document = Settings().with_assignments(assignments).model_dump(mode="json")
+    return UseSettings(
+        command_id=uuid.uuid4().hex, issued_by=user_at_host(), reason=reason, settings=document
+    )
+
+
+@dataclass(frozen=True)
+class LogStart:
+    """What an opened log begins with, and what to tell people of it.
+
+    ``is_new`` if it has no events; ``command`` is then the one that it begins with, None if it says
+    nothing. ``known`` are the settings that a log with events says, None if it says none.
+    """
+
+    log: Path
+    options: NewLogOptions
+    is_new: bool
+    is_ros: bool
+    known: Settings | None = None
+    command: UseSettings | None = None
+
+    @classmethod
+    def of(
+        cls, log: Path, writer: LogWriter, options: NewLogOptions, *, is_ros: bool
+    ) -> "LogStart":
+        """The start of the log that ``writer`` has opened; ``is_ros`` if it gets input of ROS.
+        Raises MisuseError if settings are chosen and the log has others."""
+        if writer.next_offset > 0:
+            known = _known_settings(log, is_needed=bool(options.assignments))
+            _check_same(log, known or Settings(), options)
+            return cls(log, options, is_new=False, is_ros=is_ros, known=known)
+        command = options.command()
+        if command is None and is_ros:
+            command = _command([f"preset={ROS_PRESET}"], _ROS_REASON)
+        return cls(log, options, is_new=True, is_ros=is_ros, command=command)
+
+    def for_import(self) -> LogSettings:
+        """The same for an importer."""
+        document = None if self.known is None else self.known.model_dump(mode="json")
+        if self.command is not None:
+            document = self.command.settings
+        return LogSettings(self.command, document, check_settings)
+
+    def record(self, writer: LogWriter) -> None:
+        """Append the command; it is durable when this returns."""
+        if self.command is not None:
+            writer.append(COMMAND_KEY, encode_command(self.command))
+            writer.sync()
+        self.say()
+
+    @contextmanager
+    def said_on_error(self, writer: LogWriter) -> Iterator[None]:
+        """Print the line also if an error ends an import that has recorded the settings."""
+        try:
+            yield
+        except MapfoldError:
+            self.say_recorded(writer)
+            raise
+
+    def say_recorded(self, writer: LogWriter, *, as_source: bool = False) -> None:
+        """`say`, of an import that did not end, if the log has got settings by it."""
+        if as_source or (self.command is not None and writer.next_offset > 0):
+            self.say(as_source=as_source)
+
+    def say(self, *, as_source: bool = False) -> None:
+        """Print one line on the settings of a new log, ``as_source`` if it took those of a source.
+        Also where ROS goes into a log that says nothing."""
+        if self.command is not None:
+            named = " ".join(self.options.words()) or f"--preset {ROS_PRESET}, for input of ROS"
+            say(visible(f"{self.log}: a new log with {named}, said at offset 0"))
+        elif as_source:
+            say(visible(f"{self.log}: a new log with the settings that its source begins with"))
+        elif self.is_new or (self.is_ros and self.known is None):
+            what = "a new log" if self.is_new else "a log"
+            change = command_line("edit", self.log, *_change(["--preset", ROS_PRESET]))
+            line = (
+                f"{self.log}: {what} of --preset classic; with --preset {ROS_PRESET} places are"
+                f" rooms and objects have positions: `{change}`"
+            )
+            say(visible(line))
+
+
+def _change(options: Sequence[str]) -> list[str]:
+    return ["use-settings", *options, "--reason", "WHY"]
+
+
+def _known_settings(log: Path, *, is_needed: bool) -> Settings | None:
+    """The settings that the log says; None if it says none or, unless they are needed, cannot be
+    read."""
+    try:
+        with LogReader(log) as reader:
+            return read_corrections(reader).settings
+    except (LogDamaged, FoldError):
+        if is_needed:
+            raise
+        return None
+
+
+def _check_same(log: Path, known: Settings, options: NewLogOptions) -> None:
+    asked = known.with_assignments(options.assignments)
+    if asked == known:
+        return
+    here = known.by_name()
+    differing = ", ".join(
+        f"{name}={here.get(name)}, not {value}" for name, value in asked.changed_from(known).items()
+    )
+    raise MisuseError(
+        f"{log} has {differing}; a log's settings are said when it is made. To change them:"
+        f" `{command_line('edit', log, *_change(options.words()))}`"
+    )
