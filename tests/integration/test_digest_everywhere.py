@@ -43,7 +43,7 @@ fold, view, vectors = SemanticMap(settings), MapView(settings), []
 lines = Path(sys.argv[1]).read_bytes().splitlines()
 for offset, line in enumerate(lines):
     accepted = ingest(line)
-    vectors += accepted.vectors
+    vectors += [vector for vector in accepted.vectors if vector is not None]
     view.apply_event(offset, fold.fold(offset, accepted))
 ahead = MapView(settings)
 events = (Event(offset, "tb/detections", 0, 0, line) for offset, line in enumerate(lines))
@@ -56,15 +56,16 @@ print(map_digest(view), hashlib.sha256((matrix @ matrix[0]).tobytes()).hexdigest
 
 
 def _synthetic_run() -> list[bytes]:
-    """A walk along a wavy corridor; looks scatter around eight things' directions."""
+    """A walk along a wavy corridor; looks scatter around eight things' directions, and some
+    detections have none."""
     rng = np.random.default_rng(4)
     looks = rng.normal(size=(8, 512))
     payloads = []
     for i in range(rounds(300, 120)):
         which = [int(w) for w in rng.choice(8, 2, replace=False)]
         seen = [
-            detection(f"class {w % 3}", looks[w] + rng.normal(size=512) * 0.8, det_id=f"{i}-{w}")
-            for w in which
+            detection(f"class {w % 3}", None if w + i % 3 == 5 else look, det_id=f"{i}-{w}")
+            for w, look in zip(which, looks[which] + rng.normal(size=(2, 512)) * 0.8, strict=True)
         ]
         x, y = i * 0.21 % 12, float(np.sin(i / 7))
         payloads.append(payload(envelope(i, x, y, detections=seen)))
