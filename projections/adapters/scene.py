@@ -104,15 +104,16 @@ def places_of(view: MapView) -> list[ShownPlace]:
     return found
 
 
-def objects_of(view: MapView) -> list[ShownObject]:
-    """The objects of a map, in the order in which they were founded."""
+def objects_of(view: MapView, *, everything: bool = False) -> list[ShownObject]:
+    """The confirmed objects of a map, or with ``everything`` all, in the order in which they were
+    founded."""
     return [
         ShownObject(
             found,
             view.keyframes[view.observations[found.observations[0]].keyframe].floor,
             found.missing_in is not None,
         )
-        for found in view.objects.values()
+        for found in objects_shown(view, everything=everything)
     ]
 
 
@@ -222,10 +223,10 @@ class ObjectGroup:
         return sum(xs) / len(xs), sum(ys) / len(ys)
 
 
-def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
-    """The objects seen at least that often, by place and class; most seen first."""
+def object_groups(objects: Iterable[ObjectRecord]) -> list[ObjectGroup]:
+    """The objects by place and class; most seen first."""
     grouped: dict[tuple[int | None, str, bool], list[list[ObjectRecord]]] = defaultdict(list)
-    for found in objects_seen(view, min_observations):
+    for found in objects:
         _add_to_group(grouped[found.place, found.class_name, found.missing_in is not None], found)
     groups = [
         ObjectGroup(name, place, missing, tuple(members))
@@ -235,9 +236,15 @@ def object_groups(view: MapView, min_observations: int) -> list[ObjectGroup]:
     return sorted(groups, key=lambda group: (-group.obs_count, group.members[0].ordinal))
 
 
-def objects_seen(view: MapView, min_observations: int) -> list[ObjectRecord]:
-    """The objects seen at least that often."""
-    return [found for found in view.objects.values() if found.obs_count >= min_observations]
+def objects_shown(
+    view: MapView, *, everything: bool = False, min_observations: int = 1
+) -> list[ObjectRecord]:
+    """The confirmed objects, or with ``everything`` all, that were seen at least that often."""
+    return [
+        found
+        for found in view.objects.values()
+        if (everything or found.confirmed) and found.obs_count >= min_observations
+    ]
 
 
 def two_sigma(at: EstimatedPosition) -> tuple[float, float, float]:

@@ -95,7 +95,7 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     """A new detection of a keyframe.
 
     ``embedding`` is None when the detection has none *or* it is of another space than the map's
-    (then ``foreign_space`` is true).
+    (then ``foreign_space`` is true). ``measured`` is whether it has a depth or a position.
     """
 
     offset: Offset
@@ -110,6 +110,7 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     embedding_model: str | None
     embedding: UnitVector | None
     foreign_space: bool
+    measured: bool = False
 
 
 class EventSkipped(msgspec.Struct, frozen=True, gc=False):

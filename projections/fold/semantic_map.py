@@ -336,6 +336,7 @@ class SemanticMap:
                     model,
                     unit[1] if unit is not None and is_member else None,
                     unit is not None and not is_member,
+                    detection.depth_m is not None or detection.position is not None,
                 )
             )
             if unit is not None and is_member:

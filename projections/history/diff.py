@@ -15,9 +15,18 @@ from eventsrc.envelope.model import Offset, RunId
 from projections.fold.corrections import RecordedCommand
 from projections.map.digest import map_digest
 from projections.map.phrases import command_document
-from projections.map.records import EstimatedPosition, KeyframeRecord, Relocation
+from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
 from projections.store.history_records import Cause
+
+from .object_changes import (
+    ObjectChanges,
+    ObjectRow,
+    changes_document,
+    object_changes,
+    object_document,
+    object_shift_m,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,24 +38,6 @@ class PlaceRow:
     centroid_y: float
     keyframe_count: int
     name: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectRow:
-    """An object: its mean position in metres, its detections in order; under fusion by evidence
-    where it stands, and whether it is missing."""
-
-    object_id: str
-    class_name: str
-    mean_x: float
-    mean_y: float
-    place_id: str | None
-    first_seen: float
-    last_seen: float
-    det_ids: tuple[str, ...]
-    estimate: EstimatedPosition | None = None
-    missing: bool = False
-    relocations: tuple[Relocation, ...] = ()
 
 
 class KeyframeRow(msgspec.Struct, frozen=True, gc=False):
@@ -182,6 +173,7 @@ def _object_rows(view: MapView) -> Iterator[ObjectRow]:
             o.estimate,
             o.missing_in is not None,
             tuple(o.relocations),
+            o.confirmed,
         )
 
 
@@ -190,7 +182,8 @@ class Difference:
     """The difference of the map after ``start`` events and that after ``end``.
 
     ``absorbed`` gives, by id of an absorbed place, the surviving place and the cause; it is empty
-    when ``end`` < ``start``. ``commands`` are those that one of the maps knows and the other not.
+    when ``end`` < ``start``. ``became`` is about the changed objects. ``commands`` are those that
+    one of the maps knows and the other not.
     """
 
     start: Offset
@@ -202,6 +195,7 @@ class Difference:
     objects: Changes[str, ObjectRow]
     edges: Changes[tuple[str, str], EdgeRow]
     absorbed: dict[str, tuple[str, Cause]]
+    became: ObjectChanges
     commands: tuple[RecordedCommand, ...] = ()
 
     @property
@@ -227,7 +221,7 @@ class Difference:
             "digests": list(self.digests),
             "counts": self._counts(),
             "places": self._places(),
-            "objects": _objects(self.objects),
+            "objects": _objects(self.objects, self.became),
             "keyframes": _keyframes(self.keyframes),
             "adjacency": _edges(self.edges),
             **({"commands": list(map(command_document, self.commands))} if self.commands else {}),
@@ -266,6 +260,19 @@ def difference_of(
 ) -> Difference:
     """The difference of two maps."""
     before, after = rows_of(first), rows_of(second)
+    objects = changes(before.objects, after.objects)
+    ids, survivors = second.all_objects, second.object_survivors
+    joined = {
+        ids[number].object_id: ids[survivors.find(number)].object_id
+        for number in survivors.absorbed_by
+    }
+    became = object_changes(
+        before.objects,
+        after.objects,
+        objects.changed,
+        joined,
+        is_forward=first.next_offset <= second.next_offset,
+    )
     return Difference(
         start=first.next_offset,
         end=second.next_offset,
@@ -273,9 +280,10 @@ def difference_of(
         counts=(first.counts(), second.counts()),
         keyframes=changes(before.keyframes, after.keyframes),
         places=changes(before.places, after.places),
-        objects=changes(before.objects, after.objects),
+        objects=objects,
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
+        became=became,
         commands=tuple(commands),
     )
 
@@ -283,11 +291,6 @@ def difference_of(
 def place_shift_m(before: PlaceRow, after: PlaceRow) -> float:
     """The distance between two centroids in metres."""
     return math.hypot(after.centroid_x - before.centroid_x, after.centroid_y - before.centroid_y)
-
-
-def object_shift_m(before: ObjectRow, after: ObjectRow) -> float:
-    """The distance between two mean positions in metres."""
-    return math.hypot(after.mean_x - before.mean_x, after.mean_y - before.mean_y)
 
 
 def _place(row: PlaceRow) -> dict[str, Any]:
@@ -304,48 +307,27 @@ def _into(absorbed: tuple[str, Cause] | None) -> dict[str, Any]:
     return {} if absorbed is None else {"into": absorbed[0], "by": absorbed[1].document()}
 
 
-def _object(row: ObjectRow) -> dict[str, Any]:
+def _objects(found: Changes[str, ObjectRow], became: ObjectChanges) -> dict[str, Any]:
+    joined = became.joined
     return {
-        "object_id": row.object_id,
-        "class_name": row.class_name,
-        "mean_x": row.mean_x,
-        "mean_y": row.mean_y,
-        "obs_count": len(row.det_ids),
-        "place_id": row.place_id,
-        "first_seen": row.first_seen,
-        "last_seen": row.last_seen,
-        **_evidence(row),
-    }
-
-
-def _evidence(row: ObjectRow) -> dict[str, Any]:
-    at = row.estimate
-    if at is None:
-        return {}
-    return {
-        "est_x": at.est_x,
-        "est_y": at.est_y,
-        "est_sigma_m": at.est_sigma_m,
-        "spots": at.spots,
-        "missing": row.missing,
-    }
-
-
-def _objects(found: Changes[str, ObjectRow]) -> dict[str, Any]:
-    return {
-        "new": [{**_object(row), "det_ids": list(row.det_ids)} for row in found.added],
-        "gone": [_object(row) for row in found.removed],
+        "new": [{**object_document(row), "det_ids": list(row.det_ids)} for row in found.added],
+        "gone": [
+            object_document(row)
+            | ({"into": joined[row.object_id]} if row.object_id in joined else {})
+            for row in found.removed
+        ],
         "changed": [
             {
                 "object_id": before.object_id,
-                "before": _object(before),
-                "after": _object(after),
+                "before": object_document(before),
+                "after": object_document(after),
                 "moved_m": object_shift_m(before, after),
                 "relocated": before.place_id != after.place_id,
                 "new_det_ids": list(after.det_ids[len(before.det_ids) :]),
             }
             for before, after in found.changed
         ],
+        **changes_document(became),
     }
 
 

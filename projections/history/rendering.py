@@ -1,19 +1,14 @@
-"""Text output of `mapfold diff`, `merges`, `bisect` and `why`."""
+"""Text output of `mapfold merges`, `bisect` and `why`."""
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from eventsrc.base.text import counted, table
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import PlaceOrdinal
-from projections.map.phrases import command_title
-from projections.map.records import EstimatedPosition
 from projections.store.history import History
 from projections.store.history_records import EdgeChange, Merge, ObjectMerge, RefusedMerge
 
 from .bisect import Search, Turn
-from .diff import Difference, ObjectRow, PlaceRow, object_shift_m, place_shift_m
 from .explanation import Explanation
 from .merge_reasons import evidence_text, merge_reason, refuser
 from .names import keyframe_name, place_name, place_title
@@ -24,178 +19,6 @@ def shortened(lines: Sequence[str], most: int | None, hint: str) -> list[str]:
     if most is None or len(lines) <= most:
         return list(lines)
     return [*lines[:most], f"… and {len(lines) - most:,} more ({hint})"]
-
-
-_HINT = "--all shows them"
-_MOVED_M = 0.005
-"""A shorter move is not printed: it would be 0.00 m."""
-
-
-def difference_text(diff: Difference, *, most: int | None) -> str:
-    """The digests, a line per kind, and up to ``most`` things of each kind; None for all."""
-    return "".join(f"{line}\n" for line in _difference_lines(diff, most))
-
-
-def _difference_lines(diff: Difference, most: int | None) -> Iterator[str]:
-    first, second = diff.digests
-    if diff.same:
-        yield f"the same map at {diff.start:,} and {diff.end:,}: digest {first[:16]}"
-        return
-    yield f"from {diff.start:,} to {diff.end:,}: digest {first[:16]} → {second[:16]}"
-    if diff.commands:
-        yield f"commands   {len(diff.commands):,} in between"
-        lines = [f"{c.offset:,}  {command_title(c.command)}" for c in diff.commands]
-        yield from (f"  {line}" for line in shortened(lines, most, _HINT))
-    yield f"keyframes  {_keyframes(diff)}"
-    for title, summary, groups in (_places(diff), _objects(diff), _edges(diff)):
-        yield f"{title:<11}{summary}"
-        for group in groups:
-            yield from (f"  {line}" for line in shortened(group, most, _HINT))
-
-
-def _keyframes(diff: Difference) -> str:
-    found = diff.keyframes
-    relabelled = [(b.place_id, a.place_id) for b, a in found.changed]
-    out_of_noise = sum(before is None for before, _ in relabelled)
-    parts = [
-        (len(found.added), "new"),
-        (len(found.removed), "gone"),
-        (out_of_noise, "left noise"),
-        (len(relabelled) - out_of_noise, "changed place"),
-    ]
-    return _counts_text(parts)
-
-
-def _counts_text(parts: Sequence[tuple[int, str]]) -> str:
-    return ", ".join(f"{count:,} {what}" for count, what in parts if count) or "unchanged"
-
-
-def _places(diff: Difference) -> tuple[str, str, list[list[str]]]:
-    found = diff.places
-    parts = [
-        (len(found.added), "formed"),
-        (len(found.removed), "gone"),
-        (len(found.changed), "changed"),
-    ]
-    groups = [
-        [f"+ {_place_row_text(row)}" for row in found.added],
-        [f"- {_title(row)}{_into(diff, row)}" for row in found.removed],
-        [f"~ {_place_change(before, after)}" for before, after in found.changed],
-    ]
-    return "places", _counts_text(parts), groups
-
-
-def _size(row: PlaceRow) -> str:
-    return counted(row.keyframe_count, "keyframe")
-
-
-def _place_row_text(row: PlaceRow) -> str:
-    x, y = row.centroid_x, row.centroid_y
-    return f"{_title(row)}: {_size(row)} around ({x:.2f}, {y:.2f})"
-
-
-def _title(row: PlaceRow) -> str:
-    return row.place_id if row.name is None else f'{row.place_id} "{row.name}"'
-
-
-def _into(diff: Difference, row: PlaceRow) -> str:
-    if row.place_id not in diff.absorbed:
-        return f" ({_size(row)})"
-    survivor, cause = diff.absorbed[row.place_id]
-    return f" ({_size(row)}) into {survivor} at {cause.offset:,} ({cause.name})"
-
-
-def _place_change(before: PlaceRow, after: PlaceRow) -> str:
-    moved = place_shift_m(before, after)
-    shift = f", centre moved {moved:.2f} m" if moved >= _MOVED_M else ""
-    size = f"{before.keyframe_count:,} → {_size(after)}{shift}"
-    if before.name == after.name:
-        return f"{_title(after)}: {size}"
-    named = f"{_quoted(before.name)} → {_quoted(after.name)}"
-    unchanged = before.keyframe_count == after.keyframe_count and not shift
-    return f"{after.place_id}: {named if unchanged else f'{named}, {size}'}"
-
-
-def _quoted(name: str | None) -> str:
-    return "no name" if name is None else f'"{name}"'
-
-
-@dataclass(frozen=True, slots=True)
-class _ObjectChange:
-    before: ObjectRow
-    after: ObjectRow
-
-    @property
-    def relocated(self) -> bool:
-        return self.before.place_id != self.after.place_id
-
-    @property
-    def seen(self) -> int:
-        return len(self.after.det_ids) - len(self.before.det_ids)
-
-    def text(self) -> str:
-        before, after = self.before, self.after
-        shift = object_shift_m(before, after)
-        parts = [f"{after.object_id} {after.class_name}:"]
-        if before.class_name != after.class_name:
-            parts.append(f"{before.class_name} → {after.class_name}")
-        if self.relocated:
-            parts.append(f"{self.before.place_id or 'no place'} → {after.place_id or 'no place'}")
-        if self.seen:
-            now = counted(len(after.det_ids), "time")
-            parts.append(f"seen {len(before.det_ids):,} → {now}")
-        if before.missing != after.missing:
-            parts.append("missing" if after.missing else "not missing any more")
-        if before.estimate is not None and after.estimate is not None:
-            if before.estimate != after.estimate:
-                parts.append(_estimate_change(before.estimate, after.estimate))
-        elif shift >= _MOVED_M:
-            parts.append(f"moved {shift:.2f} m")
-        return parts[0] + " " + ", ".join(parts[1:])
-
-
-def _estimate_change(before: EstimatedPosition, after: EstimatedPosition) -> str:
-    shift = math.hypot(after.est_x - before.est_x, after.est_y - before.est_y)
-    place = f"stands {shift:.2f} m elsewhere, " if shift >= _MOVED_M else ""
-    return f"{place}± {before.est_sigma_m:.2f} → {after.est_sigma_m:.2f} m"
-
-
-def _objects(diff: Difference) -> tuple[str, str, list[list[str]]]:
-    found = diff.objects
-    changed = [_ObjectChange(before, after) for before, after in found.changed]
-    relocated = [change for change in changed if change.relocated]
-    others = [change for change in changed if not change.relocated]
-    parts = [
-        (len(found.added), "new"),
-        (len(found.removed), "gone"),
-        (sum(change.seen > 0 for change in changed), "seen again"),
-        (len(relocated), "relocated"),
-    ]
-    groups = [
-        [f"+ {o.object_id} {o.class_name} in {o.place_id or 'no place'}" for o in found.added],
-        [f"- {o.object_id} {o.class_name}" for o in found.removed],
-        [f"> {change.text()}" for change in relocated],
-        [f"~ {change.text()}" for change in others],
-    ]
-    return "objects", _counts_text(parts), groups
-
-
-def _edges(diff: Difference) -> tuple[str, str, list[list[str]]]:
-    found = diff.edges
-    parts = [
-        (len(found.added), "new"),
-        (len(found.removed), "gone"),
-        (len(found.changed), "changed"),
-    ]
-    groups = [
-        [f"+ {e.a} – {e.b}: {counted(e.shared_transitions, 'transition')}" for e in found.added],
-        [f"- {e.a} – {e.b}" for e in found.removed],
-        [
-            f"~ {after.a} – {after.b}: {before.shared_transitions:,} → {after.shared_transitions:,}"
-            for before, after in found.changed
-        ],
-    ]
-    return "adjacency", _counts_text(parts), groups
 
 
 _MERGES_HEADER = (

@@ -105,7 +105,8 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     was nothing to compare (`ObjectSeen`).
 
     ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
-    made with ``keep_embeddings=False``; ``embedding_crc`` is there even then.
+    made with ``keep_embeddings=False``; ``embedding_crc`` is there even then. ``measured`` is
+    whether it has a depth or a position.
     """
 
     ordinal: ObservationOrdinal
@@ -120,6 +121,7 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     foreign_space: bool
     object: ObjectOrdinal | None = None
     similarity_q40: int | None = None
+    measured: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +181,8 @@ class ObjectRecord:
 
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
     those of fusion by evidence: ``misses`` is the number of keyframes of a run that should show it
-    and do not, ``missing_in`` the run by which it is missing. ``counted_as`` is how `PlaceContents`
-    counts it.
+    and do not, ``missing_in`` the run by which it is missing. ``confirmed`` is as in
+    `projections.map.confirmed`, ``counted_as`` how `PlaceContents` counts it.
     """
 
     ordinal: ObjectOrdinal
@@ -197,6 +199,7 @@ class ObjectRecord:
     misses: int = 0
     missing_in: RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)
+    confirmed: bool = False
     counted_as: tuple[PlaceOrdinal, str, bool] | None = None
 
     @property

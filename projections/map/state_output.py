@@ -14,6 +14,7 @@ from projections.fold.exact import UM_PER_M
 from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
+from .confirmed import objects_text
 from .phrases import command_document
 from .place_regions import Region, place_regions
 from .records import ObjectRecord
@@ -154,6 +155,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
             "first_seen": o.first_seen,
             "last_seen": o.last_seen,
             "det_ids": [det_ids[i] for i in o.observations],
+            "confirmed": o.confirmed,
             **(_evidence(view, o) if view.settings.fusion == "evidence" else {}),
         }
         for o in view.objects.values()
@@ -184,8 +186,15 @@ def _evidence(view: MapView, found: ObjectRecord) -> dict[str, Any]:
 _MAX_PLACES = 40
 
 
-def state_text(view: MapView, digest: str | None, known_at: Offset | None = None) -> str:
-    """Counts, settings, digest and the first 40 places, for people; ends in a newline."""
+def state_text(
+    view: MapView,
+    digest: str | None,
+    known_at: Offset | None = None,
+    *,
+    everything: bool = False,
+) -> str:
+    """Counts, settings, digest and the first 40 places, for people; ends in a newline. Objects seen
+    once are counted in the places only with ``everything``."""
     lines = [
         f"after {counted(view.next_offset, 'event')}: {_counts(view)}",
         f"settings {_settings(view.settings)}",
@@ -197,7 +206,7 @@ def state_text(view: MapView, digest: str | None, known_at: Offset | None = None
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
-    lines += _place_lines(view)
+    lines += _place_lines(view, everything=everything)
     return "\n".join(lines) + "\n"
 
 
@@ -227,8 +236,10 @@ def _standing(view: MapView) -> str:
 
 def _counts(view: MapView) -> str:
     counts = view.counts()
-    words = ("run", "keyframe", "observation", "object", "place")
-    text = ", ".join(counted(counts[f"{word}s"], word) for word in words)
+    words = ("run", "keyframe", "observation")
+    parts = [counted(counts[f"{word}s"], word) for word in words]
+    parts += [objects_text(view.objects.values()), counted(counts["places"], "place")]
+    text = ", ".join(parts)
     rare = {
         "noise": "{} in no place",
         "duplicates": "{} seen twice",
@@ -267,7 +278,7 @@ def _shown_floor(name: str | None) -> str:
     return "-" if name is None else visible(name)
 
 
-def _place_lines(view: MapView) -> list[str]:
+def _place_lines(view: MapView, *, everything: bool) -> list[str]:
     if not view.places:
         return ["no places yet"]
     neighbours: dict[PlaceOrdinal, list[str]] = {place: [] for place in view.places}
@@ -276,7 +287,7 @@ def _place_lines(view: MapView) -> list[str]:
         neighbours[b].append(f"{view.place_id(a)} ×{transitions}")
     objects = dict.fromkeys(view.places, 0)
     for record in view.objects.values():
-        if record.place is not None:
+        if record.place is not None and (everything or record.confirmed):
             objects[record.place] += 1
     shown = list(view.places.items())[:_MAX_PLACES]
     width = max(len(place.place_id) for place in view.places.values())

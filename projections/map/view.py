@@ -23,6 +23,7 @@ from projections.fold.pair_groups import ObjectSurvivors, PlaceSurvivors
 from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
 
+from .confirmed import confirm
 from .records import (
     EstimatedPosition,
     KeyframeRecord,
@@ -191,6 +192,7 @@ class MapView:
                 vector if self.keep_embeddings else None,
                 None if vector is None else crc32(vector.data),
                 delta.foreign_space,
+                measured=delta.measured,
             )
         )
 
@@ -248,6 +250,7 @@ class MapView:
             observation.object = delta.object
             observation.similarity_q40 = delta.similarity_q40
             found.observations.append(delta.observation)
+            confirm(found, (delta.observation,), self.observations, self.keyframes)
         is_counted = (found.obs_count > 1) is (delta.obs_count > 1)
         found.obs_count = delta.obs_count
         found.sum_x_um = delta.sum_x_um
@@ -265,6 +268,7 @@ class MapView:
                 self.observations[observation].object = delta.survivor
             survivor.observations += absorbed.observations
             survivor.observations.sort()
+            confirm(survivor, absorbed.observations, self.observations, self.keyframes)
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None
@@ -300,14 +304,8 @@ class MapView:
     def _object_relocated(self, delta: deltas.ObjectRelocated) -> None:
         found = self.all_objects[delta.object]
         found.misses, found.missing_in = 0, None
-        moved = Relocation(
-            delta.offset,
-            delta.observation,
-            delta.from_x_um,
-            delta.from_y_um,
-            delta.to_x_um,
-            delta.to_y_um,
-        )
+        at = (delta.from_x_um, delta.from_y_um, delta.to_x_um, delta.to_y_um)
+        moved = Relocation(delta.offset, delta.observation, *at)
         if moved not in found.relocations:
             found.relocations.append(moved)
 
@@ -364,6 +362,7 @@ class MapView:
             "poses": posed,
             "observations": len(self.observations),
             "objects": len(self.objects),
+            "confirmed": sum(o.confirmed for o in self.objects.values()),
             "places": len(self.places),
             "noise": posed - placed,
             "adjacency": len(self.adjacency),

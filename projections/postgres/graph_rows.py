@@ -252,7 +252,8 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
         properties = (
             f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
             f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
-            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r}{more}}}'
+            f' "first_seen": {o.first_seen!r}, "last_seen": {o.last_seen!r},'
+            f' "confirmed": {"true" if o.confirmed else "false"}{more}}}'
         )
         yield base + i, properties
 

@@ -7,6 +7,7 @@ An Object is what the last delta of each kind about it says. Where two kinds spe
 * Its class is that of its last classification; without one, that as which it was found.
 * The keyframes that should show it and do not are those of its last `ObjectMissing`; none once a
   later event has relocated it.
+* It is confirmed by the first event after which `projections.map.confirmed` says so.
 
 `projections.map.view` applies the same deltas one by one; property tests compare the two.
 """
@@ -19,6 +20,7 @@ import numpy as np
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
+from projections.map.confirmed import APART_S, APART_UM
 from projections.map.records import EstimatedPosition, ObjectRecord
 
 from .columns import NONE, Array
@@ -115,6 +117,12 @@ class ObjectStates:
         found: Array = self.is_looked_for & (self.of("missing", "missing") != 0)
         return found
 
+    @cached_property
+    def is_confirmed(self) -> Array:
+        """Whether they are confirmed."""
+        found: Array = self._tables.once("confirmed", _confirmed_at)[self.objects] < self.ends
+        return found
+
     def has(self, table: str) -> Array:
         """Whether a row of a table says something about them."""
         found: Array = self._rows(table) != NONE
@@ -148,6 +156,8 @@ class ObjectStates:
                 self._estimates(),
                 misses,
                 [None if run == NONE else run for run in runs],
+                ([] for _ in places),
+                self.is_confirmed.tolist(),
             )
         )
 
@@ -176,3 +186,47 @@ class ObjectStates:
                 else np.full(len(self.objects), NONE, np.int64)
             )
         return self._last[table]
+
+
+def _confirmed_at(tables: Tables) -> Rows:
+    """By Object the event that confirms it; 2⁶³ − 1 for one that is seen once."""
+    found = np.full(tables.count("found"), np.iinfo(np.int64).max)
+    if not len(found):
+        return found
+    seen = tables.integers("seen", "object")
+    founders = tables.integers("found", "observation")
+    offsets, observations = (tables.integers("seen", each) for each in ("offset", "observation"))
+    rows = np.flatnonzero(_confirms(tables, founders[seen], observations))
+    np.minimum.at(found, seen[rows], offsets[rows])
+    parts: dict[int, list[Rows]] = {}
+    merges = (
+        tables.integers("fused", each).tolist() for each in ("offset", "survivor", "absorbed")
+    )
+    for offset, survivor, absorbed in zip(*merges, strict=True):
+        own = observations[tables.group("seen", "object")[absorbed]]
+        gained = np.concatenate([own, *parts.pop(absorbed, [])])
+        parts.setdefault(survivor, []).append(gained)
+        first = np.full(len(gained), founders[survivor])
+        if found[survivor] > offset and _confirms(tables, first, gained).any():
+            found[survivor] = offset
+    return found
+
+
+def _confirms(tables: Tables, first: Rows, later: Rows) -> Array:
+    """Whether each observation of ``later`` confirms an Object founded by that of ``first``."""
+    keyframes = tables.integers("observation", "keyframe")
+    one, other = keyframes[first], keyframes[later]
+    dx, dy = (
+        np.clip(
+            tables.integers("keyframe", axis)[other] - tables.integers("keyframe", axis)[one],
+            -APART_UM,
+            APART_UM,
+        )
+        for axis in ("x_um", "y_um")
+    )  # clipped: no square is beyond int64
+    runs, times = tables.column("keyframe", "run"), tables.column("keyframe", "timestamp")
+    is_measured = tables.column("observation", "measured")[later] != 0
+    is_elsewhere = dx * dx + dy * dy >= APART_UM * APART_UM
+    is_later = np.abs(times[other] - times[one]) > APART_S
+    found: Array = is_measured | is_elsewhere | is_later | (runs[one] != runs[other])
+    return found

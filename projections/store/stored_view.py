@@ -211,6 +211,7 @@ def _observations(moment: Moment, first: int, last: int) -> list[ObservationReco
             found["foreign_space"],
             [None if each == NONE else each for each in objects],
             [None if q40 == NO_INT else q40 for q40 in similarities],
+            found["measured"],
         )
     )
 

@@ -49,6 +49,7 @@ class Tables:
         self._repair = threading.Lock()
         self._columns: dict[str, Array] = {}
         self._groups: dict[str, Groups] = {}
+        self._made: dict[str, Rows] = {}
         self._unreleased = 0  # rows that were read
 
     @property
@@ -98,6 +99,12 @@ class Tables:
         if key not in self._groups:
             self._groups[key] = Groups(self.column(table, column))
         return self._groups[key]
+
+    def once(self, name: str, make: Callable[["Tables"], Rows]) -> Rows:
+        """What ``make`` makes of the tables; made when it is asked for first."""
+        if name not in self._made:
+            self._made[name] = make(self)
+        return self._made[name]
 
     def as_of(self, table: str, column: str, things: Rows, ends: Rows) -> Rows:
         """For each of ``things`` the last row about it, by ``column``, of the events below its end;

@@ -72,7 +72,7 @@ def entities(scene: bytes) -> list[str]:
 def expected_entities(state: dict[str, Any], merges: list[dict[str, Any]]) -> list[str]:
     """The ids that a scene of this map must have, by what the commands print."""
     names = [f"place/{place['place_id']}" for place in state["places"]]
-    names += [f"object/{found['object_id']}" for found in state["objects"]]
+    names += [f"object/{found['object_id']}" for found in state["objects"] if found["confirmed"]]
     names += ["adjacency"] if state["adjacency"] else []
     posed = [k["run_id"] for k in state["keyframes"] if k["map_x"] is not None]
     names += [f"path/{run}" for run in dict.fromkeys(posed) if posed.count(run) > 1]

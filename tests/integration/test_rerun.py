@@ -116,7 +116,7 @@ def test_the_recording_shows_the_map_of_each_moment(mapfold: Commands) -> None:
 
 def _compare(recorded: Recording, state: dict[str, Any], end: int) -> None:
     """An offset's map against ``state --json`` of it."""
-    places, objects = state["places"], state["objects"]
+    places, objects = state["places"], [o for o in state["objects"] if o["confirmed"]]
     shown = recorded.at("/map/places", end)
     assert [label.rpartition("(")[2].rstrip(")") for label in shown["Points2D:labels"]] == [
         place["place_id"] for place in places

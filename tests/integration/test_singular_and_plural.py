@@ -43,14 +43,17 @@ def mapfold(tmp_path: Path) -> Commands:
         (("diff", "log", "0", "1", *_LONE), "1 keyframe around"),
         (("diff", "log", "2", "3", *_LONE), "(1 keyframe) into"),
         (("diff", "log", "3", "0", *_LONE), None),
-        (("diff", "log", "2", "1", *_LONE), "seen 2 → 1 time,"),
+        (("diff", "log", "2", "1", *_LONE), "seen 2 → 1 time\n"),
         (("why", "log", "run-a_p0", *_LONE), "10 objects: cup ×2, thing 0, thing 1, "),
         (("why", "log", "run-a_p0", *_LONE), "thing 6 and 1 more class; next to"),
         (("why", "log", "--same", "run-a:1", "run-a:2", "--set", "min_samples=2"), "1 event after"),
-        (("draw", "log", "--out", "all.svg", "--min-observations", "1"), "seen 1 time or more"),
+        (("draw", "log", "--out", "all.svg", "--all"), " seen once, "),
         (("merges", "log", "--show", "1", *_LONE), "absorbed  run-a_p1, 1 keyframe"),
         (("state", "log", "--at", "1", *_LONE), "1 place"),
-        (("draw", "log", "--at", "1", "--out", "one.svg", *_LONE), "1 place, 1 object"),
+        (
+            ("draw", "log", "--at", "1", "--out", "one.svg", *_LONE),
+            "0 objects + 1 seen once",
+        ),
     ],
 )
 def test_one_is_singular(mapfold: Commands, args: tuple[str, ...], says: str | None) -> None:

@@ -134,10 +134,12 @@ def test_settings_come_from_file_and_set_on_top(mapfold: Commands, log: Path) ->
 def test_the_text_is_a_short_table(mapfold: Commands, log: Path) -> None:
     lines = mapfold("state", log).out.splitlines()
     assert lines[0] == (
-        "after 9 events: 1 run, 8 keyframes, 7 observations, 3 objects, 2 places, "
+        "after 9 events: 1 run, 8 keyframes, 7 observations, 0 objects + 3 seen once, 2 places, "
         "1 keyframe in no place"
     )
     assert lines[1].startswith("settings default: eps_m=1.5, min_samples=3")
+    assert lines[4].split() == ["run-a_p0", "3", "0", "(0.10,", "0.00)", "run-a_p1", "×1"]
+    lines = mapfold("state", log, "--all").out.splitlines()
     assert lines[4].split() == ["run-a_p0", "3", "1", "(0.10,", "0.00)", "run-a_p1", "×1"]
 
 

@@ -143,6 +143,7 @@ def test_the_rows_of_the_page_have_none_of_it(steps: list[Step]) -> None:
     for _, properties in object_rows(view, view.objects):
         assert list(json.loads(properties)) == [
             "object_id", "class_name", "mean_x", "mean_y", "obs_count", "first_seen", "last_seen",
+            "confirmed",
         ]  # fmt: skip
 
 

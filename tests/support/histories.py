@@ -31,6 +31,7 @@ from projections.history.merge_reasons import (
     object_merge_document,
     refusal_document,
 )
+from projections.map.confirmed import confirm
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, new_map
 from projections.map.records import (
@@ -220,6 +221,7 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
     view.objects = {o.ordinal: o for o in view.all_objects if o.ordinal not in absorbed}
     for found in view.objects.values():
         view.contents.update(found)
+        confirm(found, found.observations, view.observations, view.keyframes)
     view.runs = _runs(history, view.keyframes, end)
     view.adjacency = _adjacency(history, end)
     for skipped in history.skipped[: count_before(history.skipped, end)]:

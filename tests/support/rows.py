@@ -213,6 +213,7 @@ def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> No
             "obs_count": obj.obs_count,
             "first_seen": obj.first_seen,
             "last_seen": obj.last_seen,
+            "confirmed": obj.confirmed,
         }
         if view.settings.fusion == "evidence":
             properties["missing"] = obj.missing_in is not None

@@ -223,7 +223,14 @@ def expected_rows(events: Iterable[Sequence[d.Delta]]) -> dict[str, list[tuple[A
     objects, located = [], []
     for found in (f for f in deltas if isinstance(f, d.ObjectFound) and f.object not in into):
         about = [delta for delta in deltas if getattr(delta, "object", None) == found.object]
-        objects.append((gid("Object", found.object + 1), _properties(found, about, deltas)))
+        members = [
+            seen.observation
+            for seen in deltas
+            if isinstance(seen, d.ObjectSeen) and now(seen.object) == found.object
+        ]
+        properties = _properties(found, about, deltas)
+        properties["confirmed"] = _is_confirmed(found, members, deltas)
+        objects.append((gid("Object", found.object + 1), properties))
         moves = [m.place for m in about if isinstance(m, d.ObjectMoved)]
         if moves and moves[-1] is not None:
             ends = gid("Object", found.object + 1), gid("Place", moves[-1] + 1)
@@ -283,6 +290,24 @@ def _properties(
         "missing": missing,
         **properties,
     }
+
+
+def _is_confirmed(found: d.ObjectFound, members: Sequence[int], deltas: Sequence[d.Delta]) -> bool:
+    added = {o.observation: o for o in deltas if isinstance(o, d.ObservationAdded)}
+    keyframes = {k.keyframe: k for k in deltas if isinstance(k, d.KeyframeAdded)}
+    first = keyframes[added[found.observation].keyframe]
+    return any(
+        added[member].measured
+        or now.run != first.run
+        or abs(now.timestamp - first.timestamp) > 60.0
+        or _far_um2(first.pose, now.pose) >= 350_000**2
+        for member in members
+        for now in (keyframes[added[member].keyframe],)
+    )
+
+
+def _far_um2(a: d.Pose | None, b: d.Pose | None) -> int:
+    return 0 if a is None or b is None else (a.x_um - b.x_um) ** 2 + (a.y_um - b.y_um) ** 2
 
 
 def _largest(at: d.ObjectEstimated) -> float:

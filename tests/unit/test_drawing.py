@@ -13,6 +13,7 @@ from projections.adapters.drawing import HousePlan, LostRobot, MergeMark, Spot, 
 from projections.adapters.drawing.map_picture import compose, legend_lines
 from projections.adapters.drawing.sheet import Sheet
 from projections.adapters.palette import place_colour
+from projections.adapters.scene import objects_of, objects_shown
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.map.view import MapView
@@ -40,7 +41,8 @@ def _two_places() -> MapView:
         box = (0.0, 0.0, 1.0, 1.0)
         view.apply(
             d.ObservationAdded(
-                number, number, 2, "run", 2, f"d{number}", name, 0.9, box, None, None, False
+                *(number, number, 2, "run", 2, f"d{number}", name, 0.9, box, None, None, False),
+                measured=count > 1,
             )
         )
         view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))
@@ -60,7 +62,18 @@ def test_the_picture_names_places_objects_and_transitions() -> None:
     texts = _texts(compose(_two_places(), "a title", HousePlan()))
     assert {"a title", "p0", "p1", "37", "cup & saucer", "<vase>"} <= set(texts)
     assert "rare" not in texts  # seen once
-    assert any("2 places  ·  3 objects, 2 of them shown" in text for text in texts)
+    assert any("2 places  ·  2 objects + 1 seen once  ·" in text for text in texts)
+
+
+def test_objects_seen_once_are_shown_when_all_are_asked_for() -> None:
+    view = _two_places()
+    texts = _texts(compose(view, "", HousePlan(), objects=objects_shown(view, everything=True)))
+    assert "rare" in texts
+    assert any("2 objects + 1 seen once, 3 shown  ·" in text for text in texts)
+    often = objects_shown(view, everything=True, min_observations=3)
+    assert [found.class_name for found in often] == ["<vase>"]
+    assert [shown.label for shown in objects_of(view)] == ["cup & saucer", "<vase>"]
+    assert [shown.label for shown in objects_of(view, everything=True)][2:] == ["rare"]
 
 
 def test_names_of_places_carry_the_run_where_two_runs_have_the_same() -> None:
@@ -97,7 +110,8 @@ def test_a_long_name_is_cut() -> None:
 def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
     view = _two_places()
     box = (0.0, 0.0, 1.0, 1.0)
-    view.apply(d.ObservationAdded(3, 3, 4, "run", 4, "d3", "<vase>", 0.9, box, None, None, False))
+    seen = (3, 3, 4, "run", 4, "d3", "<vase>", 0.9, box, None, None, False)
+    view.apply(d.ObservationAdded(*seen, measured=True))
     view.apply(d.ObjectFound(4, 3, "obj-3", "<vase>", 3))
     view.apply(d.ObjectSeen(4, 3, 3, 0, 2, 8_000_000, 1_000_000, 0.0, 0.0))
     view.apply(d.ObjectMoved(4, 3, 0))
@@ -107,7 +121,8 @@ def test_objects_of_one_class_far_apart_keep_labels_of_their_own() -> None:
 def test_objects_of_one_class_in_one_place_share_a_label() -> None:
     view = _two_places()
     box = (0.0, 0.0, 1.0, 1.0)
-    view.apply(d.ObservationAdded(3, 3, 3, "run", 3, "d3", "<vase>", 0.9, box, None, None, False))
+    seen = (3, 3, 3, "run", 3, "d3", "<vase>", 0.9, box, None, None, False)
+    view.apply(d.ObservationAdded(*seen, measured=True))
     view.apply(d.ObjectFound(3, 3, "obj-3", "<vase>", 3))
     view.apply(d.ObjectSeen(3, 3, 3, 0, 2, 6_000_000, 1_000_000, 0.0, 0.0))
     view.apply(d.ObjectMoved(3, 3, 0))
@@ -134,7 +149,8 @@ def _add_objects(view: MapView, names: Iterable[str]) -> None:
     for number, name in enumerate(names, start=3):
         view.apply(
             d.ObservationAdded(
-                number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False
+                *(number, number, 0, "run", 0, f"d{number}", name, 0.9, box, None, None, False),
+                measured=True,
             )
         )
         view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))

@@ -43,7 +43,8 @@ def view_with(settings: Settings, *deltas: d.Delta) -> MapView:
         box = (0.0, 0.0, 1.0, 1.0)
         view.apply(
             d.ObservationAdded(
-                2, number, 2, "run", 2, f"d{number}", name, 0.9, box, None, None, False
+                *(2, number, 2, "run", 2, f"d{number}", name, 0.9, box, None, None, False),
+                measured=True,
             )
         )
         view.apply(d.ObjectFound(2, number, f"obj-{number}", name, number))

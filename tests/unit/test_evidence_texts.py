@@ -9,10 +9,11 @@ from eventsrc.envelope.model import Offset
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.history.diff import difference_of
+from projections.history.diff_rendering import difference_text
 from projections.history.explanation import Explanation
 from projections.history.merge_reasons import object_merge_document
 from projections.history.object_explanation import explain_object
-from projections.history.rendering import difference_text, explanation_text, object_merges_text
+from projections.history.rendering import explanation_text, object_merges_text
 from projections.map.view import MapView
 from tests.support.memory_history import MemoryHistory
 
@@ -190,8 +191,11 @@ def test_a_difference_names_what_evidence_changed() -> None:
     views = [told(EVENTS[:end])[1] for end in (2, 4, 6, 9)]
     texts = [difference_text(difference_of(a, b, {}, ()), most=None) for a, b in pairwise(views)]
     assert "chair → stool, seen 1 → 3 times" in texts[0]
-    assert "stands 0.20 m elsewhere, ± 0.80 → 0.12 m" in texts[0]
-    assert "obj-a stool: missing\n" in texts[1]
-    assert "not missing any more" in texts[2]
+    assert "± 0.80 → 0.12 m" in texts[0]
+    assert "- obj-b stool: joined into obj-a\n" in texts[0]
+    assert "1 other shifted by less than its error\n" in texts[0]
+    assert "! obj-a stool: missing at (1.20, 2.00), no place\n" in texts[1]
+    assert "> obj-a stool: moved 3.00 ± 0.28 m, (1.20, 2.00) → (4.20, 2.00)\n" in texts[2]
+    assert "! obj-a stool: back at (1.20, 2.00), no place\n" in texts[2]
     after = difference_of(views[1], views[2], {}, ()).document()["objects"]["changed"][0]["after"]
     assert (after["est_x"], after["missing"], after["spots"]) == (1.2, True, 3)

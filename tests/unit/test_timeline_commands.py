@@ -24,13 +24,13 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
 from projections.fold.settings import Settings
 from projections.history import LogTimeline, NoSuchThing
+from projections.history.diff_rendering import difference_text
 from projections.history.merge_reasons import (
     merge_document,
     object_merge_document,
     refusal_document,
 )
 from projections.history.rendering import (
-    difference_text,
     merge_text,
     merges_text,
     object_merges_text,

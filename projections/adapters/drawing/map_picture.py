@@ -13,11 +13,13 @@ from projections.adapters.scene import (
     HousePlan,
     LostRobot,
     MergeMark,
-    objects_seen,
+    objects_shown,
     place_names,
     spot_of,
 )
 from projections.fold.deltas import PlacesMerged
+from projections.map.confirmed import objects_text
+from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 from projections.store.history_records import Merge
 
@@ -59,15 +61,17 @@ def draw_map(
     plan: HousePlan | None = None,
     lost: LostRobot | None = None,
     marks: Sequence[MergeMark] = (),
-    min_observations: int = 2,
+    everything: bool = False,
+    min_observations: int = 1,
 ) -> None:
     """Draw ``view`` to ``out``, in the format of its suffix (.png, .svg, .pdf).
 
-    Objects seen fewer than ``min_observations`` times are left out. Raises MisuseError when ``out``
-    cannot be written or has another suffix.
+    Objects with fewer than ``min_observations`` are left out, and without ``everything`` those that
+    are not confirmed. Raises MisuseError when ``out`` cannot be written or has another suffix.
     """
     check_suffix(out)
-    compose(view, title, plan or HousePlan(), lost, marks, min_observations).save(out)
+    shown = objects_shown(view, everything=everything, min_observations=min_observations)
+    compose(view, title, plan or HousePlan(), lost, marks, shown).save(out)
 
 
 def map_png(view: MapView, title: str) -> bytes:
@@ -81,12 +85,13 @@ def compose(
     plan: HousePlan,
     lost: LostRobot | None = None,
     marks: Sequence[MergeMark] = (),
-    min_observations: int = 2,
+    objects: Sequence[ObjectRecord] | None = None,
 ) -> Sheet:
-    """The finished sheet, not yet written to a file."""
+    """The finished sheet, not yet written to a file; ``objects`` are those to draw, by default the
+    confirmed ones."""
     by_evidence = view.settings.fusion == "evidence"
-    shown = objects_seen(view, min_observations) if by_evidence else []
-    standing = [found.spot for found in shown]
+    shown = objects_shown(view) if objects is None else objects
+    standing = [found.spot for found in shown] if by_evidence else []
     sheet = new_sheet(view, plan, [*standing, *wall_spots(view)])
     draw_floor(sheet, plan)
     draw_map_walls(sheet, view)
@@ -100,24 +105,23 @@ def compose(
     sheet.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
     draw_room_names(sheet, plan)
     draw_merge_marks(sheet, marks)
-    left_out = draw_objects(sheet, view, min_observations)
+    left_out = draw_objects(sheet, shown)
     sheet.header(0, title, 14, palette.INK, "bold")
-    sheet.header(1, _numbers(view, min_observations), 9.5, palette.SMALL_PRINT)
+    sheet.header(1, _numbers(view, len(shown)), 9.5, palette.SMALL_PRINT)
     legend = legend_lines(lost, marks, left_out, by_evidence=by_evidence)
     for line, text in enumerate(legend):
         sheet.footer(line, text, palette.SMALL_PRINT)
     return sheet
 
 
-def _numbers(view: MapView, min_observations: int) -> str:
+def _numbers(view: MapView, shown: int) -> str:
     counts, settings = view.counts(), view.settings
-    shown = sum(found.obs_count >= min_observations for found in view.objects.values())
+    drawn = "" if shown == counts["confirmed"] else f", {shown:,} shown"
     keyframes = counts["poses" if view.floors else "keyframes"]
     return (
         f"{counted(keyframes, 'keyframe')} ({counts['noise']} in no place)  ·  "
         f"{counted(counts['places'], 'place')}  ·  "
-        f"{counted(counts['objects'], 'object')}, {shown} of them shown: seen "
-        f"{counted(min_observations, 'time')} or more  ·  {settings.places_text()}"
+        f"{objects_text(view.objects.values())}{drawn}  ·  {settings.places_text()}"
     )
 
 

@@ -5,7 +5,7 @@ clear of it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from matplotlib.patches import Circle, Ellipse
 
@@ -68,9 +68,9 @@ def draw_room_names(sheet: Sheet, plan: HousePlan) -> None:
         _draw_text(sheet, (free or boxes)[0], name, 9.5, palette.ROOM_NAME, style="italic")
 
 
-def draw_objects(sheet: Sheet, view: MapView, min_observations: int) -> int:
+def draw_objects(sheet: Sheet, objects: Iterable[ObjectRecord]) -> int:
     """A dot for each object, a label for each group; returns how many labels did not fit."""
-    groups = object_groups(view, min_observations)
+    groups = object_groups(objects)
     for group in groups:
         colour = palette.INK if group.place is None else palette.place_colour(group.place)
         xs, ys = zip(*(member.spot for member in group.members), strict=True)

@@ -109,6 +109,7 @@ def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
             obs_count=found.obs_count,
             sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
             missing=True if found.missing_in is not None else None,
+            confirmed=found.confirmed,
         )
 
 

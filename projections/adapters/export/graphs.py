@@ -53,6 +53,7 @@ def _graph(view: MapView) -> "networkx.Graph":
                 sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
                 obs_count=found.obs_count,
                 missing=True if found.missing_in is not None else None,
+                confirmed=found.confirmed,
             ),
         )
         if found.place is not None:

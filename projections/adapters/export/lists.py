@@ -82,10 +82,11 @@ def _objects(view: MapView) -> _Table:
                 found.first_seen,
                 found.last_seen,
                 "true" if found.missing_in is not None else "false",
+                "true" if found.confirmed else "false",
             )
         )
     names = ("object_id", "class_name", "place_id", "mean_x", "mean_y", "est_x", "est_y")
-    more = ("est_sigma_m", "obs_count", "first_seen", "last_seen", "missing")
+    more = ("est_sigma_m", "obs_count", "first_seen", "last_seen", "missing", "confirmed")
     return (*names, *more), rows
 
 

@@ -194,10 +194,13 @@ class PastMaps:
 class Playback(ServerListener):
     """A server of past maps, which listens from its construction until `run` has ended.
 
-    Raises OSError where it cannot listen. At first it shows the end of the log, paused.
+    Objects that are not confirmed are shown only with ``everything``. Raises OSError where it
+    cannot listen. At first it shows the end of the log, paused.
     """
 
-    def __init__(self, maps: PastMaps, name: str, host: str, port: int) -> None:
+    def __init__(
+        self, maps: PastMaps, name: str, host: str, port: int, *, everything: bool = False
+    ) -> None:
         self._maps = maps
         self._first_ns, self._last_ns = maps.moments.span_ns
         self._changed = threading.Condition()
@@ -206,7 +209,7 @@ class Playback(ServerListener):
         self._playing, self._speed = False, 1.0
         self._to_show, self._ended = False, False
         context = Context()
-        self._topics = MapTopics(context)
+        self._topics = MapTopics(context, everything=everything)
         self._topics.declare(maps.moments.topics, maps.floors)
         try:
             self.server: WebSocketServer = start_server(

@@ -16,11 +16,11 @@ from projections.map.scenes import RecordedFold
 from .topics import MapTopics
 
 
-def write_recording(fold: RecordedFold, path: Path) -> int:
+def write_recording(fold: RecordedFold, path: Path, *, everything: bool = False) -> int:
     """Record a fold's events and the maps that they make; returns the number of scenes.
 
-    The same log gives the same bytes. Raises FoldError at an event that cannot be folded, and what
-    `written_whole` raises.
+    Scenes have Objects that are not confirmed only with ``everything``. The same log gives the same
+    bytes. Raises FoldError at an event that cannot be folded, and what `written_whole` raises.
     """
     context, scenes = Context(), 0
     with written_whole(path) as file:
@@ -28,7 +28,7 @@ def write_recording(fold: RecordedFold, path: Path) -> int:
             raise MisuseError(f"{path}: an MCAP recording goes to a file, not a pipe; choose one")
         sink = _Sink(file)
         with open_mcap(sink, context=context):
-            topics = MapTopics(context)
+            topics = MapTopics(context, everything=everything)
             for event, now, deltas, is_scene in fold:
                 topics.event(event, now)
                 topics.changes(change_lines(fold.view, deltas), now)

@@ -83,9 +83,11 @@ _RECORDED: Final = "/recorded"
 
 
 class MapTopics:
-    """Publishes to whatever sinks ``context`` has."""
+    """Publishes to whatever sinks ``context`` has; Objects that are not confirmed only with
+    ``everything``."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, *, everything: bool) -> None:
+        self._everything = everything
         self._context = context
         self._scene = SceneUpdateChannel("/mapfold/map", context=context)
         self._changes = LogChannel("/mapfold/changes", context=context)
@@ -148,7 +150,8 @@ class MapTopics:
         self, view: MapView, merges: Sequence[PlacesMerged], time_ns: int, **state: Any
     ) -> None:
         """The whole map and its counts; ``state`` is added to these."""
-        self._scene.log(map_scene(view, merges, time_ns), log_time=time_ns)
+        scene = map_scene(view, merges, time_ns, everything=self._everything)
+        self._scene.log(scene, log_time=time_ns)
         self._state.log({"offset": view.next_offset, **state, **view.counts()}, log_time=time_ns)
 
     def walls(self, view: MapView, given: MapGiven, time_ns: int) -> None:
@@ -209,13 +212,16 @@ def timestamp(time_ns: int) -> Timestamp:
     return Timestamp(sec=max(time_ns, 0) // _SECOND_NS, nsec=max(time_ns, 0) % _SECOND_NS)
 
 
-def map_scene(view: MapView, merges: Iterable[PlacesMerged], time_ns: int) -> SceneUpdate:
-    """Places with outline and name, Objects, adjacency, the path of each run, and a mark where each
-    of ``merges`` happened; entities in that order, those of a kind by ordinal."""
+def map_scene(
+    view: MapView, merges: Iterable[PlacesMerged], time_ns: int, *, everything: bool
+) -> SceneUpdate:
+    """Places with outline and name, confirmed Objects or with ``everything`` all, adjacency, the
+    path of each run, and a mark where each of ``merges`` happened; entities in that order, those of
+    a kind by ordinal."""
     now = timestamp(time_ns)
     places = places_of(view)
-    parts = [*_places(view, places), *_objects(view), *_ways(view, ways_of(view, places))]
-    parts += [*_paths(view), *_merges(view, merges)]
+    parts = [*_places(view, places), *_objects(view, everything=everything)]
+    parts += [*_ways(view, ways_of(view, places)), *_paths(view), *_merges(view, merges)]
     return SceneUpdate(
         deletions=[SceneEntityDeletion(timestamp=now, type=SceneEntityDeletionType.All)],
         entities=[
@@ -282,8 +288,8 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
         yield f"place/{place.place_id}", shapes
 
 
-def _objects(view: MapView) -> Iterator[_Part]:
-    for shown in objects_of(view):
+def _objects(view: MapView, *, everything: bool) -> Iterator[_Part]:
+    for shown in objects_of(view, everything=everything):
         found, missing = shown.record, shown.missing
         z = height(view, shown.floor) + 0.2
         colour = _GREY if found.place is None else _colour(found.place)

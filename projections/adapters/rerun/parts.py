@@ -87,9 +87,10 @@ class Graph:
 Part = Dots | Lines | Arrow | Graph
 
 
-def map_parts(view: MapView) -> dict[Path, Part]:
-    """The whole map but for the robot."""
-    places, objects = places_of(view), objects_of(view)
+def map_parts(view: MapView, *, everything: bool) -> dict[Path, Part]:
+    """The whole map but for the robot, and without ``everything`` for Objects that are not
+    confirmed."""
+    places, objects = places_of(view), objects_of(view, everything=everything)
     ways = ways_of(view, places)
     parts: dict[Path, Part] = {("graph",): _graph(view, places, objects, ways)}
     for floor, given in view.maps_in_force().items():

@@ -53,9 +53,12 @@ _Y_UP: Final = rerun.Transform3D(scale=[1.0, -1.0, 1.0])
 """Rerun's 2D view has y downwards."""
 
 
-def write_recording(fold: RecordedFold, path: File, recording_id: str) -> int:
+def write_recording(
+    fold: RecordedFold, path: File, recording_id: str, *, everything: bool = False
+) -> int:
     """Record the maps of a fold; returns the number of scenes.
 
+    Maps have Objects that are not confirmed only with ``everything``.
     The viewer shows two recordings of one ``recording_id`` as one. Raises FoldError at an
     event that cannot be folded, and what `written_whole` raises.
     """
@@ -73,7 +76,7 @@ def write_recording(fold: RecordedFold, path: File, recording_id: str) -> int:
         with written_whole(path) as file, _copied_to(file) as pipe:
             recording.save(pipe, default_blueprint=_blueprint())
             try:
-                scenes = _record(fold, recording)
+                scenes = _record(fold, recording, everything=everything)
                 recording.flush()
             finally:
                 recording.disconnect()  # closes the pipe, for whose end `_copied_to` waits
@@ -109,7 +112,7 @@ def _copied_to(file: OutputFile) -> Iterator[File]:
         raise failed[0]
 
 
-def _record(fold: RecordedFold, recording: rerun.RecordingStream) -> int:
+def _record(fold: RecordedFold, recording: rerun.RecordingStream, *, everything: bool) -> int:
     series, scenes = _Series(), 0
     recording.send_recording_start_time_nanos(fold.moments.span_ns[0])
     the_map, robot = _Shown(recording), _Shown(recording)
@@ -123,7 +126,7 @@ def _record(fold: RecordedFold, recording: rerun.RecordingStream) -> int:
         robot.show(robot_parts(fold.view))
         series.add(fold.view, event, now)
         if is_scene:
-            the_map.show(map_parts(fold.view))
+            the_map.show(map_parts(fold.view, everything=everything))
             scenes += 1
     series.send(recording)
     recording.send_blueprint(_blueprint(fold.view))

@@ -163,10 +163,11 @@ def read_objects_of_place(connection: Connection, place_id: str) -> list[dict[st
     ]
 
 
-def read_object_counts(connection: Connection, class_name: str) -> dict[int, int]:
-    """Number of Objects of a class, by Place ordinal; only Places that have one."""
+def read_object_counts(connection: Connection, class_name: str) -> dict[int, tuple[int, int]]:
+    """Number of Objects of a class, and of confirmed ones, by Place ordinal; only Places that have
+    one."""
     rows = _rows(connection, "object_counts", id=text(class_name))
-    return {_ordinal(graphid): count for graphid, count in rows}
+    return {_ordinal(graphid): (count, confirmed) for graphid, count, confirmed in rows}
 
 
 def _read_square(connection: Connection, kind: str, x: float, y: float, r: float) -> list[Any]:

@@ -4,7 +4,6 @@ A `MapSource` has the data they need: `LiveMap` in the graph's database, `Folded
 have the same methods.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final, TypeAlias
 
@@ -33,6 +32,7 @@ _RECORD_FIELDS: Final = (
     "obs_count",
     "first_seen",
     "last_seen",
+    "confirmed",
 )
 _ESTIMATE_FIELDS: Final = ("est_x", "est_y", "est_sigma_m")
 _OBJECT_FIELDS: Final = (
@@ -57,8 +57,9 @@ class LiveMap:
         """All Places and their adjacency."""
         return read_place_graph(self._connection)
 
-    def count_objects(self, class_name: str) -> dict[int, int]:
-        """Number of Objects of a class, by Place ordinal; only Places that have one."""
+    def count_objects(self, class_name: str) -> dict[int, tuple[int, int]]:
+        """Number of Objects of a class, and of confirmed ones, by Place ordinal; only Places that
+        have one."""
         return read_object_counts(self._connection, class_name)
 
     def find_object(self, object_id: str) -> dict[str, Any] | None:
@@ -85,14 +86,15 @@ class FoldedMap:
         """All Places and their adjacency."""
         return PlaceGraph.of_view(self._view)
 
-    def count_objects(self, class_name: str) -> dict[int, int]:
-        """Number of Objects of a class, by Place ordinal; only Places that have one."""
-        objects = self._view.objects.values()
-        return Counter(
-            each.place
-            for each in objects
-            if each.class_name == class_name and each.place is not None
-        )
+    def count_objects(self, class_name: str) -> dict[int, tuple[int, int]]:
+        """Number of Objects of a class, and of confirmed ones, by Place ordinal; only Places that
+        have one."""
+        found: dict[int, tuple[int, int]] = {}
+        for each in self._view.objects.values():
+            if each.class_name == class_name and each.place is not None:
+                count, confirmed = found.get(each.place, (0, 0))
+                found[each.place] = count + 1, confirmed + each.confirmed
+        return found
 
     def find_object(self, object_id: str) -> dict[str, Any] | None:
         """An Object with its place_id."""
@@ -198,7 +200,12 @@ def places_holding(
     counts = source.count_objects(class_name)
     order = sorted((p for p in within if p in counts), key=lambda p: (within[p], p))
     return [
-        {"place_id": graph.places[p].place_id, "hops": within[p], "objects": counts[p]}
+        {
+            "place_id": graph.places[p].place_id,
+            "hops": within[p],
+            "objects": counts[p][0],
+            "confirmed": counts[p][1],
+        }
         | _named(graph.places[p])
         for p in order
     ]

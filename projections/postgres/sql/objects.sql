@@ -33,8 +33,9 @@ WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[its.properties, '"place_i
 ORDER BY thing.id
 
 -- name: object_counts
--- Places with Objects of a class, and how many.
-SELECT located.end_id::text, count(*)
+-- Places with Objects of a class, how many, and how many of them are confirmed.
+SELECT located.end_id::text, count(*),
+       count(*) FILTER (WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"confirmed"'::ag_catalog.agtype]) = 'true'::ag_catalog.agtype)
 FROM {object} AS thing JOIN {located_in} AS located ON located.start_id = thing.id
 WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"class_name"'::ag_catalog.agtype])
     = %(id)s::text::ag_catalog.agtype

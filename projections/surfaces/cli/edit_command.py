@@ -15,7 +15,7 @@ from projections.edit.make import Stamp
 from projections.edit.record import Made, MakeCommand, make_command, record_command, void_text
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.settings import Settings
-from projections.history.rendering import difference_text
+from projections.history.diff_rendering import difference_text
 
 from .folded_log import FoldSettings, settings_from
 from .options import JsonOption, ZenohClient, user_at_host

@@ -15,6 +15,7 @@ from eventsrc.base.text import counted
 from eventsrc.base.user_files import write_files
 from eventsrc.record.transport.config import is_loopback
 from projections.fold.corrections import map_fingerprint
+from projections.map.confirmed import objects_text
 from projections.map.one_floor import view_of_floor
 from projections.map.scenes import RecordedFold
 from projections.store.history_recorder import map_after
@@ -85,6 +86,10 @@ def export(
             " counter-clockwise from east, for --geojson [default: coordinates are metres].",
         ),
     ] = None,
+    all_: Annotated[
+        bool,
+        typer.Option("--all", help="Objects seen once, too, in --foxglove and --rerun."),
+    ] = False,
     floor: Annotated[
         str | None,
         typer.Option(
@@ -97,7 +102,8 @@ def export(
     """Write the map folded to a point in the log for other programs.
 
     GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and recordings for Foxglove and Rerun, one or
-    several at once. The same log and settings give the same bytes; for Rerun, the same data.
+    several at once. The same log and settings give the same bytes; for Rerun, the same data. Files
+    have all objects, with whether each is confirmed; recordings show the confirmed ones.
     """
     files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
     recordings = {"foxglove": foxglove, "rerun": rerun}
@@ -110,6 +116,8 @@ def export(
         raise MisuseError("--csv-raw is for --csv")
     if every is not None and not any(recordings.values()):
         raise MisuseError("--every is for --foxglove and --rerun")
+    if all_ and not any(recordings.values()):
+        raise MisuseError("--all is for --foxglove and --rerun; the other files have all objects")
     if floor is not None and foxglove is not None:
         raise MisuseError("--foxglove shows all floors, one above the other; leave --floor out")
     if floor is not None and rerun is not None:
@@ -120,9 +128,8 @@ def export(
     with source.opened(at, known_at) as (reader, end, _, corrections, settings):
         for name, file in recordings.items():
             if file is not None:
-                write = _recorder(
-                    name, f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
-                )
+                made = f"{reader.log_id} {map_fingerprint(settings, corrections)} {end} {every}"
+                write = _recorder(name, f"{made} all" if all_ else made, everything=all_)
                 with Bar() as bar:
                     fold = RecordedFold(
                         reader,
@@ -151,25 +158,27 @@ def export(
     if csv is not None:
         texts |= {csv / name: text for name, text in formats.tables(view, raw=csv_raw).items()}
     write_files({path: text.encode() for path, text in texts.items()})
-    places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
+    places, objects = counted(len(view.places), "place"), objects_text(view.objects.values())
     say(f"wrote {', '.join(map(str, texts))}: {places}, {objects}")
 
 
-def _recorder(name: str, identity: str) -> Callable[[RecordedFold, Path], int]:
+def _recorder(
+    name: str, identity: str, *, everything: bool = False
+) -> Callable[[RecordedFold, Path], int]:
     """The function that writes the recordings of an option. Raises MisuseError if its extra is not
     installed."""
     try:
         if name == "foxglove":
             from projections.adapters.foxglove.recording import write_recording
 
-            return write_recording
+            return partial(write_recording, everything=everything)
         from projections.adapters.rerun import rrd_recording
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"--{name} needs {error.name}, which is not installed; pip install 'mapfold[{name}]'"
         ) from None
     recording_id = hashlib.sha256(identity.encode()).hexdigest()[:32]
-    return partial(rrd_recording.write_recording, recording_id=recording_id)
+    return partial(rrd_recording.write_recording, recording_id=recording_id, everything=everything)
 
 
 def _degrees(text: str) -> tuple[float, ...]:
@@ -199,6 +208,7 @@ def foxglove(
             metavar="FILE", help="Write a layout there first, for Foxglove to import from file."
         ),
     ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Show objects seen once, too.")] = False,
     known_at: KnownAtOption = None,
     source: LogSettings,
 ) -> None:
@@ -233,7 +243,7 @@ def foxglove(
                 " before; the timeline shows them at that event's time"
             )
         try:
-            playback = Playback(maps, source.log.resolve().name, host, port)
+            playback = Playback(maps, source.log.resolve().name, host, port, everything=all_)
         except (OSError, UnicodeError) as error:  # the latter of a host that is no text
             raise MisuseError(
                 f"cannot listen on {host}:{port}: {error}; give another --host or --port"

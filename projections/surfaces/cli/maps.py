@@ -9,6 +9,7 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
+from projections.map.confirmed import objects_text
 from projections.map.digest import map_digest
 from projections.map.state_output import (
     camera_advice,
@@ -31,6 +32,9 @@ def state(
     at: FoldToOption = "end",
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
+    all_: Annotated[
+        bool, typer.Option("--all", help="Count objects seen once in the places, too.")
+    ] = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
     no_digest: Annotated[
         bool,
@@ -59,7 +63,7 @@ def state(
     elif digest:
         display(f"{hexdigits}\n")
     else:
-        display(state_text(view, hexdigits, known))
+        display(state_text(view, hexdigits, known, everything=all_))
     if digest:
         return
     counts = view.counts()
@@ -81,9 +85,10 @@ def draw(
             metavar="SEED", help="Draw the plan of this simulated house under the map.", min=0
         ),
     ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Draw objects seen once, too.")] = False,
     min_observations: Annotated[
-        int, typer.Option(metavar="N", help="Leave out objects seen less often.", min=1)
-    ] = 2,
+        int, typer.Option(metavar="N", help="Leave out objects with fewer observations.", min=1)
+    ] = 1,
     floor: Annotated[
         str | None,
         typer.Option(
@@ -124,7 +129,8 @@ def draw(
             title=title,
             plan=None if house is None else plan_of(build_house(house)),
             marks=merge_marks(view, merged) if merges else (),
+            everything=all_,
             min_observations=min_observations,
         )
-    places, objects = counted(len(view.places), "place"), counted(len(view.objects), "object")
-    say(f"wrote {out}: {places}, {objects}")
+    places = counted(len(view.places), "place")
+    say(f"wrote {out}: {places}, {objects_text(view.objects.values())}")

@@ -33,6 +33,7 @@ query = typer.Typer(
     no_args_is_help=True, help="Ask the map: similar, where, contents, holding, path."
 )
 
+AllOption = Annotated[bool, typer.Option("--all", help="Print objects seen once, too.")]
 PlaceArgument = Annotated[
     str, typer.Argument(metavar="PLACE", help="A place: p3, a name, a type of room.")
 ]
@@ -123,12 +124,23 @@ def where(
 def contents(
     *,
     place: PlaceArgument,
+    all_: AllOption = False,
     asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
-    """List the objects located in a place."""
+    """List the objects located in a place.
+
+    Those seen once, from one spot at one time, are only counted; --json has all.
+    """
     with asked.source() as source:
-        _print(objects_of(source, place), json_)
+        found = objects_of(source, place)
+    once = 0 if json_ or all_ else sum(not thing["confirmed"] for thing in found)
+    if once:
+        found = [thing for thing in found if thing["confirmed"]]
+    if found or not once:
+        _print(found, json_)
+    if once:
+        say(f"+ {once:,} seen once; --all prints them")
 
 
 @query.command()
@@ -137,15 +149,18 @@ def holding(
     class_name: Annotated[str, typer.Argument(metavar="CLASS", help="A class, such as cup.")],
     start: Annotated[str, typer.Option("--from", metavar="PLACE", help="The place to start from.")],
     hops: Annotated[int, typer.Option("--hops", metavar="N", min=0, help="Most steps.")] = 2,
+    all_: AllOption = False,
     asked: AskedMap,
     json_: JsonOption = False,
 ) -> None:
     """List the places near a place that hold an object of a class.
 
-    Near is at most --hops steps away; a step is from a place to an adjacent one.
+    Near is at most --hops steps away; a step is from a place to an adjacent one. Places where such
+    objects were only seen once are left out, unless --all or --json is given.
     """
     with asked.source() as source:
-        _print(places_holding(source, class_name, start, hops), json_)
+        found = places_holding(source, class_name, start, hops)
+    _print([place for place in found if json_ or all_ or place["confirmed"]], json_)
 
 
 @query.command()

@@ -14,13 +14,13 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
 from projections.history.condition_functions import functions_help
+from projections.history.diff_rendering import difference_text
 from projections.history.merge_reasons import (
     merge_document,
     object_merge_document,
     refusal_document,
 )
 from projections.history.rendering import (
-    difference_text,
     explanation_text,
     merge_text,
     merges_text,

@@ -15,8 +15,9 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import compile_corrections
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
+from projections.history.diff_rendering import difference_text
 from projections.history.merge_reasons import merge_document
-from projections.history.rendering import difference_text, search_text
+from projections.history.rendering import search_text
 from projections.history.rule_folds import Rules
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
 from projections.history.whatif_rendering import whatif_text

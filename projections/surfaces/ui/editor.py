@@ -31,7 +31,7 @@ from projections.edit.record import (
 )
 from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
-from projections.history.rendering import difference_text
+from projections.history.diff_rendering import difference_text
 
 from .comparisons import MOST_LINES
 from .log_map import Opened, PrefixReader

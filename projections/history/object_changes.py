@@ -1,0 +1,221 @@
+"""What became of the Objects of one map in a later one: moved, missing, joined, or seen again.
+
+The fold decides: what has moved has a relocation (`fold.evidence_fusion`) and stands elsewhere by
+more than both errors; what is not where it should be is missing (`fold.presence`). An estimate that
+shifts without a relocation is better known, not moved; it is only counted. With fusion=page there
+is no estimate, only the mean position of the robot, which says nothing about moves: of those that
+shift by more than the spread of the positions 3 % were moved, so none is called so.
+
+A change is *sure* when
+
+* the Object's estimate before, and after a move the new one, has a standard error of at most
+  `_KNOWN_M`; and
+* no other Object of its class stands, in the later map, where it stood: all are farther from there
+  than both errors explain (`_BEYOND`). Otherwise it may have been exchanged for one that looks the
+  same: where an alike one is at the old place, the one that is elsewhere is another.
+
+On generated buildings with a fifth of the movable things moved, 94 % of the sure changes are true
+and 82 % of all (developing half; docs/decisions/fusion.md has the validating half).
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from projections.map.records import EstimatedPosition, Relocation
+
+_KNOWN_M: Final = 0.5
+_BEYOND: Final = 9.21
+"""99 % of the squared normalised distances of two estimates of one position."""
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectRow:
+    """An object: its mean position in metres, its detections in order; under fusion by evidence
+    where it stands, and whether it is missing."""
+
+    object_id: str
+    class_name: str
+    mean_x: float
+    mean_y: float
+    place_id: str | None
+    first_seen: float
+    last_seen: float
+    det_ids: tuple[str, ...]
+    estimate: EstimatedPosition | None = None
+    missing: bool = False
+    relocations: tuple[Relocation, ...] = ()
+    confirmed: bool = False
+
+    @property
+    def spot(self) -> Point:
+        """Where it stands, in metres; without an estimate the mean position."""
+        at = self.estimate
+        return (self.mean_x, self.mean_y) if at is None else (at.est_x, at.est_y)
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectMove:
+    """An Object that the fold found elsewhere; ``error_m`` is the distance's standard error."""
+
+    before: ObjectRow
+    after: ObjectRow
+    error_m: float
+    sure: bool
+
+    @property
+    def distance_m(self) -> float:
+        """From where it stood to where it stands."""
+        return math.dist(self.before.spot, self.after.spot)
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectAbsence:
+    """An Object that is missing in one of the two maps only: in the second one, unless it is
+    ``back``."""
+
+    before: ObjectRow
+    after: ObjectRow
+    back: bool
+    sure: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectChanges:
+    """``moved`` by distance, largest first; ``missing`` and those that are back. ``jitter`` counts
+    other Objects whose estimate, or mean position, shifted within both errors, ``corrected`` those
+    that shifted by more. ``joined`` are ids of Objects that are part of another one in the second
+    map, with that one's id."""
+
+    moved: tuple[ObjectMove, ...]
+    missing: tuple[ObjectAbsence, ...]
+    jitter: int
+    corrected: int
+    joined: Mapping[str, str]
+
+
+def object_shift_m(before: ObjectRow, after: ObjectRow) -> float:
+    """The distance in metres between the estimates of an Object; where one of them has none, that
+    between the mean positions that it was seen from."""
+    if before.estimate is None or after.estimate is None:
+        return math.hypot(after.mean_x - before.mean_x, after.mean_y - before.mean_y)
+    return math.dist(before.spot, after.spot)
+
+
+def object_changes(
+    first: Mapping[str, ObjectRow],
+    second: Mapping[str, ObjectRow],
+    changed: Iterable[tuple[ObjectRow, ObjectRow]],
+    joined: Mapping[str, str],
+    *,
+    is_forward: bool,
+) -> ObjectChanges:
+    """What became of the ``changed`` Objects; backwards, ``first`` is the later map."""
+    later = _by_class(second if is_forward else first)
+    moved: list[ObjectMove] = []
+    missing: list[ObjectAbsence] = []
+    jitter = corrected = 0
+    for before, after in changed:
+        old, new = (before, after) if is_forward else (after, before)
+        is_relocated = any(each not in old.relocations for each in new.relocations)
+        is_moved = is_relocated and not _is_within(old.estimate, new.estimate)
+        if is_moved:
+            errors = [row.estimate.est_sigma_m for row in (old, new) if row.estimate is not None]
+            is_sure = _is_sure(old, later, max(errors, default=math.inf))
+            moved.append(ObjectMove(before, after, math.hypot(*errors), is_sure))
+        if before.missing != after.missing:
+            error = math.inf if old.estimate is None else old.estimate.est_sigma_m
+            is_sure = _is_sure(old, later, error)
+            missing.append(ObjectAbsence(before, after, before.missing, is_sure))
+        if not is_moved and before.spot != after.spot:
+            if _is_within(before.estimate, after.estimate):
+                jitter += 1
+            else:
+                corrected += 1
+    moved.sort(key=lambda move: (-move.distance_m, move.before.object_id))
+    return ObjectChanges(tuple(moved), tuple(missing), jitter, corrected, joined)
+
+
+def _is_sure(old: ObjectRow, later: Mapping[str, list[ObjectRow]], error_m: float) -> bool:
+    return error_m <= _KNOWN_M and not any(
+        other.object_id != old.object_id and _is_within(old.estimate, other.estimate)
+        for other in later.get(old.class_name, ())
+    )
+
+
+def _by_class(rows: Mapping[str, ObjectRow]) -> dict[str, list[ObjectRow]]:
+    found: dict[str, list[ObjectRow]] = {}
+    for row in rows.values():
+        found.setdefault(row.class_name, []).append(row)
+    return found
+
+
+def _is_within(one: EstimatedPosition | None, other: EstimatedPosition | None) -> bool:
+    """Whether the errors of two estimates explain their distance; so for mean positions, whose
+    shifts mean nothing."""
+    if one is None or other is None:
+        return True
+    dx, dy = other.est_x - one.est_x, other.est_y - one.est_y
+    sums = zip(one.covariance_m2, other.covariance_m2, strict=True)
+    xx, xy, yy = (a + b for a, b in sums)
+    return yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy <= _BEYOND * (xx * yy - xy * xy)
+
+
+def object_document(row: ObjectRow) -> dict[str, Any]:
+    """An Object as JSON, without its detections."""
+    at = row.estimate
+    return {
+        "object_id": row.object_id,
+        "class_name": row.class_name,
+        "mean_x": row.mean_x,
+        "mean_y": row.mean_y,
+        "obs_count": len(row.det_ids),
+        "place_id": row.place_id,
+        "first_seen": row.first_seen,
+        "last_seen": row.last_seen,
+        "confirmed": row.confirmed,
+        **(
+            {}
+            if at is None
+            else {
+                "est_x": at.est_x,
+                "est_y": at.est_y,
+                "est_sigma_m": at.est_sigma_m,
+                "spots": at.spots,
+                "missing": row.missing,
+            }
+        ),
+    }
+
+
+def changes_document(found: ObjectChanges) -> dict[str, Any]:
+    """The moved, the missing and the found again as JSON, and the counts of other shifts."""
+    return {
+        "moved": [
+            {
+                "object_id": move.after.object_id,
+                "class_name": move.after.class_name,
+                "from": list(move.before.spot),
+                "to": list(move.after.spot),
+                "moved_m": move.distance_m,
+                "error_m": move.error_m,
+                "sure": move.sure,
+            }
+            for move in found.moved
+        ],
+        "missing": [_absence(each) for each in found.missing if not each.back],
+        "back": [_absence(each) for each in found.missing if each.back],
+        "shifted_within_error": found.jitter,
+        "shifted_beyond_error": found.corrected,
+    }
+
+
+def _absence(found: ObjectAbsence) -> dict[str, Any]:
+    return {
+        "object_id": found.after.object_id,
+        "class_name": found.after.class_name,
+        "at": list(found.before.spot),
+        "sure": found.sure,
+    }
