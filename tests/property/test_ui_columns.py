@@ -77,6 +77,7 @@ def check_same(found: ReplayedMap, view: MapView) -> None:
         assert shown["class_name"] == o.class_name
         assert shown["place"] == o.place
         assert shown["missing"] == (o.missing_in is not None)
+        assert shown["confirmed"] == o.confirmed
 
 
 @pytest.mark.parametrize("rules", [PAGE, EVIDENCE], ids=["page", "evidence"])

@@ -207,6 +207,7 @@ def replay(header: dict[str, Any], arrays: dict[str, list[Any]], end: int) -> Re
                 x=row["x"], y=row["y"], xx=row["xx"], xy=row["xy"], yy=row["yy"],
                 count=row["count"], class_name=strings["class"][row["class"]],
                 place=None if row["place"] < 0 else row["place"], missing=bool(row["missing"]),
+                confirmed=bool(row["confirmed"]),
             )  # fmt: skip
         elif prefix == "om":
             object_gone.add(row["absorbed"])

@@ -40,7 +40,7 @@ def test_the_map_at_a_moment_is_that_of_state(
     page = visit(sample, "#at=349")
     expect(page.locator(".facts")).to_contain_text("7 places")
     expect(page.locator(".facts")).to_contain_text("349 keyframes")
-    expect(page.locator(".facts")).to_contain_text("71 objects")
+    expect(page.locator(".facts")).to_contain_text("35 objects + 36 seen once")
     named = page.locator("ol.places li")
     sizes = {p["place_id"]: p["keyframe_count"] for p in state(mapfold, 349)["places"]}
     shown = [row.split("\n") for row in named.all_inner_texts()]

@@ -294,6 +294,7 @@ def _object_columns(
         "oc_class": np.array([numbers[name] for name in states.class_names], "<i4"),
         "oc_place": states.of("moved", "place", NONE).astype("<i4"),
         "oc_missing": states.is_missing.astype("|u1"),
+        "oc_confirmed": states.is_confirmed.astype("|u1"),
         **rows.named("fused", om_offset="offset", om_survivor="survivor", om_absorbed="absorbed"),
     }
 

@@ -68,14 +68,14 @@ export function randomTables(seed: number, events = 120): Tables {
   }
   function change(offset: number, object: number): Row {
     const place = standing.length === 0 || next() < 0.2 ? -1 : standing[below(standing.length)];
-    return { offset, object, x: Math.fround(next() * 20), y: Math.fround(next() * 10), xx: 1, xy: 0, yy: 1, count: 1 + below(9), class: below(3), place, missing: below(2) };
+    return { offset, object, x: Math.fround(next() * 20), y: Math.fround(next() * 10), xx: 1, xy: 0, yy: 1, count: 1 + below(9), class: below(3), place, missing: below(2), confirmed: below(2) };
   }
   return { through: events, rows, placeIds, objectIds, names };
 }
 
 const TYPES: Record<string, string> = {
   kf_id: "i8", kf_x: "f4", kf_y: "f4", kf_yaw: "f4", kf_stamp: "f8",
-  oc_x: "f4", oc_y: "f4", oc_xx: "f4", oc_xy: "f4", oc_yy: "f4", oc_missing: "u1",
+  oc_x: "f4", oc_y: "f4", oc_xx: "f4", oc_xy: "f4", oc_yy: "f4", oc_missing: "u1", oc_confirmed: "u1",
   ev_stamp: "f8", ev_kind: "u1",
 };
 const FIELDS: Record<string, string[]> = {
@@ -84,7 +84,7 @@ const FIELDS: Record<string, string[]> = {
   pf: ["offset", "place", "founder"],
   mg: ["offset", "survivor", "absorbed", "keyframe"],
   of: ["offset", "object", "class"],
-  oc: ["offset", "object", "x", "y", "xx", "xy", "yy", "count", "class", "place", "missing"],
+  oc: ["offset", "object", "x", "y", "xx", "xy", "yy", "count", "class", "place", "missing", "confirmed"],
   om: ["offset", "survivor", "absorbed"],
   ad: ["offset", "a", "b", "count"],
   ev: ["offset", "stamp", "kind", "ref"],

@@ -3,11 +3,12 @@ import { escaped } from "../src/map/surface";
 import { decodeHistory } from "../src/history/decode";
 import { placeColours } from "../src/model/colours";
 import { compareMoments } from "../src/model/compare";
-import { mapAt } from "../src/model/map_at";
+import { mapAt, shownObjects } from "../src/model/map_at";
 import { Stamps, momentsOf, neighbour, playedTo } from "../src/model/moments";
 import { findKeyframe, keyframeId, label } from "../src/model/names";
 import { searchLocally } from "../src/model/search";
 import { completions, quoted } from "../src/panels/completion";
+import { objectsText } from "../src/ui/summary";
 import { encoded, randomTables } from "./histories";
 
 const history = decodeHistory(encoded(randomTables(5)));
@@ -49,13 +50,49 @@ describe("compareMoments", () => {
       const back = compareMoments(history, b, a);
       if (from === to) expect([there.newKeyframes, there.movedKeyframes, there.places.size, there.objects.size]).toEqual([[], [], 0, 0]);
       expect(there.newKeyframes.length).toBe(b.keyframeCount - a.keyframeCount);
-      const turned = { new: "gone", gone: "new", moved: "moved", changed: "changed" } as const;
+      const turned = { new: "gone", gone: "new", joined: "new", moved: "moved", changed: "changed" } as const;
       expect(new Map([...there.places].map(([place, change]) => [place, turned[change]]))).toEqual(back.places);
       for (const [place, change] of there.places) {
         expect(change === "new").toBe(a.standsAs[place] !== place && b.standsAs[place] === place);
         expect(change === "gone").toBe(a.standsAs[place] === place && b.standsAs[place] !== place);
       }
     }
+  });
+});
+
+describe("objects", () => {
+  const { length } = history.objectIds;
+  const relocating = {
+    ...history,
+    eventKinds: ["keyframe", "object_moved"],
+    events: { ...history.events, offset: new Int32Array(length).fill(60), kind: new Uint8Array(length).fill(1), ref: Int32Array.from({ length }, (_, object) => object) },
+  };
+  const [a, b] = [mapAt(history, 40), mapAt(history, 119)];
+  it("moved where the fold relocated them by more than both errors, the farthest first", () => {
+    const { objects, shifts } = compareMoments(relocating, a, b);
+    const { x, y } = history.changes;
+    const moved = [...Array(length).keys()].filter((object) => {
+      const [was, is] = [a.objectRow[object], b.objectRow[object]];
+      return was >= 0 && is >= 0 && was !== is && (x[is] - x[was]) ** 2 + (y[is] - y[was]) ** 2 > 2 * 9.21;
+    });
+    expect(moved.length).toBeGreaterThan(0);
+    expect([...objects].filter(([, change]) => change === "moved").map(([object]) => object)).toEqual(moved);
+    const far = shifts.map(({ x0, y0, x1, y1 }) => Math.hypot(x1 - x0, y1 - y0));
+    expect(far).toEqual([...far].sort((one, other) => other - one));
+    expect(compareMoments(history, a, b).shifts).toEqual([]);
+  });
+  it("joined another one, rather than gone", () => {
+    const { objects } = compareMoments(history, a, b);
+    const absorbed = new Set(history.objectMerges.absorbed);
+    const ended = [...objects].filter(([, change]) => change === "gone" || change === "joined");
+    expect(ended.length).toBeGreaterThan(0);
+    for (const [object, change] of ended) expect(change === "joined").toBe(absorbed.has(object));
+  });
+  it("are shown when they are confirmed, or all when all are asked for", () => {
+    expect(shownObjects(history, b, true)).toEqual(b.objects);
+    const shown = shownObjects(history, b, false);
+    expect(shown).toEqual(b.objects.filter((object) => history.changes.confirmed[b.objectRow[object]] === 1));
+    expect(objectsText(history, b)).toBe(`${shown.length} objects + ${b.objects.length - shown.length} seen once`);
   });
 });
 

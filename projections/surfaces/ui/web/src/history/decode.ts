@@ -125,6 +125,7 @@ function assembled(raw: Map<string, Column>, rest: Omit<History, Arrays>): Histo
       class: i4("oc_class"),
       place: i4("oc_place"),
       missing: read("oc_missing", Uint8Array),
+      confirmed: read("oc_confirmed", Uint8Array),
     },
     objectMerges: {
       offset: i4("om_offset"),

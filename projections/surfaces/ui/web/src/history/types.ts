@@ -25,6 +25,8 @@ export interface ObjectChanges {
   class: Int32Array;
   place: Int32Array;
   missing: Uint8Array;
+  /** 0 for an object that was seen once. */
+  confirmed: Uint8Array;
 }
 
 export interface TimelineEvents {

@@ -8,6 +8,7 @@ import { select } from "../state/actions";
 import { shownBridge, shownLost } from "../state/overlays";
 import { walls } from "../state/walls";
 import { menu, tip } from "../state/pointer";
+import { shownObjects } from "../model/map_at";
 import * as store from "../state/store";
 import { summary } from "../ui/summary";
 import { type Side, currentScene } from "./current_scene";
@@ -168,7 +169,9 @@ function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
     if (shown === null || view === null) return null;
     const regions = side === "main" ? store.regions.value : store.otherRegions.value;
     const box = canvas.getBoundingClientRect();
-    return pick(shown.history, shown.map, regions, view, event.clientX - box.left, event.clientY - box.top, store.layers.value.objects);
+    const { objects, once } = store.layers.value;
+    const found = objects ? shownObjects(shown.history, shown.map, once) : [];
+    return pick(shown.history, shown.map, regions, view, event.clientX - box.left, event.clientY - box.top, found);
   };
   const move = (event: PointerEvent) => {
     if (event.buttons !== 0) return;

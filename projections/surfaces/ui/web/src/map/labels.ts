@@ -98,9 +98,11 @@ function objectLabels(scene: Scene): Wanted[] {
   const { history, map, view, palette } = scene;
   if (!scene.layers.objects) return [];
   const lit = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
-  const { x, y, count, missing } = history.changes;
+  const { x, y, count, missing, confirmed } = history.changes;
+  const isShown = (object: number) => scene.layers.once || confirmed[map.objectRow[object]] === 1 || lit.includes(object);
   const rank = (object: number) => (lit.includes(object) ? 1e9 : 0) + count[map.objectRow[object]];
-  return [...map.objects]
+  return map.objects
+    .filter(isShown)
     .sort((a, b) => rank(b) - rank(a))
     .map((object) => {
       const row = map.objectRow[object];

@@ -32,7 +32,7 @@ export function drawDifference(on: Surface, scene: Scene) {
   circles(difference.newKeyframes, palette.added, 1.4);
   for (const { x0, y0, x1, y1 } of difference.shifts) arrow(on, scene, x0, y0, x1, y1);
   for (const [object, change] of difference.objects) {
-    if (change === "changed") continue;
+    if (change === "changed" || change === "joined") continue;
     const row = change === "gone" ? before.objectRow[object] : scene.map.objectRow[object];
     const shown = row >= 0 ? row : before.objectRow[object];
     if (shown < 0) continue;

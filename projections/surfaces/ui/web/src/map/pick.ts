@@ -31,9 +31,9 @@ export interface Picked {
   number: number;
 }
 
-export function pick(history: History, map: MapState, regions: Regions | null, view: View, sx: number, sy: number, objects: boolean): Picked | null {
+export function pick(history: History, map: MapState, regions: Regions | null, view: View, sx: number, sy: number, objects: readonly number[]): Picked | null {
   const [x, y, reach] = [mapX(view, sx), mapY(view, sy), REACH_PIXELS / view.k];
-  const object = objects ? nearestObject(history, map, x, y, reach) : -1;
+  const object = nearestObject(history, map, objects, x, y, reach);
   if (object >= 0) return { thing: { kind: "object", id: history.objectIds[object] }, number: object };
   const keyframe = nearestKeyframe(history, map, x, y, reach);
   if (keyframe >= 0) return { thing: { kind: "keyframe", id: keyframeId(history, keyframe) }, number: keyframe };
@@ -41,10 +41,10 @@ export function pick(history: History, map: MapState, regions: Regions | null, v
   return place < 0 ? null : { thing: { kind: "place", id: history.placeIds[place] }, number: place };
 }
 
-function nearestObject(history: History, map: MapState, x: number, y: number, reach: number): number {
+function nearestObject(history: History, map: MapState, objects: readonly number[], x: number, y: number, reach: number): number {
   const { x: xs, y: ys } = history.changes;
   let [found, best] = [-1, reach];
-  for (const object of map.objects) {
+  for (const object of objects) {
     const row = map.objectRow[object];
     const distance = Math.hypot(xs[row] - x, ys[row] - y);
     if (distance < best) [found, best] = [object, distance];

@@ -31,14 +31,15 @@ export function objectRadius(k: number): number {
 
 export function drawObjects(on: Surface, scene: Scene) {
   const { history, map, view, palette, width, height } = scene;
-  const { x: xs, y: ys, xx, missing } = history.changes;
+  const { x: xs, y: ys, xx, missing, confirmed } = history.changes;
   const size = objectRadius(view.k);
   const [selected, hovered] = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
   for (const object of map.objects) {
     const row = map.objectRow[object];
+    const lit = object === selected || object === hovered;
+    if (!lit && !scene.layers.once && confirmed[row] === 0) continue;
     const [x, y] = [screenX(view, xs[row]), screenY(view, ys[row])];
     if (!(x > -50 && y > -50 && x < width + 50 && y < height + 50)) continue;
-    const lit = object === selected || object === hovered;
     if (scene.layers.ellipses && !Number.isNaN(xx[row])) drawEllipse(on, scene, row, x, y, lit);
     on.beginPath(); // a diamond: dots are keyframes
     on.moveTo(x, y - size * 1.25);
@@ -51,7 +52,7 @@ export function drawObjects(on: Surface, scene: Scene) {
       on.fillStyle = palette.ground;
       on.strokeStyle = palette.removed;
     } else {
-      on.fillStyle = lit ? palette.accent : palette.object;
+      on.fillStyle = lit ? palette.accent : withAlpha(palette.object, confirmed[row] === 1 ? 1 : 0.4);
       on.strokeStyle = palette.ground;
     }
     on.fill();

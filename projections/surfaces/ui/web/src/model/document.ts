@@ -34,6 +34,7 @@ export function stateDocument(history: History, map: MapState, types: ReadonlyMa
         observations: changes.count[row],
         place_id: place(placeNow(history, map, row)),
         missing: changes.missing[row] === 1,
+        confirmed: changes.confirmed[row] === 1,
       };
     }),
     keyframes: Array.from({ length: map.keyframeCount }, (_, each) => ({

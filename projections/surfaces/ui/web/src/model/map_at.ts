@@ -35,6 +35,12 @@ export interface MapState {
   noise: number;
 }
 
+/** Objects that are confirmed, and with `everything` those seen once, too. */
+export function shownObjects(history: History, map: MapState, everything: boolean): number[] {
+  const { confirmed } = history.changes;
+  return everything ? map.objects : map.objects.filter((object) => confirmed[map.objectRow[object]] === 1);
+}
+
 /** How many rows of a sorted array are below `end`. */
 export function rowsBefore(offsets: ArrayLike<number>, end: number): number {
   let [low, high] = [0, offsets.length];

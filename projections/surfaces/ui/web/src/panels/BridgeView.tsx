@@ -120,7 +120,7 @@ function miniScene({ history, map }: Shown, merge: MergeStory, width: number, he
     palette: dark ? DARK : LIGHT,
     width,
     height,
-    layers: { regions: true, path: true, keyframes: true, objects: false, ellipses: false, edges: false, walls: true, labels: true },
+    layers: { regions: true, path: true, keyframes: true, objects: false, once: false, ellipses: false, edges: false, walls: true, labels: true },
     walls: walls.peek(),
     types: store.types.peek(),
     selection: null,

@@ -95,6 +95,9 @@ function DifferenceCounts() {
     );
   const placed = (change: string) => of(changes.places, change);
   const stood = (change: string) => of(changes.objects, change);
+  const moved = changes.shifts.map(({ object }) => object);
+  const fresh = stood("new").filter((object) => history.changes.confirmed[map.objectRow[object]] === 1);
+  const once = stood("new").length - fresh.length;
   return (
     <>
       <p class="summary">
@@ -104,9 +107,10 @@ function DifferenceCounts() {
         {row("+", "new", counted(placed("new").length, "new place"), placed("new"), place)}
         {row("×", "gone", `${counted(placed("gone").length, "place")} gone`, placed("gone"), place)}
         {row("~", "changed", `${counted(placed("changed").length, "place")} changed`, placed("changed"), place)}
-        {row("+", "new", counted(stood("new").length, "new object"), stood("new"), object)}
+        {row("+", "new", `${counted(fresh.length, "new object")}${once > 0 ? ` + ${once.toLocaleString("en")} seen once` : ""}`, stood("new"), object)}
         {row("×", "gone", `${counted(stood("gone").length, "object")} gone`, stood("gone"), object)}
-        {row("→", "moved", `${counted(stood("moved").length, "object")} moved`, stood("moved"), object)}
+        {row("~", "changed", `${counted(stood("joined").length, "object")} joined into others`, stood("joined"), object)}
+        {row("→", "moved", `${counted(moved.length, "object")} moved`, moved, object)}
       </ul>
     </>
   );

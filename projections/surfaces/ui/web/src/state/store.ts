@@ -91,6 +91,7 @@ export const layers = signal({
   path: true,
   keyframes: true,
   objects: true,
+  once: false,
   ellipses: true,
   edges: true,
   walls: true,

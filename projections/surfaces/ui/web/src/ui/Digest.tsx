@@ -7,6 +7,7 @@ import { floorName, floorsOf } from "../model/floors";
 import { counted, isolated, label } from "../model/names";
 import { useAnswer } from "../state/answers";
 import * as store from "../state/store";
+import { objectsText } from "./summary";
 
 export function Digest() {
   const [map, history] = [store.map.value, store.history.value];
@@ -24,7 +25,7 @@ export function Digest() {
       <p>
         <b>{counted(map.places.length, "place")}</b>
         <span>{counted(map.keyframeCount, "keyframe")}</span>
-        <span>{counted(map.objects.length, "object")}</span>
+        <span>{objectsText(history, map)}</span>
         {map.noise > 0 && <span>{map.noise.toLocaleString("en")} in no place</span>}
       </p>
       <p class="digest" title={digest}>

@@ -12,6 +12,7 @@ const LAYERS: [store.LayerName, string, preact.JSX.Element][] = [
   ["keyframes", "keyframe / in no place", <><circle cx="6" cy="9" r="3.4" class="sign-dot" /><circle cx="15" cy="9" r="3" class="sign-hollow" /></>],
   ["path", "drive", <><path d="M2 13 Q7 3 12 8" class="sign-line" /><path d="M18 8 11 4.6 12.6 8 11 11.4z" class="sign-fill" /></>],
   ["objects", "object / missing", <><path d="M6 5l4 4-4 4-4-4z" class="sign-fill" /><path d="M15 5l4 4-4 4-4-4z" class="sign-missing" /></>],
+  ["once", "object seen once", <path d="M10 5l4 4-4 4-4-4z" class="sign-faint" />],
   ["ellipses", "95 % area", <ellipse cx="10" cy="9" rx="8" ry="4.5" class="sign-hollow" />],
   ["edges", "drives between", <path d="M1 9H19" class="sign-dashed" />],
   ["walls", "wall", <path d="M2 14V5H18" class="sign-wall" />],

@@ -1,7 +1,14 @@
+/** `142 objects + 695 seen once`. */
+export function objectsText(history: History, map: MapState): string {
+  const confirmed = shownObjects(history, map, false).length;
+  const once = map.objects.length - confirmed;
+  return counted(confirmed, "object") + (once > 0 ? ` + ${once.toLocaleString("en")} seen once` : "");
+}
+
 /** A map in one sentence, also for people who do not see it. */
 
 import type { History } from "../history/types";
-import type { MapState } from "../model/map_at";
+import { type MapState, shownObjects } from "../model/map_at";
 import { counted } from "../model/names";
 
 export function summary(map: MapState | null, history: History | null): string {
@@ -9,7 +16,7 @@ export function summary(map: MapState | null, history: History | null): string {
   const noise = map.noise > 0 ? `, ${counted(map.noise, "keyframe")} in no place` : "";
   return (
     `Map after ${counted(map.at, "event")}: ${counted(map.keyframeCount, "keyframe")}, ` +
-    `${counted(map.places.length, "place")}, ${counted(map.objects.length, "object")}${noise}`
+    `${counted(map.places.length, "place")}, ${objectsText(history, map)}${noise}`
   );
 }
 
