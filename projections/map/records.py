@@ -16,6 +16,8 @@ from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCame
 from projections.fold.deltas import (
     KeyframeOrdinal,
     ObjectOrdinal,
+    ObjectSeen,
+    ObjectsMerged,
     ObservationOrdinal,
     PlaceOrdinal,
     Pose,
@@ -201,6 +203,12 @@ class ObjectRecord:
     relocations: list[Relocation] = field(default_factory=list)
     confirmed: bool = False
     counted_as: tuple[PlaceOrdinal, str, bool] | None = None
+
+    def recount(self, delta: ObjectSeen | ObjectsMerged) -> None:
+        """Take over the count, sums and times of a delta."""
+        self.obs_count = delta.obs_count
+        self.sum_x_um, self.sum_y_um = delta.sum_x_um, delta.sum_y_um
+        self.first_seen, self.last_seen = delta.first_seen, delta.last_seen
 
     @property
     def spot(self) -> tuple[float, float]:

@@ -252,11 +252,7 @@ class MapView:
             found.observations.append(delta.observation)
             confirm(found, (delta.observation,), self.observations, self.keyframes)
         is_counted = (found.obs_count > 1) is (delta.obs_count > 1)
-        found.obs_count = delta.obs_count
-        found.sum_x_um = delta.sum_x_um
-        found.sum_y_um = delta.sum_y_um
-        found.first_seen = delta.first_seen
-        found.last_seen = delta.last_seen
+        found.recount(delta)
         if not is_counted:
             self.contents.update(found)
 
@@ -274,22 +270,13 @@ class MapView:
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None
             self.contents.update(absorbed)
             self.object_survivors.merge(delta.survivor, (delta.absorbed,))
-        survivor.obs_count = delta.obs_count
-        survivor.sum_x_um = delta.sum_x_um
-        survivor.sum_y_um = delta.sum_y_um
-        survivor.first_seen = delta.first_seen
-        survivor.last_seen = delta.last_seen
+        survivor.recount(delta)
         self.contents.update(survivor)
 
     def _object_estimated(self, delta: deltas.ObjectEstimated) -> None:
-        self.all_objects[delta.object].estimate = EstimatedPosition(
-            delta.x_um,
-            delta.y_um,
-            delta.var_xx_um2,
-            delta.var_xy_um2,
-            delta.var_yy_um2,
-            delta.spots,
-        )
+        variances = delta.var_xx_um2, delta.var_xy_um2, delta.var_yy_um2
+        at = EstimatedPosition(delta.x_um, delta.y_um, *variances, delta.spots)
+        self.all_objects[delta.object].estimate = at
 
     def _object_classified(self, delta: deltas.ObjectClassified) -> None:
         found = self.all_objects[delta.object]
