@@ -34,6 +34,10 @@ VISION_MSGS: Final[Mapping[str, str]] = {
         "vision_msgs/BoundingBox2D bbox\nstring id\n"
     ),
     "vision_msgs/msg/Detection2DArray": f"{_HEADER}vision_msgs/Detection2D[] detections\n",
+    "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name\n",
+    "vision_msgs/msg/LabelInfo": (
+        f"{_HEADER}vision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
+    ),
 }
 """The definitions of vision_msgs 4, which ROS does not ship with its own messages. Those of version
 3 differ in the name of a nested type only: in CDR both are the same bytes."""

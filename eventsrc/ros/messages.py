@@ -18,6 +18,7 @@ from eventsrc.envelope.model import covariance_fault
 from .transforms import Transform, unit_transform
 
 DETECTIONS: Final = "vision_msgs/msg/Detection2DArray"
+LABELS: Final = "vision_msgs/msg/LabelInfo"
 TF: Final = "tf2_msgs/msg/TFMessage"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -170,6 +171,12 @@ def detections_of(message: Any, labels: Mapping[str, str]) -> Detected:
         ids.append(str(getattr(each, "id", "")))
     header = message.header
     return Detected(stamp_of(header.stamp), frame_name(header.frame_id), made, ids, unclassified)
+
+
+def labels_of(message: Any) -> dict[str, str]:
+    """The names of a LabelInfo by class id, as detections write it."""
+    named = ((str(int(each.class_id)), str(each.class_name)) for each in message.class_map)
+    return {class_id: name for class_id, name in named if name}
 
 
 def embeddings_of_text(message: Any) -> StampedEmbeddings:

@@ -320,6 +320,36 @@ def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(mapfold: 
         assert told in mapfold("import", "log", "drive", *options, code=2).err
 
 
+@pytest.mark.parametrize("topic", ["/label_info", "/far/label_info"])
+def test_numbered_classes_get_the_names_of_a_label_info(mapfold: Commands, topic: str) -> None:
+    seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "17", "7")]
+    shown = ("/detections", START, ros.detections(START, "camera", *seen))
+    told = (topic, START + 5, ros.label_info(START, {0: "person", 17: "chair", 7: ""}))
+    write_bag(mapfold.folder / "drive", [shown, told])
+    said = mapfold("import", "log", "drive").err
+    assert f"{topic} " in said
+    assert "vision_msgs/msg/LabelInfo: names of classes" in said
+    (made,) = envelopes(mapfold.folder / "log")
+    assert [each["class"] for each in made["detections"]] == ["person", "chair", "7"]
+    (mapfold.folder / "names.json").write_text('{"17": "stool", "7": "bicycle"}')
+    mapfold("import", "other", "drive", "--labels", "names.json")
+    (made,) = envelopes(mapfold.folder / "other")
+    assert [each["class"] for each in made["detections"]] == ["person", "stool", "bicycle"]
+    said = mapfold("import", "log", "drive", "--labels", "names.json").err
+    assert "nothing is new: the first recording of a keyframe counts; " in said
+    assert "`mapfold edit log relabel --labels FILE` names its classes" in said
+
+
+def test_a_label_info_that_cannot_be_read_names_nothing(mapfold: Commands) -> None:
+    seen = ros.detection([("17", 0.9)], ros.box(9, 9, 2, 2))
+    shown = ("/detections", START, ros.detections(START, "camera", seen))
+    short = Raw("vision_msgs/msg/LabelInfo", b"\0\1\0\0\xff")
+    write_bag(mapfold.folder / "drive", [shown, ("/label_info", START, short)])
+    mapfold("import", "log", "drive", code=None)
+    (made,) = envelopes(mapfold.folder / "log")
+    assert [each["class"] for each in made["detections"]] == ["17"]
+
+
 def test_numbered_classes_get_the_names_of_a_file(mapfold: Commands) -> None:
     seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "2", "7")]
     shown = ("/detections", START, ros.detections(START, "camera", *seen))

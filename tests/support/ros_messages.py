@@ -156,6 +156,16 @@ def camera_info(ns: int, frame: str, fx: float, width: int = 640, height: int = 
     )
 
 
+def label_info(ns: int, names: dict[int, str]) -> Any:
+    classes = [
+        make("vision_msgs/msg/VisionClass", class_id=number, class_name=name)
+        for number, name in names.items()
+    ]
+    return make(
+        "vision_msgs/msg/LabelInfo", header=header(ns, ""), class_map=classes, threshold=0.5
+    )
+
+
 def text(data: str) -> Any:
     return make("std_msgs/msg/String", data=data)
 

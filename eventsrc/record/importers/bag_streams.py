@@ -81,7 +81,7 @@ def sampled(type_name: str, number: int) -> bool:
     if type_name == ros.TF:
         few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
         return few or number < _FIRST_TRANSFORMS
-    return number == 0 and type_name in (ros.DETECTIONS, ros.CAMERA_INFO, *_POSE_TYPES)
+    return number == 0 and type_name in (ros.DETECTIONS, ros.LABELS, ros.CAMERA_INFO, *_POSE_TYPES)
 
 
 class Chooser:
@@ -136,11 +136,13 @@ class Chooser:
         covariance = self._covariance(topic, map_frame) if by_transforms else None
         embeddings = self._embeddings(topic)
         camera = self._camera(topic, camera_frame)
+        label_info = self._nearest(topic, self._of_type(ros.LABELS), "names of classes")
+        found_labels = next(iter(self._samples(label_info, ros.labels_of)), {})
         topics = tf, tf_static, None if by_transforms else pose, covariance, embeddings, camera
         made.streams.append(
             Stream(
                 *(topic, run_id, *topics, map_frame, base_frame),
-                labels=options.labels,
+                labels={**found_labels, **options.labels},
                 embedding_model=options.embedding_model,
                 heights=options.heights,
                 max_gap_ns=options.max_gap_ns,
@@ -171,6 +173,7 @@ class Chooser:
         made.use(covariance, "errors of poses")
         made.use(embeddings, "embeddings")
         made.use(camera, "camera")
+        made.use(label_info, "names of classes")
         if embeddings is None and options.embeddings != NONE:
             made.notes.append(
                 f"{topic}: no topic has embeddings, so there will be no Objects; "

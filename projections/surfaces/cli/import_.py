@@ -142,7 +142,7 @@ def import_(
         )
     start.say(as_source=report.began_as_source)
     say(_summary(log, report))
-    for line in _passed_over(report):
+    for line in _passed_over(log, report):
         say(line)
     useless = any(bag.is_useless for bag in report.bags)
     finish(findings=report.rejected > 0 or report.imported_nothing or useless)
@@ -218,7 +218,7 @@ def _summary(log: Path, report: ImportReport) -> str:
     return ", ".join(parts) + hint
 
 
-def _passed_over(report: ImportReport) -> Iterator[str]:
+def _passed_over(log: Path, report: ImportReport) -> Iterator[str]:
     for each in report.passed_over[:_MOST_TOPICS]:
         yield visible(f"passed over: {each.topic}: {counted(each.count, 'message')}, {each.what}")
     if len(report.passed_over) > _MOST_TOPICS:
@@ -230,6 +230,15 @@ def _passed_over(report: ImportReport) -> Iterator[str]:
         yield (
             "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
             "imports a topic of JSON nevertheless and reports what is wrong with each message"
+        )
+    if report.accepted and report.accepted == report.repeated:
+        labels, settings = (
+            advised("edit", log, *words)
+            for words in (("relabel", "--labels", "FILE"), ("use-settings", "--preset", "NAME"))
+        )
+        yield visible(
+            "nothing is new: the first recording of a keyframe counts; "
+            f"`{labels}` names its classes, `{settings}` changes the rules of the map"
         )
 
 
