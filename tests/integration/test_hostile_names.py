@@ -54,6 +54,7 @@ def check(said: Said) -> Said:
         "bisect L place_count>=1",
         "evaluate --map L --query L",
         "query where-is L",
+        "find L --all",
     ],
 )
 def test_a_command_prints_nothing_that_a_terminal_obeys(run: Commands, command: str) -> None:

@@ -80,6 +80,7 @@ PROVOKED = {
     "simulate": ["--out", "drive.jsonl"],
     "state": ["L"],
     "draw": ["L", "--out", "map.png"],
+    "find": ["L", "cups"],
     "export": ["L", "--dot", "map.dot"],
     "relocalize": ["--class", "cup", "--log", "L"],
     "evaluate": ["--map", "L", "--self"],

@@ -36,6 +36,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "state": "maps:state",
         "draw": "maps:draw",
         "ui": "ui:ui",
+        "find": "find_command:find_things",
         "query": "query:query",
         "export": "export_command:export",
         "foxglove": "export_command:foxglove",

@@ -13,7 +13,8 @@ from eventsrc.base.text import counted, visible
 from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from eventsrc.log.seek import resolve
+from eventsrc.log.seek import resolve, time_of
+from projections.ask.find import FoundObjects, Wanted, find
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
@@ -98,6 +99,45 @@ class Map:
         id_ = self.view.all_objects[self.view.object_survivors.find(wanted)].object_id
         return next(each for each in self.state["objects"] if each["object_id"] == id_)
 
+    def find(
+        self,
+        what: str | None = None,
+        *,
+        room: str | None = None,
+        near: str | tuple[float, float] | None = None,
+        missing: bool = False,
+        moved: bool = False,
+        seen_since: float | str | None = None,
+        not_seen_since: float | str | None = None,
+        top: int = 10,
+        every: bool = False,
+    ) -> FoundObjects:
+        """The Objects that are ``what``, such as ``"chairs"`` or an id, None for all, best first.
+
+        ``room`` is the Place they are in, ``near`` the point in metres or the thing from which they
+        are ordered. Times are ISO 8601 or robot seconds. Objects that were seen once are left out
+        without ``every``. Raises MisuseError for what this map does not have.
+
+        Examples:
+            >>> house = fold("logs/sample", preset="full")
+            >>> [answer.class_name for answer in house.find("sinks", top=1).answers]
+            ['sink']
+        """
+        return find(
+            self.view,
+            Wanted(
+                what=what,
+                room=room,
+                near=near if near is None or isinstance(near, str) else f"{near[0]},{near[1]}",
+                missing=missing,
+                moved=moved,
+                seen_since=_robot_seconds(seen_since),
+                not_seen_since=_robot_seconds(not_seen_since),
+                top=top,
+                every=every,
+            ),
+        )
+
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
         from projections.adapters.drawing import (
@@ -136,6 +176,15 @@ class Map:
             f' src="data:image/png;base64,{picture}">'
             f"<table><tr>{head}</tr>{rows}</table>{rest}"
         )
+
+
+def _robot_seconds(time: float | str | None) -> float | None:
+    if not isinstance(time, str):
+        return time
+    time_ns = time_of(time)
+    if time_ns is None:
+        raise MisuseError(f"{time!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
+    return time_ns / 1e9
 
 
 def _cell(value: object) -> str:

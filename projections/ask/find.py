@@ -1,0 +1,255 @@
+"""Where things are: the Objects of a map that a person asks for.
+
+`find` is pure over a `MapView`. What is asked for is a class (`class_names`), an Object's id, or
+nothing, which is everything.
+
+Answers are ordered by distance where ``near`` is given; else those that are where they were last
+seen come before those that are missing, then the ones seen most often.
+"""
+
+import math
+import re
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
+
+from eventsrc.base.errors import MisuseError
+from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
+from projections.fold.exact import UM_PER_M
+from projections.map.naming import MOST_NEAR, Rule, Thing, matches, thing_called, things_of
+from projections.map.records import KeyframeRecord, ObjectRecord
+from projections.map.view import MapView
+from projections.store.history_records import iso_time
+
+from .class_names import ClassMatch, classes_meant, near_classes
+
+Match = Literal["id", "everything"] | ClassMatch
+"""How an Object is what was asked for."""
+
+_MAX_SHOWN: Final = 256
+_POINT: Final = re.compile(r"\s*([^,\s]+)\s*,\s*([^,\s]+)\s*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What is asked for.
+
+    ``what`` is None for everything. ``room`` is the Place that it is in, ``near`` a point ``X,Y``
+    in metres, or an Object or Place, by any of its names. Times are robot seconds since the epoch:
+    last seen at ``seen_since`` or later, and before ``not_seen_since``. There are at most ``top``
+    answers, Objects that were seen once among them only with ``every``.
+    """
+
+    what: str | None = None
+    room: str | None = None
+    near: str | None = None
+    missing: bool = False
+    moved: bool = False
+    seen_since: float | None = None
+    not_seen_since: float | None = None
+    top: int = 10
+    every: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SeenAt:
+    """The keyframe in which a thing was seen, with the offset of its event. ``time`` is in robot
+    seconds since the epoch, ``iso`` the same as ISO 8601."""
+
+    time: float
+    iso: str
+    run_id: str
+    keyframe_id: int
+    offset: int
+
+
+@dataclass(frozen=True, slots=True)
+class FoundObject:
+    """An Object that answers a question.
+
+    ``x`` and ``y`` are metres; ``sigma_m`` is their standard error in the direction in which it is
+    largest, None where they are the mean position of the robot that saw it. ``distance_m`` is from
+    what it should be near. ``missing_in`` is the run in which it was looked for in vain,
+    ``moved_from`` where it stood before, in metres. ``offsets`` are the events that saw it.
+    """
+
+    object_id: str
+    class_name: str
+    match: Match
+    place_id: str | None
+    place_name: str | None
+    place_type: str | None
+    x: float
+    y: float
+    sigma_m: float | None
+    distance_m: float | None
+    obs_count: int
+    confirmed: bool
+    first_seen: SeenAt
+    last_seen: SeenAt
+    missing_in: str | None
+    moved_from: tuple[float, float] | None
+    offsets: tuple[int, ...]
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundObjects:
+    """The answers, best first, of ``count`` that there are; ``unconfirmed`` more were seen once.
+
+    ``match`` is the rule by which ``classes`` are what was asked for.
+    """
+
+    match: Match
+    classes: tuple[str, ...]
+    count: int
+    unconfirmed: int
+    answers: tuple[FoundObject, ...]
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+def find(view: MapView, wanted: Wanted) -> FoundObjects:
+    """The Objects of a map that answer a question.
+
+    Raises MisuseError, also NoSuchThing and SeveralThings, for what the map does not have or what
+    means several things, and for a question that its settings cannot answer.
+    """
+    if (wanted.missing or wanted.moved) and view.settings.fusion != "evidence":
+        raise MisuseError(
+            "only a map with fusion by evidence knows what is missing or has moved; fold it with"
+            " --preset full"
+        )
+    things = things_of(view)
+    room = None
+    if wanted.room is not None:
+        ordinal = PlaceOrdinal(thing_called(wanted.room, things, ["place"]).ordinal)
+        room = view.survivors.find(ordinal)
+    spot = None if wanted.near is None else _spot(wanted.near, things)
+    match, objects = _meant(view, wanted.what, things)
+    classes = tuple(sorted({each.class_name for each in objects}))
+    found = [each for each in objects if _is_wanted(each, wanted, room)]
+    kept = found
+    if match != "id" and not wanted.every:
+        kept = [each for each in found if each.confirmed]
+
+    def order(each: ObjectRecord) -> tuple[float, bool, int, int]:
+        distance = 0.0 if spot is None else _distance(each.spot, spot)
+        return distance, each.missing_in is not None, -each.obs_count, each.ordinal
+
+    answers = [_answer(view, each, match, spot) for each in sorted(kept, key=order)[: wanted.top]]
+    return FoundObjects(match, classes, len(kept), len(found) - len(kept), tuple(answers))
+
+
+def _distance(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """Metres."""
+    return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2)
+
+
+def _meant(
+    view: MapView, what: str | None, things: list[Thing]
+) -> tuple[Match, list[ObjectRecord]]:
+    """The Objects that are what is asked for, and the rule by which."""
+    standing = list(view.objects.values())
+    if what is None:
+        return "everything", standing
+    what = what if len(what) <= _MAX_SHOWN else f"{what[:_MAX_SHOWN]}…"  # no name is as long
+    rule, called = matches(what, (thing for thing in things if thing.kind == "object"))
+    if rule in (Rule.ID, Rule.SHORT):
+        one = thing_called(what, called, ["object"])
+        found = view.object_survivors.find(ObjectOrdinal(one.ordinal))
+        return "id", [view.all_objects[found]]
+    match, classes = classes_meant(what, {each.class_name for each in standing})
+    if not classes:
+        raise _nothing(what, standing, things)
+    return match, [each for each in standing if each.class_name in classes]
+
+
+def _nothing(what: str, standing: list[ObjectRecord], things: list[Thing]) -> MisuseError:
+    """The error for a class that the map does not have."""
+    places = matches(what, (thing for thing in things if thing.kind == "place"))[1]
+    if places:
+        listed = ", ".join(str(place) for place in places[:MOST_NEAR])
+        return MisuseError(
+            f"{what!r} is a place: {listed}; what is in it is found by --in, without a class"
+        )
+    classes = sorted({each.class_name for each in standing})
+    if not classes:
+        return MisuseError(f"no {what!r}: this map has no Objects")
+    near = near_classes(what, classes)
+    listed = f"near it: {', '.join(near)}" if near else f"there are {', '.join(classes[:10])}"
+    more = f" and {len(classes) - 10} more" if not near and len(classes) > 10 else ""
+    return MisuseError(f"no class like {what!r} in this map; {listed}{more}")
+
+
+def _spot(near: str, things: list[Thing]) -> tuple[float, float]:
+    """The point that things should be near, in metres."""
+    point = _POINT.fullmatch(near)
+    if point is not None:
+        try:
+            x, y = float(point[1]), float(point[2])
+        except ValueError:
+            pass
+        else:
+            if math.isfinite(x) and math.isfinite(y):
+                return x, y
+    thing = thing_called(near, things, ["place", "object"])
+    if thing.spot is None:
+        raise MisuseError(f"{near!r} has no position in this map; give X,Y in metres")
+    return thing.spot
+
+
+def _is_wanted(each: ObjectRecord, wanted: Wanted, room: PlaceOrdinal | None) -> bool:
+    if room is not None and each.place != room:
+        return False
+    if wanted.missing and each.missing_in is None:
+        return False
+    if wanted.moved and not each.relocations:
+        return False
+    if wanted.seen_since is not None and each.last_seen < wanted.seen_since:
+        return False
+    return wanted.not_seen_since is None or each.last_seen < wanted.not_seen_since
+
+
+def _answer(
+    view: MapView, each: ObjectRecord, match: Match, spot: tuple[float, float] | None
+) -> FoundObject:
+    at, place = each.estimate, each.place
+    x, y = each.spot
+    keyframes = [view.keyframes[view.observations[o].keyframe] for o in each.observations]
+    kind = None if place is None else view.type_of(place)
+    moved = each.relocations[-1] if each.relocations else None
+    return FoundObject(
+        object_id=each.object_id,
+        class_name=each.class_name,
+        match=match,
+        place_id=view.place_id(place),
+        place_name=None if place is None else view.all_places[place].name,
+        place_type=None if kind is None else kind.type,
+        x=x,
+        y=y,
+        sigma_m=None if at is None else at.est_sigma_m,
+        distance_m=None if spot is None else _distance(each.spot, spot),
+        obs_count=each.obs_count,
+        confirmed=each.confirmed,
+        first_seen=_seen_at(min(keyframes, key=_time)),
+        last_seen=_seen_at(max(keyframes, key=_time)),
+        missing_in=None if each.missing_in is None else view.runs[each.missing_in].run_id,
+        moved_from=(
+            None if moved is None else (moved.from_x_um / UM_PER_M, moved.from_y_um / UM_PER_M)
+        ),
+        offsets=tuple(sorted({keyframe.offset for keyframe in keyframes})),
+    )
+
+
+def _time(keyframe: KeyframeRecord) -> tuple[float, int]:
+    return keyframe.timestamp, keyframe.offset
+
+
+def _seen_at(keyframe: KeyframeRecord) -> SeenAt:
+    time = keyframe.timestamp
+    return SeenAt(time, iso_time(time), keyframe.run_id, keyframe.keyframe_id, keyframe.offset)
