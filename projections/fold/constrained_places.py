@@ -38,9 +38,12 @@ from . import State
 from .core_index import CoreIndex
 from .corrections import Keyframe
 from .deltas import Delta, KeyframeOrdinal, KeyframePlaced, MergeRefused, PlaceOrdinal, PlacesMerged
+from .exact import metres_to_um
 from .pair_groups import PairGroups
 from .place_members import NOISE, Apart, Inside, PlaceAnchors, PosedKeyframe
 from .places import Part, Places
+from .rooms import Rooms
+from .settings import Settings
 
 Rank: TypeAlias = tuple[int, int]
 """The order of what is clustered: (0, place), or (1, earliest fresh core point of a fresh cell)."""
@@ -345,3 +348,12 @@ class _Forest:
         first, second = sorted((one, other))
         self._parents[second] = first
         self.inside[first] += self.inside[second]
+
+
+def places_by(settings: Settings, groups: PairGroups[Keyframe]) -> Places | Rooms:
+    """The reducer of places; ``groups`` are the keyframes that commands name."""
+    if settings.places == "rooms":
+        rooms = settings.rooms
+        return Rooms(metres_to_um(rooms.cell_m), metres_to_um(rooms.drive_m), groups)
+    core_index = CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
+    return ConstrainedPlaces(core_index, groups) if groups.group_of else Places(core_index)

@@ -76,9 +76,8 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
-    """A new keyframe; ``pose`` is None when the envelope has none. ``floor`` is the name of the
-    floor that the pose is on and ``camera`` the one that took the picture, None if the envelope
-    states none."""
+    """A new keyframe. ``pose``, ``floor``, the name of the one that the pose is on, and ``camera``,
+    the one that took the picture, are None where the envelope has none."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -191,8 +190,7 @@ class MergeRefused(msgspec.Struct, frozen=True, gc=False):
 
     ``link`` is the pair of core points that would have joined them (of anchors, where a ``join``
     is refused), ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept
-    apart, of ``a`` and of ``b``. ``a`` was founded before ``b``. There is one for each pair of
-    places, however often they touch.
+    apart, of ``a`` and of ``b``. ``a`` was founded before ``b``. A pair of places has only one.
     """
 
     offset: Offset
@@ -287,8 +285,7 @@ class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
     """Why fusion by evidence made two Objects one.
 
     ``look`` and ``geometry`` are log-likelihood ratios in thousandths of a nat: same thing against
-    two things. ``distance_um`` is that of the two estimates, ``pictures_with_both`` of ``pictures``
-    showed both at once.
+    two. ``distance_um`` is of the estimates; ``pictures_with_both`` of ``pictures`` showed both.
     """
 
     look: int

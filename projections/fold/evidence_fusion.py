@@ -43,9 +43,10 @@ from .deltas import (
 from .evidence import EvidenceConstants
 from .evidence_objects import EvidenceObjects, MovedObject, ObjectDelta
 from .exact import log
+from .objects import ConstrainedObjects, Objects
 from .pair_groups import PairGroups
 from .presence import Presence
-from .settings import CameraConstants
+from .settings import CameraConstants, Settings
 from .sights import PoseError, Sighting
 
 _LEAST_NEW, _LEAST_RIVAL = 3, 2
@@ -282,3 +283,12 @@ def _in_order(
     for latest in (classes, estimates):
         others += [latest[ordinal] for ordinal in sorted(latest) if ordinal not in absorbed]
     return others
+
+
+def objects_by(settings: Settings, named: PairGroups[DetId]) -> Objects | EvidenceFusion:
+    """The reducer of Objects; ``named`` are the detections that commands name."""
+    groups = named if named.group_of else None
+    if settings.fusion == "evidence":
+        return EvidenceFusion(settings.evidence, groups)
+    limits = settings.fusion_radius_m, settings.fusion_similarity
+    return Objects(*limits) if groups is None else ConstrainedObjects(*limits, groups)

@@ -25,8 +25,7 @@ from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset, RunId
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
-from .constrained_places import ConstrainedPlaces
-from .core_index import CoreIndex
+from .constrained_places import ConstrainedPlaces, places_by
 from .corrections import NO_CORRECTIONS, Corrections, Keyframe
 from .deltas import (
     Delta,
@@ -50,8 +49,8 @@ from .deltas import (
     SkipKind,
 )
 from .edited_events import EventEdits, Reembedded, Space
-from .evidence_fusion import EvidenceFusion
-from .exact import Units, metres_to_um, unit_vectors
+from .evidence_fusion import EvidenceFusion, objects_by
+from .exact import Units, unit_vectors
 from .floors import CurrentMap, Floors
 from .folded_ids import FoldedIds, content_digest
 from .objects import NO_VECTOR, ConstrainedObjects, Objects
@@ -350,13 +349,9 @@ class SemanticMap:
         self, offset: Offset, accepted: Accepted, det_id: DetId, first: KeyframeOrdinal
     ) -> EventSkipped:
         envelope = accepted.envelope
+        at = self.folded_ids.offsets[first]
         return EventSkipped(
-            offset,
-            "det_id_reused",
-            envelope.run_id,
-            envelope.keyframe_id,
-            det_id,
-            self.folded_ids.offsets[first],
+            offset, "det_id_reused", envelope.run_id, envelope.keyframe_id, det_id, at
         )
 
     def _place(
@@ -368,8 +363,7 @@ class SemanticMap:
         pose: Pose,
         deltas: list[Delta],
     ) -> PlaceOrdinal | None:
-        """Run places, report the changes to located-in and adjacency, and return the keyframe's
-        place."""
+        """Run places, report changes to located-in and adjacency; returns the keyframe's place."""
         folded_ids, place = self.folded_ids, None
         changes = self.places.fold(
             PosedKeyframe(offset, keyframe, run, run_id, pose.x_um, pose.y_um)
@@ -404,21 +398,3 @@ class SemanticMap:
                 if type(following) is ObjectRelocated and following.object == delta.survivor:
                     self.located_in.object_left(delta.survivor)
                 self.located_in.objects_merged(delta.survivor, delta.absorbed)
-
-
-def places_by(settings: Settings, groups: PairGroups[Keyframe]) -> Places | Rooms:
-    """The reducer of places; ``groups`` are the keyframes that commands name."""
-    if settings.places == "rooms":
-        rooms = settings.rooms
-        return Rooms(metres_to_um(rooms.cell_m), metres_to_um(rooms.drive_m), groups)
-    core_index = CoreIndex(metres_to_um(settings.eps_m), settings.min_samples)
-    return ConstrainedPlaces(core_index, groups) if groups.group_of else Places(core_index)
-
-
-def objects_by(settings: Settings, named: PairGroups[DetId]) -> Objects | EvidenceFusion:
-    """The reducer of Objects; ``named`` are the detections that commands name."""
-    groups = named if named.group_of else None
-    if settings.fusion == "evidence":
-        return EvidenceFusion(settings.evidence, groups)
-    limits = settings.fusion_radius_m, settings.fusion_similarity
-    return Objects(*limits) if groups is None else ConstrainedObjects(*limits, groups)
