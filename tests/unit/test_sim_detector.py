@@ -14,18 +14,18 @@ from eventsrc.adapters.sim.detector import (
 )
 from eventsrc.adapters.sim.drive import TruePose
 from eventsrc.adapters.sim.floorplan import FloorPlan, Rect, Segment
-from eventsrc.adapters.sim.house import MODELS, House, Thing, build_house
+from eventsrc.adapters.sim.house import MODELS, House, SimulatedThing, build_house
 
 FAR_WALL = Segment(-50.0, -50.0, -50.0, 50.0)
 
 
-def _house(*things: Thing, walls: tuple[Segment, ...] = (FAR_WALL,)) -> House:
+def _house(*things: SimulatedThing, walls: tuple[Segment, ...] = (FAR_WALL,)) -> House:
     return House(0, FloorPlan(Rect(-50, -50, 50, 50), (), (), walls), things)
 
 
-def _lamp(x: float, y: float) -> Thing:
+def _lamp(x: float, y: float) -> SimulatedThing:
     model = MODELS["lamp-floor"]
-    return Thing("lamp-floor-1", model, "", Rect.around(x, y, 0.35, 0.35), math.pi)
+    return SimulatedThing("lamp-floor-1", model, "", Rect.around(x, y, 0.35, 0.35), math.pi)
 
 
 def _seen(house: House, yaw: float = 0.0) -> list[VisibleObject]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from .drive import TruePose
 from .floorplan import wrap
-from .house import MODELS, House, Thing
+from .house import MODELS, House, SimulatedThing
 from .random_streams import Vector, bernoulli, direction, normal, normals, stream, uniform, unit
 
 WIDTH_PX, HEIGHT_PX = 640, 400
@@ -52,7 +52,7 @@ class VisibleObject:
     ``side_rad`` is the direction from the thing to the camera, relative to the thing's front.
     """
 
-    thing: Thing
+    thing: SimulatedThing
     box: Box
     distance_m: float
     side_rad: float
@@ -71,7 +71,7 @@ def visible_objects(house: House, pose: TruePose) -> Iterator[VisibleObject]:
             yield VisibleObject(thing, box, distance, side)
 
 
-def _project(thing: Thing, pose: TruePose) -> Box | None:
+def _project(thing: SimulatedThing, pose: TruePose) -> Box | None:
     """The box around the thing's eight corners, None when one is beside or behind the camera."""
     rect, cos, sin = thing.footprint, math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
     heights = (thing.model.base_m, thing.model.base_m + thing.model.height_m)
@@ -100,7 +100,7 @@ def _clipped(box: Box | None) -> Box | None:
     return cut if wide * high >= _MIN_SHOWN * (x1 - x0) * (y1 - y0) else None
 
 
-def _unoccluded(house: House, thing: Thing, pose: TruePose) -> bool:
+def _unoccluded(house: House, thing: SimulatedThing, pose: TruePose) -> bool:
     x, y = thing.centre
     away = math.hypot(x - pose.x, y - pose.y)
     half = 0.4 * min(thing.model.width_m, thing.model.depth_m)

@@ -117,7 +117,7 @@ _MAP_MARGIN = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class SimulatedThing:
     """One object. ``instance`` is its true identity, ``facing_rad`` the direction of its front."""
 
     instance: str
@@ -138,7 +138,7 @@ class House:
 
     seed: int
     plan: FloorPlan
-    things: tuple[Thing, ...]
+    things: tuple[SimulatedThing, ...]
 
     @cached_property
     def walls(self) -> Walls:
@@ -165,26 +165,26 @@ def build_house(seed: int) -> House:
     )
 
 
-def _grid(plan: FloorPlan, things: tuple[Thing, ...]) -> DriveGrid:
+def _grid(plan: FloorPlan, things: tuple[SimulatedThing, ...]) -> DriveGrid:
     return DriveGrid(
         plan.outline, Walls(plan.walls), [t.footprint for t in things if t.model.stands]
     )
 
 
-def _with_instances(seed: int, things: tuple[Thing, ...]) -> tuple[Thing, ...]:
+def _with_instances(seed: int, things: tuple[SimulatedThing, ...]) -> tuple[SimulatedThing, ...]:
     """Name the instances of a model house7-model-1, house7-model-2 … in the order of placing. No
     two houses share an instance."""
     counts: dict[str, int] = {}
-    named: list[Thing] = []
+    named: list[SimulatedThing] = []
     for thing in things:
         count = counts[thing.model.name] = counts.get(thing.model.name, 0) + 1
         named.append(replace(thing, instance=f"house{seed}-{thing.model.name}-{count}"))
     return tuple(named)
 
 
-def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | None:
+def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[SimulatedThing, ...] | None:
     """Everything in FURNITURE and the dining set; None when something does not fit."""
-    placed: list[Thing] = []
+    placed: list[SimulatedThing] = []
     dining = _dining_set(plan, rng)
     if dining is None:
         return None
@@ -198,7 +198,7 @@ def _furnish(plan: FloorPlan, rng: np.random.Generator) -> tuple[Thing, ...] | N
     return tuple(placed)
 
 
-def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[Thing] | None:
+def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[SimulatedThing] | None:
     room = plan.room("dining room")
     keep_clear = list(_door_areas(plan, room))
     for _ in range(_TRIES):
@@ -216,8 +216,12 @@ def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[Thing] | None
 
 
 def _against_a_wall(
-    plan: FloorPlan, room: Room, model: Model, placed: list[Thing], rng: np.random.Generator
-) -> Thing | None:
+    plan: FloorPlan,
+    room: Room,
+    model: Model,
+    placed: list[SimulatedThing],
+    rng: np.random.Generator,
+) -> SimulatedThing | None:
     taken = [t.footprint for t in placed if t.room == room.name and t.model.stands == model.stands]
     taken += _door_areas(plan, room)
     for _ in range(_TRIES):
@@ -242,10 +246,10 @@ def _spot(rect: Rect, model: Model, side: int, along: float) -> Rect:
     return Rect.around(x, y, model.width_m, model.depth_m)
 
 
-def _thing(model: Model, room: Room, spot: Rect, side: int) -> Thing:
+def _thing(model: Model, room: Room, spot: Rect, side: int) -> SimulatedThing:
     """``side`` is the wall at its back; its front faces the other way."""
     quarter_turns = {0: 0.0, 1: 0.5, 2: 1.0, 3: -0.5}
-    return Thing("", model, room.name, spot, quarter_turns[side] * np.pi)
+    return SimulatedThing("", model, room.name, spot, quarter_turns[side] * np.pi)
 
 
 def _door_areas(plan: FloorPlan, room: Room) -> Iterator[Rect]:

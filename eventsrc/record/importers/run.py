@@ -64,7 +64,7 @@ OnReject = Callable[[str, str], None]
 """Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
 
 
-class LogSettings(NamedTuple):
+class StatedSettings(NamedTuple):
     """The settings that a log says: ``begins`` is the command that a new log begins with, None for
     one that says nothing yet; ``known`` is the document of settings in force. ``check`` raises
     MapfoldError for a command that no fold can use."""
@@ -74,7 +74,7 @@ class LogSettings(NamedTuple):
     check: Callable[[Command], None] = lambda _: None
 
 
-_NO_SETTINGS = LogSettings()
+_NO_SETTINGS = StatedSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
-    settings: LogSettings = _NO_SETTINGS,
+    settings: StatedSettings = _NO_SETTINGS,
     topics: TopicChoice = ALL_TOPICS,
     bags: BagOptions = _DEFAULT_BAGS,
     ledger: GapLedger[RunId] | None = None,
@@ -187,7 +187,7 @@ class _Import:
     on_reject: OnReject
     topics: TopicChoice
     ledger: GapLedger[RunId] | None
-    settings: LogSettings
+    settings: StatedSettings
     given: list[tuple[str, bytes]]
     """Keys and payloads that are appended before the first message."""
     begins: bool = False

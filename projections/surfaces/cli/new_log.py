@@ -18,7 +18,7 @@ from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.commands import UseSettings, encode_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.record.importers.run import LogSettings
+from eventsrc.record.importers.run import StatedSettings
 from projections.fold.corrections import check_settings
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import PRESETS, Settings
@@ -127,12 +127,12 @@ class LogStart:
             command = _command([f"preset={ROS_PRESET}"], _ROS_REASON)
         return cls(log, options, is_new=True, is_ros=is_ros, command=command)
 
-    def for_import(self) -> LogSettings:
+    def for_import(self) -> StatedSettings:
         """The same for an importer."""
         document = None if self.known is None else self.known.model_dump(mode="json")
         if self.command is not None:
             document = self.command.settings
-        return LogSettings(self.command, document, check_settings)
+        return StatedSettings(self.command, document, check_settings)
 
     def record(self, writer: LogWriter) -> None:
         """Append the command; it is durable when this returns."""
