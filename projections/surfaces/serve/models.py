@@ -110,6 +110,9 @@ class MapObject(TypedDict):
     obs_count: Annotated[int, Field(ge=0)]
     first_seen: Annotated[float, Field(description="Seconds since 1970.")]
     last_seen: float
+    confirmed: NotRequired[
+        Annotated[bool, Field(description="Whether it was seen from two spots or at two times.")]
+    ]
     est_x: NotRequired[
         Annotated[float, Field(description="Estimated position, under fusion by evidence.")]
     ]

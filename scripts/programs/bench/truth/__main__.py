@@ -37,6 +37,7 @@ from .moving import score_moved
 from .place_types import TypesRow, types_row, types_table
 from .places import RULES, PlacesRow, places_row, places_table
 from .scoring import score_objects
+from .telling import ToldScores, score_told, told_table
 from .walls import world_names, world_walls
 from .worlds import (
     CACHE,
@@ -96,6 +97,8 @@ def main() -> None:
     if options.calibrated:
         print(calibration_table(rows))
     print(tables.moved_table(rows) if options.moved else tables.objects_table(rows))
+    if options.moved:
+        print(told_table((row.name, row.told) for row in rows if row.told is not None))
     _write(options.json, rows)
 
 
@@ -249,7 +252,18 @@ def _row(case: Case, options: argparse.Namespace) -> tables.Row:
         score_moved(evidence, *moved, least_seen=2, least_looks=3) if options.moved else None,
         calibrated,
         calibrated_s,
+        _told(case, settings) if options.moved else None,
     )
+
+
+def _told(case: Case, settings: Settings) -> ToldScores:
+    """What a difference of the maps after run a and after run b says."""
+    runs = list(dict.fromkeys(each.envelope.run_id for each in case.events))
+    views = [
+        fold_timed([e for e in case.events if e.envelope.run_id in runs[:count]], settings)[0]
+        for count in (1, 2)
+    ]
+    return score_told(*views, case.truth, case.things)
 
 
 if __name__ == "__main__":

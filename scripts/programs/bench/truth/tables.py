@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from .moving import MovedScores
 from .scoring import ObjectScores
+from .telling import ToldScores
 
 HOUSE = "house-a"
 
@@ -25,6 +26,7 @@ class Row:
     well: MovedScores | None = None
     calibrated: ObjectScores | None = None
     calibrated_s: float = 0.0
+    told: ToldScores | None = None
 
 
 _HEADS = (
