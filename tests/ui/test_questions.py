@@ -72,7 +72,7 @@ def test_comparing_two_moments_says_and_draws_what_changed(
     page.get_by_role("button", name="Take 348").click()
     page.get_by_role("button", name="Next event").click()
     expect(page.locator(".changes")).to_contain_text("1 place gone")
-    expect(page.locator(".changes")).to_contain_text("19 objects moved")
+    expect(page.locator(".changes")).not_to_contain_text("moved")
     expect(page.locator(".summary").first).to_have_text(
         "1 new keyframe, 101 keyframes in another place"
     )
