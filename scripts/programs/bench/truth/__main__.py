@@ -1,7 +1,7 @@
 """One table: Objects with fusion=page and by evidence, side by side, against the truth.
 
 scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types]
+    [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types | --bags]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
@@ -29,6 +29,7 @@ from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 
 from . import tables
+from .bags import BagRow, bag_row, bags_table
 from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
 from .localising import MAPS, LocaliseRow, localise, stranger_of
@@ -48,6 +49,7 @@ from .worlds import (
     Case,
     NoWorldsError,
     as_if_alike,
+    case_folder,
     house_case,
     load_generator,
     make_case,
@@ -64,6 +66,12 @@ def main() -> None:
         limit = options.limit or (QUICK_LIMIT if options.quick else LIMIT)
         if options.localise:
             _localise(generator, chosen, options, limit)
+            return
+        if options.bags:
+            bags = [_bag_row(generator, *each, options, limit) for each in chosen]
+            print(f"{options.half} half, {len(bags)} bags of at most {limit} keyframes")
+            print(bags_table(bags))
+            _write(options.json, bags)
             return
         cases = _cases(generator, chosen, options, limit)
         if options.places:
@@ -102,12 +110,19 @@ def main() -> None:
     _write(options.json, rows)
 
 
+def _bag_row(
+    generator: ModuleType, profile: str, world: str, options: argparse.Namespace, limit: int
+) -> BagRow:
+    folder = case_folder(generator, profile, world, 0.0, limit, options.seed, options.cache)
+    return bag_row(options.worlds / "make_bag.py", folder, profile, world)
+
+
 def _world(case: Case) -> str:
     """The building of a case; house-a, whose walls are not known, is in no generator."""
     return case.name.rpartition(" ")[2]
 
 
-def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow]) -> None:
+def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow]) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
         path.write_text(json.dumps(document, indent=1) + "\n")
@@ -184,6 +199,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--places", action="store_true", help="places against rooms, no Objects")
     parser.add_argument(
         "--walls", action="store_true", help="with --places: rooms with an occupancy map, too"
+    )
+    parser.add_argument(
+        "--bags", action="store_true", help="bags of ROS 2 with walls, imported without an option"
     )
     parser.add_argument("--types", action="store_true", help="types of places against room names")
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")

@@ -130,13 +130,27 @@ def make_case(
 ) -> Case:
     """The runs of a profile in a world, generated unless the cache has them; without
     ``embeddings`` as a bare detector sees them."""
+    kept = case_folder(generator, profile, world, moved, limit, seed, cache)
+    return read_case(kept, profile, world, embeddings=embeddings)
+
+
+def case_folder(
+    generator: ModuleType,
+    profile: str,
+    world: str,
+    moved: float,
+    limit: int,
+    seed: int,
+    cache: Path,
+) -> Path:
+    """The folder of the generator's files, generated unless the cache has them."""
     source = Path(str(generator.__file__))
     layout = source.parent / "layouts" / f"{world}.json"
     version = zlib.crc32(layout.read_bytes(), zlib.crc32(source.read_bytes()))
     kept = cache / f"{version:08x}-seed{seed}-moved{moved:g}-limit{limit}" / profile / world
     if not (kept / "looks-again.json").exists():
         _generate(source, generator, profile, world, moved, limit, seed, kept)
-    return read_case(kept, profile, world, embeddings=embeddings)
+    return kept
 
 
 def _generate(
