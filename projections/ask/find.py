@@ -16,9 +16,9 @@ from eventsrc.base.errors import MisuseError
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
 from projections.map.naming import MOST_NEAR, Rule, Thing, matches, thing_called, things_of
+from projections.map.phrases import iso_time
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
-from projections.store.history_records import iso_time
 
 from .class_names import ClassMatch, classes_meant, near_classes
 

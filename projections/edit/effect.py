@@ -40,9 +40,8 @@ from projections.fold.corrections import (
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.settings import Settings, assignment_texts, settings_by_name
 from projections.history.diff import Difference, difference_of, rows_of
-from projections.map.phrases import command_document
+from projections.map.phrases import command_document, iso_time
 from projections.map.view import MapView
-from projections.store.history_records import iso_time
 
 from .current import MapToEdit, SettingsOf
 from .make import undone_by

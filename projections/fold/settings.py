@@ -235,14 +235,18 @@ class Settings(BaseModel):
 
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
         """These settings changed by ``name=value`` texts, as ``option`` takes them. ``preset=NAME``
-        stands for the assignments of a preset.
+        stands for the assignments of a preset; others come on top of it wherever it stands.
 
-        Raises SettingsError that names the option, the setting and the rule it breaks.
+        Raises SettingsError that names the option, the setting and the rule it breaks, or the two
+        values of a setting that is given twice.
         """
-        values = _tree(self)
-        for text in assignments:
+        values, given = _tree(self), dict[str, str]()
+        texts = sorted(assignments, key=lambda text: not text.lstrip().startswith("preset="))
+        for text in texts:
             try:
-                _assign(values, text)
+                name, value = _split(text)
+                _check_once(name, value, given)
+                _assign(values, name, value)
             except SettingsError as error:
                 raise SettingsError(f"{option} {_plain(text)}: {error}") from None
         try:
@@ -384,16 +388,27 @@ _EXAMPLES = {
 }
 
 
-def _assign(values: dict[str, Any], text: str) -> None:
-    """Change the document of settings by one ``name=value``. Raises SettingsError."""
+def _split(text: str) -> tuple[str, str]:
+    """Name and value of ``name=value``. Raises SettingsError."""
     # A class's name may hold dots and equals signs; its size is a number.
     split = text.rpartition("=") if text.lstrip().startswith(_SIZES) else text.partition("=")
-    name, value = split[0].strip(), split[2].strip()
     if not split[1]:
         raise SettingsError("write it as name=value, such as eps_m=1.0")
+    return split[0].strip(), split[2].strip()
+
+
+def _check_once(name: str, value: str, given: dict[str, str]) -> None:
+    """Add a setting to those that were ``given``. Raises SettingsError if it was, otherwise."""
+    before = given.setdefault(name, value)
+    if before != value:
+        raise SettingsError(f"{_plain(name)} is given as {_plain(before)} too; give one of them")
+
+
+def _assign(values: dict[str, Any], name: str, value: str) -> None:
+    """Change one setting in the document of settings. Raises SettingsError."""
     if name == "preset":
         for each in preset_assignments(value):
-            _assign(values, each)
+            _assign(values, *_split(each))
         return
     given = None if value in ("", "none") else value
     if name.startswith(_SIZES):

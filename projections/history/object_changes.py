@@ -23,6 +23,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from projections.map.phrases import seen_times
 from projections.map.records import EstimatedPosition, Relocation
 
 _KNOWN_M: Final = 0.5
@@ -173,8 +174,7 @@ def object_document(row: ObjectRow) -> dict[str, Any]:
         "mean_y": row.mean_y,
         "obs_count": len(row.det_ids),
         "place_id": row.place_id,
-        "first_seen": row.first_seen,
-        "last_seen": row.last_seen,
+        **seen_times(row.first_seen, row.last_seen),
         "confirmed": row.confirmed,
         **(
             {}

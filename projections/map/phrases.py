@@ -1,6 +1,7 @@
-"""Commands as phrases and as JSON, and the changes of an event as lines of text."""
+"""Commands as phrases and as JSON, the changes of an event as lines of text, and times."""
 
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from typing import Any
 
 from eventsrc.base.text import visible
@@ -23,6 +24,22 @@ from projections.fold.deltas import (
 from projections.fold.exact import UM_PER_M
 
 from .view import MapView
+
+
+def iso_time(time_s: float) -> str:
+    """Robot seconds since the epoch as ISO 8601 UTC with milliseconds, ending in Z."""
+    moment = datetime.fromtimestamp(time_s, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def seen_times(first_seen: float, last_seen: float) -> dict[str, Any]:
+    """When a thing was first and last seen, as seconds since the epoch and as ISO 8601."""
+    return {
+        "first_seen": first_seen,
+        "last_seen": last_seen,
+        "first_seen_iso": iso_time(first_seen),
+        "last_seen_iso": iso_time(last_seen),
+    }
 
 
 def command_name(command: Command) -> str:

@@ -15,7 +15,7 @@ from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
 from .confirmed import objects_text
-from .phrases import command_document
+from .phrases import command_document, seen_times
 from .place_regions import Region, place_regions
 from .records import ObjectRecord
 from .view import MapView
@@ -152,8 +152,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
             "mean_y": o.mean_y,
             "obs_count": o.obs_count,
             "place_id": view.place_id(o.place),
-            "first_seen": o.first_seen,
-            "last_seen": o.last_seen,
+            **seen_times(o.first_seen, o.last_seen),
             "det_ids": [det_ids[i] for i in o.observations],
             "confirmed": o.confirmed,
             **(_evidence(view, o) if view.settings.fusion == "evidence" else {}),

@@ -11,7 +11,6 @@ and later keyframes are folded, so its offset is where it was recorded, not wher
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from operator import attrgetter
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -37,6 +36,7 @@ from projections.fold.deltas import (
     PlaceNamed,
     PlaceOrdinal,
 )
+from projections.map.phrases import iso_time
 
 from .lazy_rows import Items
 
@@ -97,12 +97,6 @@ def cause_of(offset: Offset, deltas: Iterable[Delta]) -> Cause:
         if isinstance(delta, KeyframeAdded):
             return Cause(offset, "keyframe", delta.timestamp, delta.run_id, delta.keyframe_id)
     return Cause(offset, "command")
-
-
-def iso_time(time_s: float) -> str:
-    """Robot seconds since the epoch as ISO 8601 UTC with milliseconds, ending in Z."""
-    moment = datetime.fromtimestamp(time_s, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,6 +128,14 @@ def test_a_trajectory_file_moves_what_it_names(mapfold: Commands) -> None:
     assert moved == {0: (0.0, 20.0)} | {k: (k / 2 + 0.25, 20.5) for k in range(1, 5)}
 
 
+def test_a_name_needs_no_reason(mapfold: Commands) -> None:
+    mapfold("edit", "log", "name-place", LEFT, "hall")
+    (command,) = _commands(mapfold.folder / "log")
+    assert command.reason == ""
+    assert mapfold("edits", "log", "--json").json[0]["reason"] == ""
+    assert "name-place" in mapfold("edits", "log").out
+
+
 def test_what_is_wrong_is_one_line_and_writes_nothing(mapfold: Commands) -> None:
     log = mapfold.folder / "log"
     before = _files(log)

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -122,6 +123,8 @@ def test_an_unreadable_file_is_one_line(run: Commands) -> None:
 def test_info_and_cat(run: Commands) -> None:
     run("import", "a", "-", "--key", "k", stdin=b"\n".join(PAYLOADS))
     info = run("log", "info", "a", "--json").json
+    logged = datetime.fromisoformat(info["first_logged"])
+    assert logged.timestamp() == pytest.approx(info["first_logged_ns"] / 1e9, abs=1e-6)
     assert (info["events"], info["keys"], info["rejected"]) == (5, {"k": 5}, 0)
     assert "k: 5" in run("log", "info", "a").out
     shown = run("log", "cat", "a", "--json", "--from", "run-a:2", "--to", "run-a:3").lines

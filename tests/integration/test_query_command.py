@@ -1,6 +1,7 @@
 """`mapfold query`: live answers equal those of the folded log, with any names."""
 
 import json
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,10 @@ def test_the_command_asks_a_past_map(tmp_path: Path, log: Path, view: MapView) -
     thing = view.objects[0]
     now = mapfold("query", "where", thing.object_id, "--log", log, "--json").json
     assert now["obs_count"] == thing.obs_count
+    assert now["first_seen"] == thing.first_seen
+    assert datetime.fromisoformat(now["first_seen_iso"]).timestamp() == thing.first_seen
+    text = mapfold("query", "where", thing.object_id, "--log", log).out
+    assert f"first_seen {now['first_seen_iso']}  last_seen {now['last_seen_iso']}" in text
     first = next(k.offset for k in view.keyframes if thing.observations[0] in list(k.observations))
     then = mapfold(
         "query", "where", thing.object_id, "--log", log, "--at", str(first + 1), "--json"

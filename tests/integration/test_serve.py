@@ -1,6 +1,7 @@
 """`mapfold serve` as a command, its limits, and what it does without its database."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from eventsrc.record.transport.session import ZenohOptions, open_session
+from eventsrc.record.transport.session import Router, ZenohOptions, open_session
 from projections.fold.map_errors import DatabaseError, DatabaseUnavailable, ProjectionMissing
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
@@ -18,6 +19,7 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.answering import HEALTH_S, TokenBucket, TooMuchError
 from tests.support.commands import Commands, ReadyProgram
+from tests.support.fixtures_zenoh import LOOPBACK
 from tests.support.logs import walk, write_log
 from tests.support.serve_questions import DEADLINE_S, ask, fetch, http_at, question
 from tests.support.servers import kill_postgres, server_to_kill
@@ -60,6 +62,46 @@ def test_the_command_serves_until_sigterm(
         code = program.end()
     assert code == 0
     assert "service ended" in program.text
+
+
+def test_http_answers_without_a_router_and_zenoh_when_one_is_there(
+    walked_map: Targets, tmp_path: Path
+) -> None:
+    with Router(LOOPBACK) as gone:
+        (away,) = gone.endpoints
+    read, write = os.pipe()
+    words = ("--http", "127.0.0.1:0", "--connect", away, "--db", walked_map.graph_url)
+    started = Commands.in_folder(tmp_path).start("serve", *words, stderr=write)
+    os.close(write)
+    program = ReadyProgram(started, read, DEADLINE_S, DEADLINE_S)
+    try:
+        assert program.said[0] == (
+            f"no Zenoh router or peer answers at {away}; start one with `mapfold router --listen"
+            f" {away}` or say where it is with --connect; it is joined when it answers"
+        )
+        (url,) = re.findall(r"answering (http://\S+),", program.text)
+        assert fetch(f"{url}/health")[1]["status"] == "ok"
+        options = ZenohOptions(connect=(away,))
+        with (
+            Router(ZenohOptions(listen=(away,))),
+            open_session(options, mode="client") as session,
+        ):
+            give_up = time.monotonic() + DEADLINE_S
+            replies: list[tuple[bool, bytes]] = []
+            while not replies and time.monotonic() < give_up:
+                replies = session.get_replies("mapfold/relocalize", question(), timeout_s=1.0)
+        assert [good for good, _ in replies] == [True]
+    finally:
+        code = program.end()
+    assert code == 0
+
+
+def test_without_http_a_missing_router_is_one_line(walked_map: Targets, tmp_path: Path) -> None:
+    with Router(LOOPBACK) as gone:
+        (away,) = gone.endpoints
+    mapfold = Commands.in_folder(tmp_path)
+    said = mapfold("serve", "--connect", away, "--db", walked_map.graph_url, code=1).err
+    assert said.startswith(f"mapfold: no Zenoh router or peer answers at {away}; start one")
 
 
 class TestKilledServer:

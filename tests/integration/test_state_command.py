@@ -91,6 +91,8 @@ def test_the_document_says_what_was_seen(mapfold: Commands, log: Path) -> None:
         1774357200.0,
         1774357202.0,
     )
+    assert first["first_seen_iso"] == "2026-03-24T13:00:00.000Z"
+    assert first["last_seen_iso"] == "2026-03-24T13:00:02.000Z"
     assert document["adjacency"] == [{"a": "run-a_p0", "b": "run-a_p1", "shared_transitions": 1}]
     assert document["counts"]["noise"] == 1
 

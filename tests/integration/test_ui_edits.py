@@ -56,6 +56,11 @@ def test_a_dry_run_a_command_and_its_undo(mapfold: Commands, log: Path, server: 
     assert known == before
 
 
+def test_a_name_needs_no_reason(server: UiServer) -> None:
+    named = server.edit("name-place", "run-a_p0", "hall", dry_run=False).json
+    assert named["recorded"] is True
+
+
 def test_every_kind_says_what_the_command_says(
     mapfold: Commands, log: Path, server: UiServer
 ) -> None:

@@ -22,6 +22,21 @@ def test_assignments_change_what_they_name() -> None:
     assert changed == Settings(eps_m=1.0, min_samples=8, embedding_model="a=b")
 
 
+def test_a_setting_given_twice_is_refused_with_both_values() -> None:
+    for texts, told in (
+        (["min_samples=3", "eps_m=1", "min_samples=5"], "min_samples=5: min_samples is given as 3"),
+        (["preset=full", "preset=rooms"], "preset=rooms: preset is given as full too"),
+        (["evidence.sizes_m.a=b=1", "evidence.sizes_m.a=b=2"], "sizes_m.a=b is given as 1 too"),
+    ):
+        with pytest.raises(SettingsError, match=r"^--set ") as caught:
+            Settings().with_assignments(texts)
+        assert told in str(caught.value)
+    assert Settings().with_assignments(["eps_m=1", "eps_m = 1"]) == Settings(eps_m=1.0)
+    on_top = Settings(places="rooms")
+    for order in (["preset=full", "fusion=page"], ["fusion=page", "preset=full"]):
+        assert Settings().with_assignments(order) == on_top
+
+
 def test_none_gives_a_setting_back() -> None:
     pinned = Settings(embedding_model="m", embedding_dim=4)
     assert pinned.with_assignments(["embedding_model=none", "embedding_dim="]) == Settings()

@@ -93,18 +93,21 @@ class ZenohOptions:
 
     ``connect`` and ``listen`` take precedence over the file. TLS, access control and scouting are
     set in the file only. Zenoh drops messages of more than ``max_message_bytes``, unless the file
-    sets that bound; Zenoh's default is 1 GiB for each of several messages in transit.
+    sets that bound; Zenoh's default is 1 GiB for each of several messages in transit. With
+    ``joins_later`` a peer is opened although nothing answers, and connects when something does.
     """
 
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config_file: Path | None = None
     max_message_bytes: int | None = None
+    joins_later: bool = False
 
     @property
     def mode(self) -> Literal["client", "peer"]:
-        """The mode of a recorder or publisher with these options: a peer if it listens."""
-        return "peer" if self.listen else "client"
+        """The mode of a recorder or publisher with these options: a peer if it listens, or joins
+        later."""
+        return "peer" if self.listen or self.joins_later else "client"
 
 
 class Config(Protocol):
@@ -121,7 +124,8 @@ def configure(config: Config, defaults: Config, options: ZenohOptions, mode: Mod
     malformed endpoint.
     """
     connect, listen = check_endpoints(options.connect), check_endpoints(options.listen)
-    if not connect and mode == "client" and _is_unset(config, "connect/endpoints"):
+    connects = mode == "client" or options.joins_later
+    if not connect and connects and _is_unset(config, "connect/endpoints"):
         connect = (DEFAULT_ENDPOINT,)
     _set(config, "mode", mode)
     _set(config, "transport/shared_memory/enabled", False)
@@ -138,7 +142,7 @@ def configure(config: Config, defaults: Config, options: ZenohOptions, mode: Mod
         _set(config, _RECEIVED, _RECEIVED_BYTES)  # not for many links
     _configure_scouting(config)
     if mode == "peer":  # not for a router: it may start before the routers it connects to
-        _set(config, "connect/exit_on_failure", True)
+        _set(config, "connect/exit_on_failure", not options.joins_later)
         _set(config, "connect/timeout_ms", _OPEN_TIMEOUT_MS)
     if mode == "router":
         _set(config, "adminspace/enabled", True)  # `Session.locators` queries it

@@ -62,8 +62,10 @@ def _name_place(
     name: Annotated[str, typer.Argument(metavar="NAME", help="The name of the place.")],
     options: EditOptions,
 ) -> None:
-    """Give a place a name."""
-    options.record(lambda current, stamp: make.name_place(current, stamp, place, name))
+    """Give a place a name; a reason is not needed."""
+    options.record(
+        lambda current, stamp: make.name_place(current, stamp, place, name), needs_reason=False
+    )
 
 
 @edit.command("keep-apart")
@@ -241,13 +243,13 @@ def _relabel(
 ) -> None:
     """Give classes names, where a detector recorded numbers or words of its own.
 
-    A label is what the log has, whatever it was called since.
+    A label is what the log has, whatever it was called since. A reason is not needed.
     """
     labels = {} if file is None else read_labels(file)
     labels |= make.labels_of(named or ())
     if not labels:
         raise MisuseError("give LABEL=NAME or --labels FILE")
-    options.record(lambda current, stamp: make.relabel(current, stamp, labels))
+    options.record(lambda current, stamp: make.relabel(current, stamp, labels), needs_reason=False)
 
 
 @edit.command("use-settings")

@@ -61,10 +61,10 @@ class NewCommand(ZenohClient, _Stamped):
         """The settings of the map that names are looked up in."""
         return settings_from(None, None, corrections)
 
-    def record(self, make_: MakeCommand) -> None:
+    def record(self, make_: MakeCommand, *, needs_reason: bool = True) -> None:
         """Record the command, or with ``--dry-run`` print what it would change. Raises MisuseError
-        without a reason."""
-        if not self.reason.strip() and not self.dry_run:
+        where it needs a reason and has none."""
+        if needs_reason and not self.reason.strip() and not self.dry_run:
             raise MisuseError("--reason TEXT is missing: say why, for those who read the log later")
         log: Path = self.context.obj
         stamp = Stamp(

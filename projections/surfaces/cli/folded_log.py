@@ -113,16 +113,17 @@ class NamedSettings:
     def around(self, assignments: list[str] | None) -> list[str]:
         """All of them as assignments, with those of ``--set`` in between. Raises SettingsError for
         a preset that does not exist."""
-        preset = () if self.preset is None else _preset(self.preset)
+        preset = () if self.preset is None else (_preset(self.preset),)
         space = () if self.space is None else (f"embedding_model={self.space}",)
         return [*preset, *(assignments or ()), *space]
 
 
-def _preset(name: str) -> tuple[str, ...]:
+def _preset(name: str) -> str:
     try:
-        return preset_assignments(name)
+        preset_assignments(name)
     except SettingsError as error:
         raise SettingsError(f"--preset: {error}") from None
+    return f"preset={name}"
 
 
 @dataclass(frozen=True, kw_only=True)

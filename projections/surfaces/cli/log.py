@@ -106,9 +106,12 @@ def info(log: LogArgument, json_: JsonOption = False) -> None:
 
 
 def info_document(report: LogInfo) -> dict[str, Any]:
-    """The output of `log info --json`."""
+    """The output of `log info --json`: times as nanoseconds, and as ISO 8601."""
+    times = ("first_logged", "last_logged", "first_stamp", "last_stamp")
+    numbers = {name: getattr(report, f"{name}_ns") for name in times}
     return {
         **asdict(report),
+        **{name: None if ns is None else iso_time(ns) for name, ns in numbers.items()},
         "path": str(report.path),
         "segments": [asdict(s) for s in report.segments],
         "caches": {path.name: size for path, size in cache_sizes(report.path)},

@@ -11,6 +11,7 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.log import LogReader
 from projections.map.own_events import read_corrections
+from projections.map.phrases import seen_times
 from projections.postgres.connection import connect
 from projections.postgres.queries.candidate_search import CandidateReader, prepare_graph
 from projections.postgres.queries.map_queries import (
@@ -177,16 +178,23 @@ def path(
 
 
 def _print(found: Any, as_json: bool) -> None:
+    rows = [_with_iso_times(row) for row in (found if isinstance(found, list) else [found])]
     if as_json:
-        emit(found)
-        return
-    rows = found if isinstance(found, list) else [found]
-    display("".join(f"{_format(row)}\n" for row in rows) or "nothing found")
+        emit(rows if isinstance(found, list) else rows[0])
+    else:
+        display("".join(f"{_format(row)}\n" for row in rows) or "nothing found")
+
+
+def _with_iso_times(row: dict[str, Any]) -> dict[str, Any]:
+    if "first_seen" not in row:
+        return row
+    return {**row, **seen_times(row["first_seen"], row["last_seen"])}
 
 
 def _format(row: dict[str, Any]) -> str:
+    shown = {name: row.get(f"{name}_iso", value) for name, value in row.items()}
     return "  ".join(
         f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in row.items()
-        if value is not None
+        for name, value in shown.items()
+        if value is not None and not name.endswith("_iso")
     )

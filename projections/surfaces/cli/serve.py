@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import typer
 
-from eventsrc.base.errors import MisuseError
-from eventsrc.record.transport.session import open_session
+from eventsrc.base.errors import MisuseError, TransportError
+from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
 
@@ -207,7 +207,8 @@ def serve(
         answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=asked_by, note=say)
         session = None
         if zenoh:
-            session = stack.enter_context(open_session(session_options, mode=session_options.mode))
+            patient = endpoint is not None
+            session = stack.enter_context(_open_session(session_options, patient=patient))
         # Closed before the session, which sends its last answers.
         queue = stack.enter_context(FairQueue(workers))
         metrics = None if endpoint is None else _metrics(answerer, queue)
@@ -221,6 +222,20 @@ def serve(
         say("Ctrl-C ends it")
         stop.wait()
     say("service ended")
+
+
+def _open_session(options: ZenohOptions, *, patient: bool) -> Session:
+    """The session to answer over. If ``patient``, it is opened also where no router answers, and
+    joins when one does: a line says so."""
+    try:
+        return open_session(options, mode=options.mode)
+    except TransportError as error:
+        if not patient:
+            raise
+        later = dataclasses.replace(options, joins_later=True)
+        session = open_session(later, mode=later.mode)
+        say(f"{error}; it is joined when it answers")
+        return session
 
 
 def _metrics(answerer: Answerer, queue: FairQueue) -> "ServiceMetrics":

@@ -126,6 +126,7 @@ KINDS: Final = {
     "undo": _Kind("command_id", _of(make.undo)),
 }
 """The kinds of `mapfold edit` that the page can give; of ``correct-poses`` those by a transform."""
+NEEDS_NO_REASON: Final = frozenset({"name-place", "relabel"})
 
 
 def corrections_answer(opened: Opened, through: int, go_on: Callable[[], None]) -> dict[str, Any]:
@@ -163,7 +164,7 @@ class Editor:
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
         make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
-        if not asked.reason.strip() and not asked.dry_run:
+        if asked.kind not in NEEDS_NO_REASON and not asked.reason.strip() and not asked.dry_run:
             raise MisuseError("the reason is missing: say why, for later readers of the log")
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
         notes: list[str] = []

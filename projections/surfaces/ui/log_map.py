@@ -123,7 +123,8 @@ class Opened:
     def words(self, *sets: str) -> list[str]:
         """The options that give a command the same settings, changed by ``sets``."""
         words = [] if self.settings_file is None else ["--settings", str(self.settings_file)]
-        return words + [word for text in (*self.sets, *sets) for word in ("--set", text)]
+        last = {text.partition("=")[0].strip(): text for text in (*self.sets, *sets)}
+        return words + [word for text in last.values() for word in ("--set", text)]
 
     def base_words(self) -> list[str]:
         """The options that give ``mapfold whatif`` the same base."""

@@ -90,6 +90,7 @@ function Form() {
     setPreview(null);
     setFailed(null);
   }, [key]);
+  const needsReason = !["name-place", "relabel"].includes(wanted.kind);
   const whole = given.every((each) => each.trim() !== "");
   const set = (index: number, value: string) => {
     proposal.value = { kind: wanted.kind, arguments: given.map((each, at) => (at === index ? value : each)) };
@@ -144,7 +145,7 @@ function Form() {
       {preview !== null && (
         <label>
           Reason
-          <input type="text" maxLength={2000} required value={reason} placeholder="Why is it so?" onInput={(event) => setReason(event.currentTarget.value)} />
+          <input type="text" maxLength={2000} required={needsReason} value={reason} placeholder={needsReason ? "Why is it so?" : "Not needed for a name"} onInput={(event) => setReason(event.currentTarget.value)} />
         </label>
       )}
       {failed !== null && <p class="error" role="alert">{failed}</p>}
@@ -163,7 +164,7 @@ function Form() {
           </button>
         ) : (
           <>
-            <button class="button main" type="submit" disabled={busy || reason.trim() === ""}>
+            <button class="button main" type="submit" disabled={busy || (needsReason && reason.trim() === "")}>
               {busy ? "Recording …" : "Record it"}
             </button>
             <button class="button quiet" type="button" onClick={() => setPreview(null)}>
