@@ -19,12 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, TypedDict
 
 from foxglove import Channel, Context, Schema
-from foxglove.channels import (
-    FrameTransformsChannel,
-    GridChannel,
-    LogChannel,
-    SceneUpdateChannel,
-)
+from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, SceneUpdateChannel
 from foxglove.messages import (
     Color,
     CubePrimitive,
