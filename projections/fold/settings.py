@@ -1,7 +1,6 @@
 """Every parameter that changes the fold, in one frozen model.
 
-The fingerprint is part of a checkpoint's identity: a projection made with other settings is
-refused, not mixed.
+The fingerprint is part of a checkpoint's identity: no projection mixes settings.
 """
 
 import hashlib
@@ -48,8 +47,7 @@ class CameraConstants(BaseModel):
 class CameraSettings(BaseModel):
     """What the settings say of the camera; None where they do not say it.
 
-    ``hfov_error_deg`` is the standard error of a field of view that `mapfold calibrate` estimated,
-    None for one that a person gave.
+    ``hfov_error_deg`` is the standard error of an estimated field of view, None for a given one.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -63,8 +61,7 @@ class CameraSettings(BaseModel):
     @property
     def constants(self) -> CameraConstants:
         """The camera of envelopes that do not state theirs: defaults for what is not said."""
-        said = self.model_dump(exclude_none=True, exclude={"hfov_error_deg"})
-        return CameraConstants(**said)
+        return CameraConstants(**self.model_dump(exclude_none=True, exclude={"hfov_error_deg"}))
 
     @property
     def is_stated(self) -> bool:
@@ -80,8 +77,7 @@ _Length = Annotated[float, Field(ge=0.01, le=100.0)]
 class RoomsConstants(BaseModel):
     """Constants of places by rooms (``places = "rooms"``), lengths in metres.
 
-    They were chosen on the developing half of the trial data; docs/places.md has the rule and what
-    was tried.
+    They were chosen on the developing half of the trial data; the rule is in docs/places.md.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -150,8 +146,7 @@ class Settings(BaseModel):
     fusion_radius_m: Annotated[float, Field(gt=0.0, le=1000.0)] = 3.0
     """An observation may fuse with an Object whose mean position is within this distance."""
     fusion_similarity: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.7
-    """An observation may fuse with an Object whose mean embedding has at least this cosine with
-    the observation's."""
+    """An observation may fuse with an Object whose mean embedding has this cosine with its own."""
     embedding_model: Text | None = None
     """The map's embedding model; None takes that of the first embedded detection."""
     embedding_dim: Annotated[int, Field(ge=1, le=16_000)] | None = None
@@ -198,8 +193,7 @@ class Settings(BaseModel):
         return hash(self.fingerprint())
 
     def fingerprint(self) -> str:
-        """16 hex digits that are equal exactly when every setting is; the camera counts as the fold
-        uses it, so that its default may be said or not."""
+        """16 hex digits, equal exactly when every setting is; a camera not said is the default."""
         values, camera = self.model_dump(), self.camera.constants
         if "camera" in values:
             values["camera"] = camera.model_dump()
@@ -224,8 +218,7 @@ class Settings(BaseModel):
         return settings_by_name(_tree(self))
 
     def changed_from(self, base: "Settings") -> dict[str, Any]:
-        """The settings that differ from ``base`` by name, with the values here; None for a size
-        that only ``base`` has."""
+        """The values here that differ from ``base``; None for a size that only ``base`` has."""
         before, here = base.by_name(), self.by_name()
         names = [*here, *(name for name in before if name not in here)]
         changed = {name: here.get(name) for name in names if here.get(name) != before.get(name)}
@@ -344,13 +337,11 @@ def _no_setting(name: str) -> str:
 
 
 def settings_by_name(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a document of settings by the names that ``--set`` takes. Settings that it
-    leaves out are not there."""
+    """The values that a document of settings has, by the names that ``--set`` takes."""
     found: dict[str, Any] = {}
     for name, value in document.items():
         if isinstance(value, Mapping):
-            inner = settings_by_name(value)
-            found |= {f"{name}.{key}": each for key, each in inner.items()}
+            found |= {f"{name}.{key}": each for key, each in settings_by_name(value).items()}
         else:
             found[name] = value
     return found
@@ -371,11 +362,7 @@ def assignment_texts(changed: Mapping[str, Any]) -> list[str]:
 
 def _tree(settings: Settings) -> dict[str, Any]:
     """All settings as a document, those with their default too."""
-    values = {name: getattr(settings, name) for name in Settings.model_fields}
-    return {
-        name: value.model_dump() if isinstance(value, BaseModel) else value
-        for name, value in values.items()
-    }
+    return {n: v.model_dump() if isinstance(v, BaseModel) else v for n, v in settings}
 
 
 _HFOV, _HFOV_ERROR = "camera.hfov_deg", "camera.hfov_error_deg"
