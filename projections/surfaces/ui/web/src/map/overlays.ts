@@ -36,6 +36,7 @@ export function drawDifference(on: Surface, scene: Scene) {
     const row = change === "gone" ? before.objectRow[object] : scene.map.objectRow[object];
     const shown = row >= 0 ? row : before.objectRow[object];
     if (shown < 0) continue;
+    if (history.changes.confirmed[shown] === 0 && !scene.layers.once) continue;
     const colour = { new: palette.added, gone: palette.removed, moved: palette.moved }[change];
     badge(on, screenX(view, history.changes.x[shown]), screenY(view, history.changes.y[shown]), colour, change);
   }

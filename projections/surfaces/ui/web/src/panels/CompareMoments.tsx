@@ -107,7 +107,7 @@ function DifferenceCounts() {
         {row("+", "new", counted(placed("new").length, "new place"), placed("new"), place)}
         {row("×", "gone", `${counted(placed("gone").length, "place")} gone`, placed("gone"), place)}
         {row("~", "changed", `${counted(placed("changed").length, "place")} changed`, placed("changed"), place)}
-        {row("+", "new", `${counted(fresh.length, "new object")}${once > 0 ? ` + ${once.toLocaleString("en")} seen once` : ""}`, stood("new"), object)}
+        {row("+", "new", `${counted(fresh.length, "new object")}${once > 0 ? ` + ${once.toLocaleString("en")} seen once` : ""}`, fresh, object)}
         {row("×", "gone", `${counted(stood("gone").length, "object")} gone`, stood("gone"), object)}
         {row("~", "changed", `${counted(stood("joined").length, "object")} joined into others`, stood("joined"), object)}
         {row("→", "moved", `${counted(moved.length, "object")} moved`, moved, object)}
