@@ -3,9 +3,9 @@
 The wheel installs this file as the module ``mapfold``; ``python -m mapfold`` is the program.
 
 >>> import mapfold
->>> house = mapfold.fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+>>> house = mapfold.fold("logs/sample")
 >>> len(house.places), len(house.objects)
-(10, 82)
+(8, 66)
 """
 
 import sys

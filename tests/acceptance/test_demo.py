@@ -18,10 +18,10 @@ import pytest
 
 from eventsrc.envelope.system_events import COMMAND_KEY, MAP_KEY
 from eventsrc.log import LogReader
+from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
-from projections.surfaces.cli.folded_log import settings_from
 from tests.docs.console import ROOT, Command, matches, read
 from tests.support.commands import Commands, Said
 from tests.support.logs import simulated
@@ -64,6 +64,15 @@ def test_the_tour_shows_what_it_prints(played: Played) -> None:
     assert matches(shown.prints, printed.splitlines()), printed
 
 
+def _settings(played: Played) -> Settings:
+    """What the log says first."""
+    with LogReader(played.out / "log") as reader:
+        settings = read_corrections(reader).settings
+    assert settings is not None
+    assert (settings.places, settings.fusion) == ("rooms", "evidence")
+    return settings
+
+
 def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> None:
     run = simulated()
     with LogReader(played.out / "log") as reader:
@@ -80,7 +89,7 @@ def test_every_keyframe_went_through_the_router_into_the_log(played: Played) -> 
 
 
 def test_the_reported_map_is_the_fold_of_the_log(played: Played) -> None:
-    settings = settings_from(played.out / "settings.json", None)
+    settings = _settings(played)
     with LogReader(played.out / "log") as reader:
         _, view = fold_log(reader, settings)  # without the commands
     told = played.numbers["map"]
@@ -104,7 +113,7 @@ def test_the_tail_kept_up_and_the_replay_wrote_the_same_rows(played: Played) -> 
 
 
 def test_the_merges_are_where_the_number_of_places_falls(played: Played) -> None:
-    settings = settings_from(played.out / "settings.json", None)
+    settings = _settings(played)
     assert played.numbers["merges"]
     with LogReader(played.out / "log") as reader:
         for merge in played.numbers["merges"]:
@@ -118,13 +127,13 @@ def test_the_merges_are_where_the_number_of_places_falls(played: Played) -> None
 
 
 def test_one_merge_is_undone_and_one_place_has_a_name(played: Played) -> None:
-    settings = settings_from(played.out / "settings.json", None)
+    settings = _settings(played)
     with LogReader(played.out / "log") as reader:
         corrections = read_corrections(reader)
         _, before = fold_log(reader, settings)
         _, after = fold_log(reader, settings, corrections=corrections)
     told = played.numbers["corrected"]
-    assert [c["kind"] for c in told["commands"]] == ["undo-merge", "name-place"]
+    assert [c["kind"] for c in told["commands"]] == ["use-settings", "undo-merge", "name-place"]
     assert told["digest"] == map_digest(after) != map_digest(before)
     assert told["places"] == len(after.places) == len(before.places) + 1
     standing = {p.place_id: p for p in after.places.values()}

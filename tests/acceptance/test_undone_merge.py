@@ -10,10 +10,11 @@ import pytest
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.append import append_payload
 from tests.support.commands import Commands
+from tests.support.logs import sample_drive
 from tests.support.servers import furnish
 from tests.support.shared_data import shared_run
 
-SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+SAMPLE = sample_drive()
 FINE = {"eps_m": 0.75, "min_samples": 8}
 
 

@@ -20,10 +20,10 @@ from projections.surfaces.python import Map, Timeline, fold, open_log, relocaliz
 from tests.support import prefork
 from tests.support.commands import TIMEOUT_S, Commands
 from tests.support.envelopes import detection, envelope
-from tests.support.logs import write_log
+from tests.support.logs import sample_drive, write_log
 
 ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = ROOT / "logs" / "sample"
+SAMPLE = sample_drive()
 ROOMS = {"eps_m": 0.75, "min_samples": 8}
 OPTIONS = ("--set", "eps_m=0.75", "--set", "min_samples=8", "--json")
 WHY = ("--reason", "a test")

@@ -26,10 +26,10 @@ from projections.fold.settings import Settings
 from projections.map.scenes import Moments
 from tests.support.commands import Commands, ReadyProgram
 from tests.support.envelopes import detection, envelope
-from tests.support.logs import write_log
+from tests.support.logs import sample_drive, write_log
 from tests.support.maps import drawn_map, write_map_yaml
 
-SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+SAMPLE = sample_drive()
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
 SETTINGS = Settings(eps_m=0.75, min_samples=8)
 WAIT_S = 60.0

@@ -19,8 +19,8 @@ from projections.store.history_recorder import map_after
 from projections.surfaces.cli import command_line
 from tests.integration.test_reembed import IN_B, A, run
 from tests.property.test_timeline_cache import kept_early
+from tests.support.logs import SAMPLE
 from tests.support.models import drive, write
-from tests.support.services import SAMPLE
 
 ASKED = [
     ("query", "contents", "sim-7-a_p0", "--log", "LOG"),

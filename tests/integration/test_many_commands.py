@@ -48,9 +48,9 @@ from scripts.programs.bench.commands import (
     undone,
     write_log,
 )
-from tests.support.logs import command, write_rooms
+from tests.support.logs import command, sample_drive, write_rooms
 
-SAMPLE = Path("logs/sample")
+SAMPLE = sample_drive()
 EVERY = {**KINDS, "mixed": mixed}
 
 

@@ -18,10 +18,10 @@ from projections.map.scenes import RecordedFold
 from projections.surfaces.cli.export_command import _recorder
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
-from tests.support.logs import write_log
+from tests.support.logs import sample_drive, write_log
 from tests.support.maps import write_map_yaml
 
-SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+SAMPLE = sample_drive()
 SETTINGS = Settings(eps_m=0.75, min_samples=8)
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
 RERUN = Path(sys.executable).with_name("rerun")

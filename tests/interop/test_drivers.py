@@ -20,8 +20,9 @@ from projections.postgres import rebuild
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from tests.support.event_loops import run_apart
+from tests.support.logs import sample_drive
 
-SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+SAMPLE = sample_drive()
 SETTINGS = Settings(eps_m=0.75, min_samples=8)
 PLACES = (
     "SELECT * FROM cypher('semantic_map', $$ MATCH (p:Place) RETURN p.place_id, p.centroid_x"

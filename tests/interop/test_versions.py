@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.logs import sample_drive
+
 ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = ROOT / "logs" / "sample"
+SAMPLE = sample_drive()
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
 DIGEST = "83caf24df6303ddf85522676f0ae726b671725573c6044e0743eb7af2691aab1"
 EXTRAS = "serve,ui,foxglove,detector,ros,cluster"

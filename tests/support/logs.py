@@ -9,11 +9,17 @@ Random logs of everything that a log may have: for what reads logs in another wa
 Logs that hold verbatim messages (ROS in CDR, JPEG) and envelopes side by side.
 
 Simulated runs, each made once a process: one takes half a second.
+
+The keyframes of logs/sample alone.
 """
 
+import hashlib
 import json
 import math
+import os
 import random
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import count
@@ -45,6 +51,7 @@ from projections.fold.settings import Settings
 from tests.support.envelopes import detection, envelope, payload
 from tests.support.fixtures_log import BY_HAND
 from tests.support.maps import drawn_map
+from tests.support.shared_data import ROOT
 
 KEY = "tb/detections"
 WEIRD = (
@@ -356,3 +363,31 @@ def mixed_events(count: int) -> list[Event]:
 def simulated(seed: int = 7, run: str = "a") -> SimulatedRun:
     """The run, which tests may only read."""
     return simulate_run(seed, run)
+
+
+SAMPLE = ROOT / "logs" / "sample"
+
+
+@cache
+def sample_drive() -> Path:
+    """A log of the 445 keyframes of logs/sample, offsets 0 to 444, without its settings and walls:
+    it folds by the classic rules. Not to be changed: all workers share it, and later runs do, too.
+    """
+    (segment,) = SAMPLE.glob("*.mcap")
+    content = hashlib.sha256(segment.read_bytes()).hexdigest()[:16]
+    folder = Path(tempfile.gettempdir(), f"mapfold-tests-{os.getuid()}-{content}")
+    drive = folder / "sample"
+    if not drive.exists():
+        folder.mkdir(exist_ok=True)
+        made = Path(tempfile.mkdtemp(dir=folder))
+        with LogReader(SAMPLE) as reader, LogWriter(made / "sample") as writer:
+            for event in reader.read():
+                if event.is_envelope:
+                    writer.append(event.key, event.payload, logged_ns=event.logged_ns)
+        try:
+            (made / "sample").rename(drive)
+        except OSError:
+            if not drive.exists():
+                raise  # no other worker was faster
+        shutil.rmtree(made)
+    return drive

@@ -25,7 +25,7 @@ from projections.surfaces.serve.http import create_app
 from projections.surfaces.serve.listening import bind, serving
 from projections.surfaces.serve.service_metrics import CountedResponses, ServiceMetrics
 from tests.support.http_attacks import ask, request, status
-from tests.support.logs import append_command, name_place, write_log
+from tests.support.logs import append_command, name_place, sample_drive, write_log
 
 TOKEN = "0123456789abcdef-not-a-secret"
 FRIEND = "https://map.example"
@@ -83,7 +83,6 @@ def serving_twice(targets: Targets) -> Iterator[Service]:
             yield Service(answerer, port, secured)
 
 
-SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
 SETTINGS = Settings(fusion="evidence")
 KEYFRAMES = 60
 RUN = "sim-7-a"
@@ -92,7 +91,7 @@ MODEL = "mapfold-simulated-512"
 
 def documents(count: int = KEYFRAMES) -> list[dict[str, Any]]:
     """The first keyframes of the sample log, on a floor with a name."""
-    with LogReader(SAMPLE) as reader:
+    with LogReader(sample_drive()) as reader:
         found = [json.loads(event.payload) for event in reader.read(0, count)]
     return [{**document, "floor": "ground"} for document in found]
 

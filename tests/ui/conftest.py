@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.support.commands import Commands
+from tests.support.logs import sample_drive
 from tests.support.shared_data import ROOT
 from tests.support.ui_page import UiServer, showing
 
@@ -29,7 +30,7 @@ else:
     collect_ignore_glob = ["test_*.py"]
 
 WIDE = ("--set", "eps_m=1.0", "--set", "min_samples=8")
-SAMPLE = ROOT / "logs" / "sample"
+SAMPLE = sample_drive()
 Visit = Callable[..., "Page"]
 
 

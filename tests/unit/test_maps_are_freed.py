@@ -7,7 +7,6 @@ tail that restarts, ``whatif``, ``serve``) would hold several of them.
 import gc
 import weakref
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -22,8 +21,9 @@ from projections.postgres.live_fold import LiveFold
 from projections.postgres.vector_sink import VectorSink
 from projections.store.history import History
 from projections.store.tables import Tables
+from tests.support.logs import sample_drive
 
-SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
+SAMPLE = sample_drive()
 
 
 @pytest.fixture

@@ -16,9 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from eventsrc.adapters.sim import SimulatedRun
+from eventsrc.adapters.sim import House, SimulatedRun, occupancy_map
 from eventsrc.base.user_files import write_files
+from eventsrc.envelope.commands import UseSettings, encode_command
 from eventsrc.envelope.model import Offset, RunId
+from eventsrc.envelope.system_events import COMMAND_KEY, MAP_KEY
+from eventsrc.log import LogWriter
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from projections.edit.make import Stamp, name_place, undo_merge
 from projections.edit.record import MakeCommand, record_command
@@ -29,11 +32,24 @@ from projections.postgres.connection import Targets
 from projections.postgres.queries.candidate_search import CandidateReader
 from projections.surfaces.python import Answer, Map, Settings, Timeline, fold
 
-SETTINGS: Final = Settings().with_assignments(PRESETS["rooms"])
-"""With the default settings the whole house becomes one place."""
+SETTINGS: Final = Settings().with_assignments([*PRESETS["full"], "camera.hfov_deg=69.4"])
+"""Rooms, objects by evidence, and the camera of the simulated robot."""
 MOST_CROPS: Final = 3
 NEAR_M: Final = 1.5
 """Error up to which an estimate counts as right; the answer's ``confidence`` has the same bound."""
+
+
+def begin_log(writer: LogWriter, house: House, logged_ns: int | None = None) -> None:
+    """Begin a log with the settings, as ``mapfold edit LOG use-settings`` records them,
+    and the walls, as ``mapfold import --map`` does."""
+    command = UseSettings(
+        command_id="settings",
+        issued_by="demo@mapfold",
+        reason="places are rooms; the robot's camera",
+        settings=SETTINGS.model_dump(mode="json"),
+    )
+    writer.append(COMMAND_KEY, encode_command(command), logged_ns=logged_ns)
+    writer.append(MAP_KEY, occupancy_map(house).encode(), logged_ns=logged_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +99,8 @@ class Explored:
 def explore(log: Path, run: SimulatedRun) -> Explored:
     """Fold the log, and note the rooms of every merge."""
     started = time.monotonic()
-    house = fold(log, settings=SETTINGS)
-    with Timeline(log, SETTINGS, cache=False) as timeline:
+    house = fold(log)
+    with Timeline(log, cache=False) as timeline:
         merges = [_room_merge(each, timeline, run) for each in timeline.merges()]
     return Explored(house, tuple(merges), time.monotonic() - started)
 
@@ -161,7 +177,7 @@ def correct(log: Path, targets: Targets, run: SimulatedRun, explored: Explored) 
             settings_of=lambda _: SETTINGS,
             open_session=lambda: open_session(ZenohOptions(), mode="client"),
         )
-    house = fold(log, settings=SETTINGS)
+    house = fold(log)
     rooms, merge = place_rooms(house, run), most_telling(explored.merges)
     parted = () if merge is None else (merge.survivor.place_id, merge.absorbed[0].place_id)
     parts = [

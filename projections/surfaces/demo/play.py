@@ -18,11 +18,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from eventsrc.adapters.sim import occupancy_map, simulate_run
+from eventsrc.adapters.sim import simulate_run
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import command_line
-from eventsrc.base.user_files import write_files
-from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogWriter
 from projections import history
 from projections.adapters.drawing import LostRobot, MergeMark, Spot, draw_map, plan_of
@@ -39,6 +37,7 @@ from .acts import (
     LostRun,
     RoomMerge,
     ask_lost,
+    begin_log,
     correct,
     explore,
     most_telling,
@@ -47,7 +46,7 @@ from .acts import (
 from .recorded_run import record_run
 
 MARKER: Final = ".mapfold-demo"
-_GENERATED: Final = ("map.png", "settings.json", "question-*.json", "record.txt", "simulate.txt")
+_GENERATED: Final = ("map.png", "question-*.json", "record.txt", "simulate.txt")
 
 
 @contextlib.contextmanager
@@ -104,12 +103,11 @@ def run_demo(
     house, clock = explorer.house, _Stages(print_line)
     detections = sum(len(envelope["detections"]) for envelope in explorer.envelopes)
     with fresh_folder(out) as folder, contextlib.ExitStack() as stack:
-        log, settings = folder / "log", folder / "settings.json"
-        write_files({settings: (SETTINGS.model_dump_json(indent=2) + "\n").encode()})
+        log = folder / "log"
         with clock.stage("Run A explores the house and is recorded"):
             targets = stack.enter_context(_databases(folder, db, vector_db))
             with LogWriter(log) as writer:
-                writer.append(MAP_KEY, occupancy_map(house).encode())
+                begin_log(writer, house)
             recorded, followed = record_run(explorer, speed, folder, targets, SETTINGS)
             rooms = len(house.plan.rooms)
             clock.show(story.recording_lines(recorded, followed, detections, rooms, speed))
@@ -215,17 +213,17 @@ def _next_commands(
         yield f"   export MAPFOLD_HOME={_quoted(folder)}    # where the databases are"
     if db is not None or vector_db is not None:  # a URL may hold a password: not printed
         yield "   # and MAPFOLD_DB, MAPFOLD_VECTOR_DB set to what --db and --vector-db were given"
-    log, settings = folder / "log", ("--settings", folder / "settings.json")
-    yield f"   {command_line('state', log, *settings)}"
+    log = folder / "log"
+    yield f"   {command_line('state', log)}"
     if merge is not None:
         before_and_behind = merge.offset, merge.offset + 1
-        yield f"   {command_line('diff', log, *before_and_behind, *settings)}    # that merge"
-        yield f"   {command_line('merges', log, *settings, '--refused')}    # undone since"
-    yield f"   {command_line('edits', log, *settings)}"
+        yield f"   {command_line('diff', log, *before_and_behind)}    # that merge"
+        yield f"   {command_line('merges', log, '--refused')}    # undone since"
+    yield f"   {command_line('edits', log)}"
     yield f"   {command_line('relocalize', folder / 'question-1.json')}"
-    yield f"   {command_line('status', log, *settings)}"
+    yield f"   {command_line('status', log)}"
     shown = ("--at", merge.offset + 1, "--select", f"merge:{merge.offset}") if merge else ()
-    yield f"   {command_line('ui', log, *settings, *shown)}    # in a browser"
+    yield f"   {command_line('ui', log, *shown)}    # in a browser"
 
 
 def _relative(path: Path) -> Path:

@@ -47,7 +47,7 @@ def recording_lines(
         f"   {kept}; {recorded.rejected} rejected, {recorded.lost} lost, "
         f"{recorded.log_bytes / 1e6:.1f} MB"
     )
-    yield "   the walls of the house, an occupancy map, were put into the log before"
+    yield "   the log began with its settings, the preset full, and the walls of the house"
     yield (
         f"   a tail wrote them to Apache AGE and pgvector as they came, in "
         f"{counted(followed.batches, 'transaction')}:"
@@ -77,7 +77,7 @@ def _digest_text(replayed: RebuildReport, house: Map, shown: int) -> str:
 
 
 def map_lines(house: Map, other_settings: Settings, other_places: int) -> Iterator[str]:
-    """The map's numbers, with which settings, and with the default settings."""
+    """The map's numbers, with which settings, and with the classic ones."""
     counts = house.state["counts"]
     yield (
         f"   {counted(counts['places'], 'place')} from {counted(counts['keyframes'], 'keyframe')} "
@@ -91,8 +91,8 @@ def map_lines(house: Map, other_settings: Settings, other_places: int) -> Iterat
         f"{house.view.settings.places_text()}"
     )
     yield (
-        f"   (the default, {other_settings.eps_m:g} m and {other_settings.min_samples}, chains "
-        f"this drive into {counted(other_places, 'place')})"
+        f"   (classic, by distance alone, {other_settings.eps_m:g} m and "
+        f"{other_settings.min_samples}, chains this drive into {counted(other_places, 'place')})"
     )
 
 
@@ -280,7 +280,6 @@ def result_document(result: DemoResult, seconds: dict[str, float], folder: Path)
         "files": {
             "folder": str(folder),
             "log": str(folder / "log"),
-            "settings": str(folder / "settings.json"),
             "map": str(folder / "map.png"),
         },
     }

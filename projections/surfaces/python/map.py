@@ -45,9 +45,9 @@ class Map:
     ``view`` is the map as data (`projections.map.view.MapView`), not to be changed.
 
     Examples:
-        >>> house = fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+        >>> house = fold("logs/sample")
         >>> house.places[3]["type"], house.digest[:8]
-        ('living room', '83caf24d')
+        ('living room', '97223fec')
     """
 
     def __init__(self, view: MapView, known_at: Offset | None = None) -> None:
@@ -213,10 +213,10 @@ def relocalize(
     without embeddings.
 
     Examples:
-        >>> house = fold("logs/sample", settings={"eps_m": 0.75, "min_samples": 8})
+        >>> house = fold("logs/sample")
         >>> answer = relocalize(house, [{"class": "toilet"}, {"class": "mirror"}])
         >>> [place.place_id for place in answer.places]
-        ['sim-7-a_p0', 'sim-7-a_p12', 'sim-7-a_p11']
+        ['sim-7-a_p0', 'sim-7-a_p7', 'sim-7-a_p5']
     """
     if not house.view.keep_embeddings:
         raise MisuseError("this map was folded with embeddings=False; fold it with them to ask it")
@@ -249,7 +249,7 @@ def open_log(path: str | Path) -> LogReader:
     Examples:
         >>> with open_log("logs/sample") as log:
         ...     log.next_offset, next(log.read()).key
-        (445, 'tb/detections')
+        (447, 'mapfold/command')
     """
     return LogReader(Path(path))
 
@@ -277,7 +277,7 @@ def fold(
 
     Examples:
         >>> fold("logs/sample", at=240)
-        <Map after 240 events: 1 place, 54 objects, digest 9ef53eb412a130df>
+        <Map after 240 events: 6 places, 47 objects, digest b779fc66310ee528>
     """
     with nullcontext(log) if isinstance(log, LogReader) else open_log(log) as reader:
         end = resolve(reader, str(at))

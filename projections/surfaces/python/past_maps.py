@@ -42,11 +42,10 @@ class Timeline:
     interrupted, by Ctrl-C or the stop button of a notebook, can be asked again.
 
     Examples:
-        >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
-        ...     for merge in timeline.merges()[:2]:
+        >>> with Timeline("logs/sample") as timeline:
+        ...     for merge in timeline.merges():
         ...         print(merge["offset"], merge["survivor"], *merge["absorbed"])
-        240 sim-7-a_p6 sim-7-a_p7
-        294 sim-7-a_p8 sim-7-a_p9
+        304 sim-7-a_p0 sim-7-a_p4
     """
 
     def __init__(
@@ -124,9 +123,9 @@ class Timeline:
         Raises ExpressionError for a condition that cannot be read.
 
         Examples:
-            >>> with Timeline("logs/sample", {"eps_m": 0.75, "min_samples": 8}) as timeline:
+            >>> with Timeline("logs/sample") as timeline:
             ...     timeline.bisect("object_count >= 40")["found"]["offset"]
-            131
+            163
         """
         found = self._timeline.bisect(condition, self._offset(start), self._offset(end))
         return found.document()

@@ -238,9 +238,11 @@ def undone(kind: Kind, count: int) -> Iterator[Command]:
 
 
 def write_log(log: Path, given: Iterator[Command]) -> Path:
-    """The sample log with commands behind its events."""
-    shutil.copytree(SAMPLE, log)
-    with LogWriter(log, fsync=NEVER) as writer:
+    """The keyframes of the sample log, and commands behind them."""
+    with LogReader(SAMPLE) as reader, LogWriter(log, fsync=NEVER) as writer:
+        for event in reader.read():
+            if event.is_envelope:
+                writer.append(event.key, event.payload, logged_ns=event.logged_ns)
         for command in given:
             writer.append(COMMAND_KEY, encode_command(command))
     return log
