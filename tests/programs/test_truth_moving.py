@@ -6,6 +6,7 @@ from projections.fold.deltas import ObjectMissing, ObjectOrdinal, ObjectRelocate
 from scripts.programs.bench.truth.moving import MovedScores, score_moved
 from scripts.programs.bench.truth.scoring import ObjectScores
 from scripts.programs.bench.truth.tables import Row, moved_table
+from scripts.programs.bench.truth.telling import ToldScores, score_told, told_table
 from scripts.programs.bench.truth.worlds import TrueThing
 from tests.programs.truth_cases import hand_made
 
@@ -85,3 +86,16 @@ def test_the_table_adds_the_lines_up_with_the_smallest_share_last():
     assert [line.split()[1] for line in lines[1:3]] == ["two", "one"]
     assert " ".join(lines[1].split()[2:]) == "4 1 10 0.50 1 50 0.020 5 0.80 4/8"
     assert " ".join(lines[3].split()) == "all 5 2 20 0.35 2 100 0.020 10 0.50 8/16"
+
+
+def test_a_difference_is_scored_by_what_its_objects_were_before():
+    before, truth = hand_made([sight for sight in SIGHTS if sight[0] == "a"])
+    after, _ = hand_made(SIGHTS, [missing(1), missing(5)])
+    scores = score_told(before, after, truth, THINGS)
+    # Without estimates nothing is sure; m1 to m4 were moved and are in the first map.
+    assert scores == ToldScores(
+        sure=0, sure_true=0, told=2, told_true=1, shifted=0, shifted_true=0, knowable=4
+    )
+    other = ToldScores(4, 3, 4, 3, 9, 1, 5)
+    *_, last = told_table([("tripod w", scores), ("rover w", other)]).split("\n")
+    assert last.split() == ["all", "3", "4", "0.75", "4", "6", "0.67", "9", "1", "9", "0.11"]
