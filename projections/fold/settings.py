@@ -6,7 +6,6 @@ The fingerprint is part of a checkpoint's identity: no projection mixes settings
 import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import (
@@ -27,6 +26,7 @@ from eventsrc.envelope.model import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_
 
 from .evidence import EvidenceConstants
 from .map_errors import SettingsError
+from .presets import preset_assignments
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
@@ -277,28 +277,6 @@ def read_settings(file: Path) -> Settings:
     except FileFault as fault:
         raise SettingsError(f"not JSON: {fault}") from None
     return Settings.from_document(document)
-
-
-PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "classic": (
-            *("places=page", "eps_m=1.5", "min_samples=3"),
-            *("fusion=page", "fusion_radius_m=3.0", "fusion_similarity=0.7"),
-        ),
-        "rooms": ("places=rooms", "fusion=page"),
-        "full": ("places=rooms", "fusion=evidence"),
-    }
-)
-"""Settings by name, as assignments: each names the rules of places and of fusion."""
-_OLD_NAMES: Final = {"page": "classic"}
-
-
-def preset_assignments(name: str) -> tuple[str, ...]:
-    """The assignments of a preset, also by its old name. Raises SettingsError."""
-    found = PRESETS.get(_OLD_NAMES.get(name, name))
-    if found is None:
-        raise SettingsError(f"no preset {_shown(name)}; there are {', '.join(PRESETS)}")
-    return found
 
 
 def _rule(error: ErrorDetails) -> str:

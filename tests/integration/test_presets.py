@@ -6,7 +6,8 @@ import pytest
 from mapfold import Timeline, fold
 
 from projections.fold.map_errors import SettingsError
-from projections.fold.settings import PRESETS, Settings
+from projections.fold.presets import PRESETS
+from projections.fold.settings import Settings
 from tests.docs.commands_page import commands
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope

@@ -21,7 +21,8 @@ from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.importers.run import StatedSettings
 from projections.fold.corrections import check_settings
 from projections.fold.map_errors import FoldError
-from projections.fold.settings import PRESETS, Settings
+from projections.fold.presets import PRESETS
+from projections.fold.settings import Settings
 from projections.map.own_events import read_corrections
 
 from .folded_log import NamedSettings, complete_preset

@@ -25,7 +25,7 @@ from eventsrc.log import LogWriter
 from eventsrc.record.transport.session import ZenohOptions, open_session
 from projections.edit.make import Stamp, name_place, undo_merge
 from projections.edit.record import MakeCommand, record_command
-from projections.fold.settings import PRESETS
+from projections.fold.presets import PRESETS
 from projections.localize.relocalize import rank, read_question
 from projections.postgres import RebuildReport, rebuild
 from projections.postgres.connection import Targets

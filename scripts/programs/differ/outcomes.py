@@ -11,7 +11,8 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError
-from projections.fold.settings import PRESETS, Settings
+from projections.fold.presets import PRESETS
+from projections.fold.settings import Settings
 from projections.history.known_history import KnownHistory
 from projections.history.merge_reasons import (
     merge_document,
