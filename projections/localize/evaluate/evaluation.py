@@ -96,7 +96,7 @@ def evaluate(
     if query_logs:
         check_truth(keyframes, truth)
     # Damage before `end` has been raised by the fold.
-    mapped = list(read_keyframes([map_log], on_gap=lambda _: None))
+    mapped = list(read_keyframes([map_log], on_gap=lambda _: None, corrections=corrections))
     rooms = RoomIndex(mapped, keyframes, truth)
     runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
     if workers is None:

@@ -20,6 +20,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.log import LogReader
 from eventsrc.log.reader import OnGap
+from projections.fold.corrections import Corrections
 from projections.fold.edited_events import Reembedded, relabelled
 from projections.fold.exact import quantise, to_float32
 from projections.fold.settings import Settings
@@ -59,18 +60,22 @@ class ScoredQuestion:
 
 
 def read_keyframes(
-    logs: Iterable[Path], settings: Settings | None = None, on_gap: OnGap | None = None
+    logs: Iterable[Path],
+    settings: Settings | None = None,
+    on_gap: OnGap | None = None,
+    corrections: Corrections | None = None,
 ) -> Iterator[Accepted]:
     """Every valid keyframe of the logs with a pose, each (run, keyframe) once, with its log's names
     of classes; where the settings name a space, with the vectors of that space alone, also those
-    given later. Raises LogDamaged, or calls ``on_gap``, for damage."""
+    given later. ``corrections`` are those of the logs, by default of all commands of each. Raises
+    LogDamaged, or calls ``on_gap``, for damage."""
     model = None if settings is None else settings.embedding_model
     seen: set[Key] = set()
     for log in logs:
         with LogReader(log) as reader:
-            later, corrections = None, read_corrections(reader)
+            later, obeyed = None, corrections or read_corrections(reader)
             if settings is not None and model is not None:
-                later = vectors_of(reader, settings, corrections)
+                later = vectors_of(reader, settings, obeyed)
             for event in reader.read(on_gap=on_gap):
                 if not event.is_envelope:
                     continue
@@ -80,7 +85,7 @@ def read_keyframes(
                 key = (found.envelope.run_id, found.envelope.keyframe_id)
                 if key not in seen:
                     seen.add(key)
-                    found = relabelled(found, corrections.labels)
+                    found = relabelled(found, obeyed.labels)
                     yield found if model is None else _in_space(found, model, later)
 
 
