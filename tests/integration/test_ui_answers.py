@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.support.commands import Commands
-from tests.support.logs import write_log
+from tests.support.logs import sample_drive, write_log
 from tests.support.shared_data import ROOT, shared_run
 from tests.support.thorough import rounds
 from tests.support.ui_page import UiServer, read_arrays, replay, showing
@@ -27,9 +27,7 @@ NINES = "9" * 5_000
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy: histories and effects are kept beside a log."""
-    return Path(
-        shutil.copytree(ROOT / "logs" / "sample", tmp_path_factory.mktemp("sample") / "log")
-    )
+    return Path(shutil.copytree(sample_drive(), tmp_path_factory.mktemp("sample") / "log"))
 
 
 @pytest.fixture(scope="module")
