@@ -109,7 +109,7 @@ def refuse_other_origin(
         raise ProjectionMismatch(
             f"{made} with other settings"
             f" ({', '.join(_settings_differences(found.settings, inputs.settings))});"
-            f"{f' to go on with them add {options};' if options else ''} {advice}"
+            f"{f' to go on with them give {options} instead;' if options else ''} {advice}"
         )
 
 

@@ -159,9 +159,9 @@ def test_a_refusal_names_the_settings_that_fit(mapfold: Commands, log: Path) -> 
     mapfold("replay", log, "--set", "eps_m=0.75")
     said = mapfold("tail", log, "--once", "--set", "min_samples=4", code=1).err
     assert "the graph there was made with other settings" in said
-    fitting = said.partition("to go on with them add ")[2].partition(";")[0]
+    fitting = said.partition("to go on with them give ")[2].partition(" instead;")[0]
     assert fitting == "--set eps_m=0.75 --set min_samples=3"
-    mapfold("tail", log, "--once", "--set", "min_samples=4", *fitting.split())
+    mapfold("tail", log, "--once", *fitting.split())
     assert advised(said) == ["replay", str(log), "--set", "min_samples=4"]
 
 
@@ -172,15 +172,15 @@ def test_a_refusal_names_settings_of_groups_that_fit(mapfold: Commands, log: Pat
     mapfold("replay", log)
     said = mapfold("tail", log, "--once", *own, code=1).err
     assert (
-        "(camera.hfov_deg=69.4 there, 90.0 here, "
+        "(camera.hfov_deg=None there, 90.0 here, "
         "evidence.sizes_m.potted plant=None there, 0.4 here)" in said
     )
-    fitting = said.partition("to go on with them add ")[2].partition(";")[0]
-    mapfold("tail", log, "--once", *own, *shlex.split(fitting))
+    fitting = said.partition("to go on with them give ")[2].partition(" instead;")[0]
+    mapfold("tail", log, "--once", *shlex.split(fitting))
     assert advised(said) == ["replay", str(log), *own]
     mapfold(*advised(said))
     said = mapfold("tail", log, "--once", code=1).err
-    fitting = said.partition("to go on with them add ")[2].partition("; to")[0]
+    fitting = said.partition("to go on with them give ")[2].partition(" instead;")[0]
     assert shlex.split(fitting) == list(own)
     mapfold("tail", log, "--once", *own)
 

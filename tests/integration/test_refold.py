@@ -281,7 +281,8 @@ def test_settings_of_fusion_by_evidence_keep_the_vectors(
     # Without the log's settings it is refused, and the options that it names make it go on.
     with pytest.raises(ProjectionMismatch, match="fusion=evidence there, page here") as refused:
         tail(log, targets, Settings(), once=True)
-    (options,) = re.findall(r"to go on with them add (.*?); to rebuild", str(refused.value))
+    said = str(refused.value)
+    (options,) = re.findall(r"to go on with them give (.*?) instead; to rebuild", said)
     words = shlex.split(options)
     assert set(words[::2]) == {"--set"}
     assert Settings().with_assignments(words[1::2]) == evidence
