@@ -13,6 +13,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import advised, visible
+from eventsrc.log.seek import time_of
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
 from projections.map.naming import MOST_NEAR, Rule, Thing, matches, thing_called, things_of
@@ -145,6 +147,14 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
     return FoundObjects(match, classes, len(kept), len(found) - len(kept), tuple(answers))
 
 
+def robot_seconds(text: str) -> float:
+    """An ISO time in seconds since the epoch. Raises MisuseError."""
+    time_ns = time_of(text)
+    if time_ns is None:
+        raise MisuseError(f"{text!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
+    return time_ns / 1e9
+
+
 def _distance(one: tuple[float, float], other: tuple[float, float]) -> float:
     """Metres."""
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2)
@@ -174,9 +184,8 @@ def _nothing(what: str, standing: list[ObjectRecord], things: list[Thing]) -> Mi
     places = matches(what, (thing for thing in things if thing.kind == "place"))[1]
     if places:
         listed = ", ".join(str(place) for place in places[:MOST_NEAR])
-        return MisuseError(
-            f"{what!r} is a place: {listed}; what is in it is found by --in, without a class"
-        )
+        lists = visible(advised("find", "--in", what))
+        return MisuseError(f"{what!r} is a place: {listed}; `{lists}` lists what is in it")
     classes = sorted({each.class_name for each in standing})
     if not classes:
         return MisuseError(f"no {what!r}: this map has no Objects")

@@ -165,8 +165,9 @@ class Standing:
             driven.numbers.setdefault(block, number)
             place = self._survivors.find(self._joined[number])
             if place not in driven.places:
+                is_known = place in set(map(self._survivors.find, driven.places))
                 driven.places[place] = None
-                if number >= self._kept:
+                if number >= self._kept and not is_known:
                     self._due.update(self._inside.get(region, {}))
         self._taken = len(self._xs)
 

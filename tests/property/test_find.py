@@ -145,7 +145,7 @@ def test_what_has_moved_is_told_with_where_it_was(log: Path) -> None:
         (["cup", "--near", "nan,1"], "no place or object 'nan,1'"),
         (["cup", "--near", "1e999,1"], "no place or object '1e999,1'"),
         (["cup", "--near", "cup"], "'cup' means"),
-        (["cup", "--seen-since", "yesterday"], "--seen-since yesterday: no time"),
+        (["cup", "--seen-since", "yesterday"], "'yesterday' is no time"),
         (["cup", "--moved", "--preset", "classic"], "only a map with fusion by evidence knows"),
         (["\x1b[31m"], "no class like '\\x1b[31m' in this map"),
         (["cup" * 10_000], "no class like"),
@@ -162,7 +162,9 @@ def test_what_cannot_be_answered_is_an_error_that_says_why(
 def test_a_place_is_no_object_and_the_error_says_how_to_ask(log: Path) -> None:
     house = api.fold(log)
     place_id = house.places[0]["place_id"]
-    with pytest.raises(MisuseError, match=r"is a place: .*; what is in it is found by --in"):
+    with pytest.raises(
+        MisuseError, match=r"is a place: .*; `mapfold find --in .*` lists what is in it"
+    ):
         house.find(place_id)
     with pytest.raises(MisuseError, match="'now' is no time"):
         house.find(seen_since="now")

@@ -105,3 +105,26 @@ def test_objects_of_an_absorbed_place_are_in_its_survivor(
     survivors.merge(LEFT, (RIGHT,))
     assert list(standing.place_absorbed(LEFT, RIGHT)) == [CUP]
     assert standing.place_of(CUP) == LEFT
+
+
+@pytest.mark.parametrize("is_resumed", [False, True])
+def test_a_fold_that_is_resumed_decides_the_same_objects_as_one_that_goes_on(
+    survivors: PlaceSurvivors, *, is_resumed: bool
+) -> None:
+    """A place absorbs one of a region in which it had no pose of its own, and then gets one."""
+    ground = FreeFloor(OccupancyGrid(drawn_map(TWO_ROOMS, 0.2)))
+    reducer = Standing(lambda at: (0, ground, at), survivors)
+    other = PlaceOrdinal(2)
+    reducer.pose_placed(*IN_RIGHT, LEFT)
+    reducer.pose_placed(1_000_000, 3_000_000, RIGHT)
+    reducer.pose_placed(3_400_000, 3_000_000, other)
+    see(reducer, 2.0, 3.0, (1_000_000, 3_000_000))
+    reducer.pose_placed(2_000_000, 3_000_000, other)
+    reducer.decide()
+    survivors.merge(LEFT, [RIGHT])
+    reducer.place_absorbed(LEFT, RIGHT)
+    if is_resumed:
+        state, reducer = reducer.dump(), Standing(lambda at: (0, ground, at), survivors)
+        reducer.load(state)
+    reducer.pose_placed(1_000_000, 2_600_000, LEFT)
+    assert CUP not in reducer.decide()

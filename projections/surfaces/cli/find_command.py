@@ -4,10 +4,8 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import table, visible
-from eventsrc.log.seek import time_of
-from projections.ask.find import FoundObject, FoundObjects, Wanted, find
+from projections.ask.find import FoundObject, FoundObjects, Wanted, find, robot_seconds
 from projections.map.naming import ShortIds, things_of
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
@@ -65,8 +63,8 @@ def find_things(
         near=near,
         missing=missing,
         moved=moved,
-        seen_since=_seconds("--seen-since", seen_since),
-        not_seen_since=_seconds("--not-seen-since", not_seen_since),
+        seen_since=None if seen_since is None else robot_seconds(seen_since),
+        not_seen_since=None if not_seen_since is None else robot_seconds(not_seen_since),
         top=top,
         every=every,
     )
@@ -81,18 +79,6 @@ def find_things(
     display(_table(view, found) if found.answers else "nothing found\n")
     for line in _remarks(wanted, found):
         say(line)
-
-
-def _seconds(option: str, text: str | None) -> float | None:
-    """An ISO time in seconds since the epoch."""
-    if text is None:
-        return None
-    time_ns = time_of(text)
-    if time_ns is None:
-        raise MisuseError(
-            f"{option} {text}: no time; write it with its date, such as 2026-03-24T13:00:00Z"
-        )
-    return time_ns / 1e9
 
 
 def _table(view: MapView, found: FoundObjects) -> str:

@@ -196,9 +196,14 @@ def _check_same(log: Path, known: Settings, options: NewLogOptions) -> None:
         return
     here = known.by_name()
     differing = ", ".join(
-        f"{name}={here.get(name)}, not {value}" for name, value in asked.changed_from(known).items()
+        f"{name}={_shown(here.get(name))}, not {_shown(value)}"
+        for name, value in asked.changed_from(known).items()
     )
     raise MisuseError(
         f"{log} has {differing}; a log's settings are said when it is made. To change them:"
         f" `{command_line('edit', log, *_change(options.words()))}`"
     )
+
+
+def _shown(value: object) -> str:
+    return "unset" if value is None else str(value)

@@ -13,8 +13,8 @@ from eventsrc.base.text import counted, visible
 from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from eventsrc.log.seek import resolve, time_of
-from projections.ask.find import FoundObjects, Wanted, find
+from eventsrc.log.seek import resolve
+from projections.ask.find import FoundObjects, Wanted, find, robot_seconds
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
@@ -132,8 +132,8 @@ class Map:
                 near=near if near is None or isinstance(near, str) else f"{near[0]},{near[1]}",
                 missing=missing,
                 moved=moved,
-                seen_since=_robot_seconds(seen_since),
-                not_seen_since=_robot_seconds(not_seen_since),
+                seen_since=_seconds(seen_since),
+                not_seen_since=_seconds(not_seen_since),
                 top=top,
                 every=every,
             ),
@@ -179,13 +179,8 @@ class Map:
         )
 
 
-def _robot_seconds(time: float | str | None) -> float | None:
-    if not isinstance(time, str):
-        return time
-    time_ns = time_of(time)
-    if time_ns is None:
-        raise MisuseError(f"{time!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
-    return time_ns / 1e9
+def _seconds(time: float | str | None) -> float | None:
+    return robot_seconds(time) if isinstance(time, str) else time
 
 
 def _cell(value: object) -> str:
