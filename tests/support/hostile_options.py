@@ -39,6 +39,7 @@ _OPTIONS = {
     "evaluate": ["--self"],
     "simulate": ["--out=drive.jsonl"],
     "draw": ["--out=a.png"],
+    "tail": ["--once"],
     "detect": ["--images=fleet", "--detector=file", "--out=d.jsonl"],
 }
 
