@@ -288,6 +288,7 @@ def _keyframes(
             k.observations,
             place if placed < end else None,
             k.floor,
+            k.camera,
         )
         for k, placed, place in zip(
             latest.keyframes[:count], history.placed_offsets, history.placed_in, strict=False
