@@ -34,6 +34,7 @@ from projections.fold.deltas import (
     RunSeen,
 )
 
+from .place_regions import Region, place_regions
 from .view import MapView
 
 Embedded: TypeAlias = tuple[ObservationAdded, int]
@@ -54,6 +55,7 @@ class BatchChanges:
     whose shared transitions changed; one that is not in `MapView.adjacency` any more is gone.
     ``embedded`` is in the order of the observations. ``formed`` are the places that are new,
     ``floors`` the numbers of new floors. ``maps`` is whether `MapView.maps_in_force` changed.
+    ``regions`` gives the regions that changed; None stands for all of the view.
     """
 
     keyframes: range
@@ -69,6 +71,33 @@ class BatchChanges:
     formed: list[PlaceOrdinal]
     floors: range
     maps: bool = False
+    regions: "FollowedRegions | None" = None
+
+
+class FollowedRegions:
+    """The regions of places, followed through batches. They are computed only when `changed` is
+    called, and only if a place or a map has changed since it was called last."""
+
+    def __init__(self) -> None:
+        self.regions: dict[PlaceOrdinal, Region] = {}
+        """As of the last call of `changed`."""
+        self._are_due = True
+        self._changed: set[PlaceOrdinal] = set()
+
+    def end_batch(self, *, may_differ: bool) -> None:
+        """Begin a new batch after one by whose changes regions may differ."""
+        self._are_due |= may_differ
+        self._changed = set()
+
+    def changed(self, view: MapView) -> set[PlaceOrdinal]:
+        """The places whose region is another than after the last batch for which this was called;
+        at first all that have one."""
+        if self._are_due:
+            before, self.regions, self._are_due = self.regions, place_regions(view), False
+            for place in before.keys() | self.regions.keys():
+                if before.get(place) != self.regions.get(place) and place in view.places:
+                    self._changed.add(place)
+        return self._changed
 
 
 class ChangeTracker:
@@ -76,6 +105,7 @@ class ChangeTracker:
 
     def __init__(self, view: MapView) -> None:
         self.view = view
+        self._regions = FollowedRegions()
         self._start()
 
     def apply_event(self, offset: Offset, deltas: Sequence[Delta], logged_ns: int) -> None:
@@ -104,6 +134,8 @@ class ChangeTracker:
     def drain(self) -> BatchChanges:
         """All changes since the last drain."""
         self._places.update(filter(self.view.places.__contains__, self.view.contents.touched))
+        maps = self._maps != self.view.maps_in_force()
+        self._regions.end_batch(may_differ=maps or bool(self._places))
         changes = BatchChanges(
             range(self._keyframes, len(self.view.keyframes)),
             range(self._observations, len(self.view.observations)),
@@ -117,7 +149,8 @@ class ChangeTracker:
             sorted(self._reassigned),
             sorted(self._formed),
             range(self._floors, len(self.view.floors)),
-            self._maps != self.view.maps_in_force(),
+            maps,
+            self._regions,
         )
         self._start()
         return changes

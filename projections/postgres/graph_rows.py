@@ -16,14 +16,16 @@ Place, Floor, Building and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO, PART_OF.
 may become one, by a correction or under fusion by evidence, OBSERVES is a changing one too.
 """
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from json.encoder import encode_basestring
 from typing import Final
 
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.exact import Q40, UM_PER_M
-from projections.map.changes import BatchChanges
+from projections.map.changes import BatchChanges, FollowedRegions
+from projections.map.place_regions import place_regions
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
@@ -80,6 +82,8 @@ def changing_rows(view: MapView) -> dict[Label, list[Row]]:
 
 def changed_rows(changes: BatchChanges, view: MapView) -> GraphRows:
     """The rows to insert, upsert and delete after a batch."""
+    if changes.regions is not None and (moved := changes.regions.changed(view)):
+        changes = replace(changes, places=sorted({*changes.places, *moved}))
     rows = _rows(view, changes)
     gone = [p for p in changes.places if p not in view.places]
     absorbed = [o for o in changes.objects if o not in view.objects]
@@ -146,7 +150,7 @@ def _rows(view: MapView, ids: BatchChanges) -> dict[Label, Iterator[Row]]:
         "Pose": _pose_rows(view, ids.keyframes),
         "Observation": _observation_rows(view, ids.observations),
         "Object": object_rows(view, filter(view.objects.__contains__, ids.objects)),
-        "Place": _place_rows(view, filter(view.places.__contains__, ids.places)),
+        "Place": _place_rows(view, filter(view.places.__contains__, ids.places), ids.regions),
         "HAS_KEYFRAME": _edges("HAS_KEYFRAME", ((k, keyframes[k].run, k) for k in ids.keyframes)),
         "HAS_POSE": _edges(
             "HAS_POSE", ((k, k, k) for k in ids.keyframes if keyframes[k].pose is not None)
@@ -271,10 +275,12 @@ def _evidence(found: ObjectRecord) -> str:
     )
 
 
-def _place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
-    """Places, also those that were absorbed. Only those that have a name, a floor or a type that is
-    sure have these properties."""
-    base = BASE["Place"]
+def _place_rows(
+    view: MapView, places: Iterable[PlaceOrdinal], followed: FollowedRegions | None
+) -> Iterator[VertexRow]:
+    """Places, also those that were absorbed. Only those that have a name, a floor, a type that is
+    sure or a region have these properties."""
+    base, regions = BASE["Place"], place_regions(view) if followed is None else followed.regions
     for i in places:
         p = view.all_places[i]
         name = "" if p.name is None else f', "name": {text(p.name)}'
@@ -283,6 +289,9 @@ def _place_rows(view: MapView, places: Iterable[int]) -> Iterator[VertexRow]:
         if kind is not None and kind.type is not None:
             probability = number(kind.probability)
             name += f', "type": {text(kind.type)}, "type_probability": {probability}'
+        if (region := regions.get(p.ordinal)) is not None:
+            geometry = json.dumps(region.geometry(), separators=(",", ":"))
+            name += f', "region": {text(geometry)}, "area_m2": {number(region.area_m2)}'
         properties = (
             f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
             f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}{name}}}'

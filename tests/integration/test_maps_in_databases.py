@@ -10,6 +10,7 @@ import numpy as np
 import psycopg
 import pytest
 
+from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.envelope.system_events import MAP_KEY
 from eventsrc.log import LogReader, LogWriter
@@ -17,6 +18,7 @@ from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
 from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.map.fold import fold_log
+from projections.map.place_regions import place_regions
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
@@ -53,6 +55,21 @@ def test_tail_rebuild_and_check_agree(tmp_path: Path, one_database: Targets, pla
     rebuild(log, one_database, settings)
     assert all_rows(one_database) == tailed
     assert [r.differing for r in check(log, one_database, settings)] == [0, 0]
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_regions_in_rows_follow_keyframes_of_other_places(tmp_path: Path, size: int) -> None:
+    """A pose takes floor from places that its event does not name."""
+    log, settings = _log(tmp_path / "log", ROOMS.encode()), Settings(places="rooms")
+    live, fresh = followed_and_rebuilt(log, settings, size)
+    assert live.graph["Place"] == fresh.graph["Place"]
+    with LogReader(log) as reader:
+        halves = [fold_log(reader, settings, Offset(end))[1] for end in (9, 17)]
+    (first, *_), (later, other) = (list(place_regions(view).values()) for view in halves)
+    assert first.area_m2 > later.area_m2, "the second place has taken floor from the first"
+    free = int((ROOMS.cells == 0).sum())
+    assert later.area_m2 + other.area_m2 == free
+    assert all('"region": "{' in properties for _, properties in live.graph["Place"].values())
 
 
 def test_what_is_no_map_is_parked(tmp_path: Path, one_database: Targets) -> None:

@@ -29,6 +29,7 @@ from projections.fold.place_types import place_type
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
+from projections.map.place_regions import place_regions
 from projections.map.view import MapView
 from projections.postgres import TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets, connect
@@ -152,6 +153,9 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
         kind = place_type(recounted_contents(view, p.ordinal), p.name)
         if kind is not None and kind.type is not None:
             properties |= {"type": kind.type, "type_probability": kind.probability}
+        if (region := place_regions(view).get(p.ordinal)) is not None:
+            geometry = json.dumps(region.geometry(), separators=(",", ":"))
+            properties |= {"region": geometry, "area_m2": region.area_m2}
         n = p.ordinal + 1
         rows["PART_OF"].append((gid("PART_OF", n), gid("Place", n), whole, {}))
         rows["Place"].append((gid("Place", p.ordinal + 1), properties))
