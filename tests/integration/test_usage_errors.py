@@ -74,7 +74,7 @@ def test_hostile_values_of_any_option_end_without_a_traceback(mapfold: Commands)
     """A sample of what `scripts.programs.attack` tries."""
     lines = [*hostile_lines()]
     with prepared(mapfold.folder):
-        for line in lines[:: rounds(31, 997)]:
+        for line in lines[:: rounds(61, 997)]:
             said = mapfold(*line, code=None)
             assert said.code in (0, 1, 2, 3), line
             assert "Traceback" not in said.err, line
