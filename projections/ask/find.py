@@ -28,7 +28,8 @@ Match = Literal["id", "everything"] | ClassMatch
 """How an Object is what was asked for."""
 
 _MAX_SHOWN: Final = 256
-_POINT: Final = re.compile(r"\s*([^,\s]+)\s*,\s*([^,\s]+)\s*")
+_NUMBER: Final = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_POINT: Final = re.compile(rf"\s*({_NUMBER})\s*,\s*({_NUMBER})\s*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +71,7 @@ class FoundObject:
 
     ``x`` and ``y`` are metres; ``sigma_m`` is their standard error in the direction in which it is
     largest, None where they are the mean position of the robot that saw it. ``distance_m`` is from
-    what it should be near. ``missing_in`` is the run in which it was looked for in vain,
+    what it should be near. ``missing_in`` is the run that should have seen it and did not,
     ``moved_from`` where it stood before, in metres. ``offsets`` are the events that saw it.
     """
 
@@ -199,13 +200,9 @@ def _spot(near: str, things: list[Thing]) -> tuple[float, float]:
     """The point that things should be near, in metres."""
     point = _POINT.fullmatch(near)
     if point is not None:
-        try:
-            x, y = float(point[1]), float(point[2])
-        except ValueError:
-            pass
-        else:
-            if math.isfinite(x) and math.isfinite(y):
-                return x, y
+        x, y = float(point[1]), float(point[2])
+        if math.isfinite(x) and math.isfinite(y):
+            return x, y
     thing = thing_called(near, things, ["place", "object"])
     if thing.spot is None:
         raise MisuseError(f"{near!r} has no position in this map; give X,Y in metres")

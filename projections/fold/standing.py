@@ -11,7 +11,8 @@ place an Object is located in; for all others most of its observations do (`rela
     halved, since it was decided; when a place comes to floor of the region that it stands in; and
     under another map.
 
-An Object that stands on nobody's floor stays in its place; at first its observations decide.
+An Object that stands on the floor of no place keeps its place; before it has one, most of its
+observations decide.
 """
 
 from collections.abc import Callable

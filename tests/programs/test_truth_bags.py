@@ -12,7 +12,7 @@ from tests.programs.truth_cases import hand_made, trial_generator
 
 
 def test_an_object_counts_in_the_room_of_most_keyframes_of_its_place() -> None:
-    """Two places, each in a room of its own; the truth knows a third room, where nobody was."""
+    """Two places, each in a room of its own; the truth has a third one, which no keyframe is in."""
     sights = [("run-a", float(k), 0.0, f"w/cup-{k // 3}", k // 3) for k in range(9)]
     placed = [
         each

@@ -143,6 +143,7 @@ def test_what_has_moved_is_told_with_where_it_was(log: Path) -> None:
         (["xyzzy"], "no class like 'xyzzy' in this map; there are chair, cup, lamp"),
         (["cup", "--in", "ballroom"], "no place 'ballroom'"),
         (["cup", "--near", "nan,1"], "no place or object 'nan,1'"),
+        (["cup", "--near", "1_0,1"], "no place or object '1_0,1'"),
         (["cup", "--near", "1e999,1"], "no place or object '1e999,1'"),
         (["cup", "--near", "cup"], "'cup' means"),
         (["cup", "--seen-since", "yesterday"], "'yesterday' is no time"),

@@ -108,7 +108,7 @@ MOVED = row(at=(4.0, 0.0), relocations=1)
         (row(), MOVED, row("b", at=(0.2, 0.0)), False),  # an alike one stands where it stood
         (row(), MOVED, row("b", at=(1.0, 0.0)), True),
         (row(), MOVED, row("b", at=(0.2, 0.0), class_name="cup"), True),
-        (row(sigma=0.6), MOVED, row("b", at=(4.0, 4.0)), False),  # nobody knew where it stood
+        (row(sigma=0.6), MOVED, row("b", at=(4.0, 4.0)), False),  # its position was uncertain
         (row(), row(at=(4.0, 0.0), sigma=0.6, relocations=1), row("b", at=(4.0, 4.0)), False),
         (row(), row(missing=True), row("b", at=(0.2, 0.0)), False),
         (row(), row(missing=True), row("b", at=(1.0, 0.0)), True),

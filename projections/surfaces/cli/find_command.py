@@ -38,7 +38,10 @@ def find_things(
     at: FoldToOption = "end",
     known_at: KnownAtOption = None,
     missing: Annotated[
-        bool, typer.Option("--missing", help="Only what was looked for in vain.")
+        bool,
+        typer.Option(
+            "--missing", help="Only missing objects: the robot looked and did not see them."
+        ),
     ] = False,
     moved: Annotated[bool, typer.Option("--moved", help="Only what has moved.")] = False,
     seen_since: Annotated[

@@ -1,7 +1,7 @@
 """The settings of a log, said once: when it is made they become its first event.
 
-A log is new as long as it has no events. Who asks for other settings than a log has is told the
-command that changes them.
+A log is new as long as it has no events. A command with other settings than a log has is refused;
+the error names the `edit` that changes them.
 """
 
 import uuid
