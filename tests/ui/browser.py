@@ -45,7 +45,13 @@ def opened(page: Page, url: str) -> Page:
     page.goto("about:blank")
     page.goto(url)
     page.wait_for_selector("html[data-painted]", timeout=WAIT_MS)
+    answered(page)
     return page
+
+
+def answered(page: Page) -> None:
+    """Waits until every question of the page has its answer."""
+    page.wait_for_selector("html[data-unanswered='0']", timeout=WAIT_MS)
 
 
 def digest(page: Page) -> str:
@@ -59,6 +65,7 @@ def pixels(page: Page, side: str = "main") -> str:
     """What a map's canvas shows, without what lies over it, when drawing has rested. The types of
     places are drawn when they come with the digest."""
     digest(page)
+    answered(page)
     drawn = "side => document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
     before = ""
     while (now := str(page.evaluate(drawn, side))) != before:

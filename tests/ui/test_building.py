@@ -23,7 +23,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import payload
 from tests.support.logs import KEY, write_log
 from tests.support.ui_page import UiServer, showing
-from tests.ui.browser import digest, pixels
+from tests.ui.browser import answered, digest, pixels
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
 
@@ -56,7 +56,8 @@ def building(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def picture(page: Page) -> ET.Element:
-    """The view as SVG."""
+    """The view as SVG, when the page has all that it asked for."""
+    answered(page)
     page.get_by_role("button", name="Take away").click()
     with page.expect_download() as waiting:
         page.get_by_role("menuitem", name="Picture as SVG").click()

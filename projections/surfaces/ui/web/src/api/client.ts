@@ -71,22 +71,36 @@ async function refused(response: Response): Promise<ApiError> {
   }
 }
 
-export async function getJson<T>(path: string, signal?: AbortSignal): Promise<T> {
-  return (await (await ask(path, { signal: signal ?? null })).json()) as T;
+let unanswered = 0;
+
+/** Counts the questions whose answers the page has not taken in yet, as `data-unanswered` of the
+ * document: at 0 what is shown is whole. */
+async function counted<T>(answer: Promise<T>): Promise<T> {
+  const count = (by: number) => (document.documentElement.dataset.unanswered = String((unanswered += by)));
+  count(1);
+  try {
+    return await answer;
+  } finally {
+    setTimeout(() => count(-1)); // whoever awaits the answer goes first
+  }
 }
 
-export async function getBinary(path: string, signal?: AbortSignal): Promise<ArrayBuffer> {
-  return (await ask(path, { signal: signal ?? null })).arrayBuffer();
+export function getJson<T>(path: string, signal?: AbortSignal): Promise<T> {
+  return counted(ask(path, { signal: signal ?? null }).then((got) => got.json() as Promise<T>));
 }
 
-export async function postJson<T>(path: string, body: unknown, signal?: AbortSignal): Promise<T> {
+export function getBinary(path: string, signal?: AbortSignal): Promise<ArrayBuffer> {
+  return counted(ask(path, { signal: signal ?? null }).then((got) => got.arrayBuffer()));
+}
+
+export function postJson<T>(path: string, body: unknown, signal?: AbortSignal): Promise<T> {
   const init = {
     method: "POST",
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(body),
     signal: signal ?? null,
   };
-  return (await (await ask(path, init)).json()) as T;
+  return counted(ask(path, init).then((got) => got.json() as Promise<T>));
 }
 
 /** Server-sent events, one after the other until the server ends or is silent for long, which it
