@@ -8,7 +8,8 @@ An Object is confirmed when one of its observations has a measured depth or posi
 * more than `APART_S` before or after the first one.
 
 All others were seen *once*: from one spot at one time, in however many pictures. The first
-observation is the one that founded the Object, also of one that has absorbed others.
+observation is the one that founded the Object, also of one that has absorbed others; one that
+absorbs a confirmed Object is confirmed.
 
 On generated buildings where 27 % of the Objects by evidence are phantoms, 99.8 % of the confirmed
 ones are real, and 99.5 % of the phantoms are among those seen once; any time from 5 s to 5 minutes

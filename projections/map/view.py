@@ -264,6 +264,7 @@ class MapView:
                 self.observations[observation].object = delta.survivor
             survivor.observations += absorbed.observations
             survivor.observations.sort()
+            survivor.confirmed |= absorbed.confirmed
             confirm(survivor, absorbed.observations, self.observations, self.keyframes)
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))

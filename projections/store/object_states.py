@@ -207,7 +207,9 @@ def _confirmed_at(tables: Tables) -> Rows:
         gained = np.concatenate([own, *parts.pop(absorbed, [])])
         parts.setdefault(survivor, []).append(gained)
         first = np.full(len(gained), founders[survivor])
-        if found[survivor] > offset and _confirms(tables, first, gained).any():
+        if found[survivor] > offset and (
+            found[absorbed] <= offset or _confirms(tables, first, gained).any()
+        ):
             found[survivor] = offset
     return found
 

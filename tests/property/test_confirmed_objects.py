@@ -1,14 +1,16 @@
 """Which Objects are confirmed, by both rules of fusion, against a recount from the envelopes: in
 the view after every event, in the kept history at every offset, in the states of each Object."""
 
+from itertools import chain
 from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import DetId, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold.corrections import NO_CORRECTIONS
+from projections.fold.corrections import NO_CORRECTIONS, Corrections
+from projections.fold.deltas import Delta, ObjectSeen, ObjectsMerged
 from projections.fold.settings import Settings
 from projections.map.state_output import state_document
 from projections.map.view import MapView
@@ -58,34 +60,51 @@ def _no_map(offset: Offset) -> OccupancyMap:
     raise AssertionError(offset)
 
 
-def recounted(view: MapView, documents: list[dict[str, Any]]) -> dict[str, bool]:
-    """By object_id whether it is confirmed: a slow recount from what was recorded."""
-    posed = {(d["run_id"], d["keyframe_id"]): d for d in documents}
-    found = {}
-    for each in view.objects.values():
-        sightings = []
-        for number in each.observations:
-            record = view.observations[number]
-            keyframe = view.keyframes[record.keyframe]
-            document = posed[keyframe.run_id, keyframe.keyframe_id]
-            own = next(
-                d
-                for index, d in enumerate(document["detections"])
-                if record.det_id
-                == d.get("det_id", f"{keyframe.run_id}_kf{keyframe.keyframe_id}_d{index}")
-            )
-            is_measured = "depth_m" in own or "position" in own
-            sightings.append((record.keyframe, document, is_measured))
-        _, first, _ = min(sightings, key=lambda sighting: sighting[0])
-        found[each.object_id] = any(
+class Recount:
+    """Which Objects are confirmed after some deltas: a slow recount from what was recorded."""
+
+    def __init__(self, view: MapView, documents: list[dict[str, Any]]) -> None:
+        self.view = view
+        self.documents = {(d["run_id"], d["keyframe_id"]): d for d in documents}
+        self.sightings: dict[int, list[int]] = {}
+        self.confirmed: set[int] = set()
+
+    def take(self, delta: Delta) -> None:
+        match delta:
+            case ObjectSeen(object=one, observation=seen):
+                if seen not in chain.from_iterable(self.sightings.values()):
+                    self._add(one, [seen])
+            case ObjectsMerged(survivor=one, absorbed=absorbed):
+                if absorbed in self.confirmed:
+                    self.confirmed.add(one)
+                self._add(one, self.sightings.pop(absorbed))
+
+    def _add(self, one: int, seen: list[int]) -> None:
+        self.sightings.setdefault(one, []).extend(seen)
+        every = [self._sighting(number) for number in self.sightings[one]]
+        _, first, _ = min(every, key=lambda sighting: sighting[0])
+        if any(
             is_measured
             or document["run_id"] != first["run_id"]
             or abs(document["timestamp"] - first["timestamp"]) > 60.0
             or (document["map_x"] - first["map_x"]) ** 2 + (document["map_y"] - first["map_y"]) ** 2
             >= 0.35**2 - 1e-12
-            for _, document, is_measured in sightings
+            for _, document, is_measured in every
+        ):
+            self.confirmed.add(one)
+
+    def _sighting(self, number: int) -> tuple[int, dict[str, Any], bool]:
+        """Keyframe, envelope, and whether distance or position were measured."""
+        record = self.view.observations[number]
+        keyframe = self.view.keyframes[record.keyframe]
+        document = self.documents[keyframe.run_id, keyframe.keyframe_id]
+        own = next(
+            d
+            for index, d in enumerate(document["detections"])
+            if record.det_id
+            == d.get("det_id", f"{keyframe.run_id}_kf{keyframe.keyframe_id}_d{index}")
         )
-    return found
+        return record.keyframe, document, "depth_m" in own or "position" in own
 
 
 @SLOW
@@ -93,18 +112,43 @@ def recounted(view: MapView, documents: list[dict[str, Any]]) -> dict[str, bool]
 def test_an_object_is_confirmed_by_another_spot_run_or_time_or_a_measured_distance(
     documents: list[dict[str, Any]], rules: Settings
 ) -> None:
-    folded = Folded.start(rules).extend(documents)
+    check_confirmed(documents, rules, NO_CORRECTIONS)
+
+
+def test_an_object_that_absorbs_a_confirmed_one_is_confirmed() -> None:
+    """The one is seen from two spots, each near that from which the other was founded."""
+    spots, looks = (0.0, -0.2, 0.2, 0.0), (LOOKS[0], LOOKS[1], LOOKS[1], LOOKS[1])
+    documents = [
+        envelope(
+            number, x, 0.0, timestamp=0.0, detections=[detection("cup", look, det_id=f"d{number}")]
+        )
+        for number, (x, look) in enumerate(zip(spots, looks, strict=True))
+    ]
+    assert check_confirmed(documents, RULES[0], NO_CORRECTIONS) == [False, True]
+    same = Corrections(same=((DetId("d0"), DetId("d3")),))
+    assert check_confirmed(documents, RULES[0], same) == [True]
+
+
+def check_confirmed(
+    documents: list[dict[str, Any]], rules: Settings, corrections: Corrections
+) -> list[bool]:
+    """Compare the view, the kept history and the states of each Object with the recount, after
+    every event. Returns what is confirmed in the end."""
+    folded = Folded.start(rules, corrections).extend(documents)
     view, writer = MapView(rules, keep_embeddings=False), TableWriter(Tables())
     confirmed: list[dict[int, bool]] = [{}]
+    recount = Recount(view, documents)
     for offset, deltas in enumerate(folded.deltas):
         view.apply_event(Offset(offset), deltas)
         writer.add(Offset(offset), deltas)
-        expected = recounted(view, documents)
-        assert {o.object_id: o.confirmed for o in view.objects.values()} == expected
-        assert view.counts()["confirmed"] == sum(expected.values())
+        for delta in deltas:
+            recount.take(delta)
+        expected = recount.confirmed & set(view.objects)
+        assert {o for o, found in view.objects.items() if found.confirmed} == expected
+        assert view.counts()["confirmed"] == len(expected)
         confirmed.append({o: found.confirmed for o, found in view.objects.items()})
     tables = Tables(writer.finish())
-    history = History(rules, NO_CORRECTIONS, tables, _no_map)
+    history = History(rules, corrections, tables, _no_map)
     for end, expected_at in enumerate(confirmed):
         past = StoredView(history, Offset(end))
         assert {o: found.confirmed for o, found in past.objects.items()} == expected_at
@@ -114,3 +158,4 @@ def test_an_object_is_confirmed_by_another_spot_run_or_time_or_a_measured_distan
         states = ObjectStates.of_one(tables, number)
         ends = zip(states.ends.tolist(), states.is_confirmed.tolist(), strict=True)
         assert all(confirmed[end][number] == is_confirmed for end, is_confirmed in ends)
+    return list(confirmed[-1].values())
