@@ -242,8 +242,8 @@ def _answer(
         distance_m=None if spot is None else _distance(each.spot, spot),
         obs_count=each.obs_count,
         confirmed=each.confirmed,
-        first_seen=_seen_at(min(keyframes, key=_time)),
-        last_seen=_seen_at(max(keyframes, key=_time)),
+        first_seen=seen_at(min(keyframes, key=_time)),
+        last_seen=seen_at(max(keyframes, key=_time)),
         missing_in=None if each.missing_in is None else view.runs[each.missing_in].run_id,
         moved_from=(
             None if moved is None else (moved.from_x_um / UM_PER_M, moved.from_y_um / UM_PER_M)
@@ -256,6 +256,7 @@ def _time(keyframe: KeyframeRecord) -> tuple[float, int]:
     return keyframe.timestamp, keyframe.offset
 
 
-def _seen_at(keyframe: KeyframeRecord) -> SeenAt:
+def seen_at(keyframe: KeyframeRecord) -> SeenAt:
+    """That a keyframe saw a thing."""
     time = keyframe.timestamp
     return SeenAt(time, iso_time(time), keyframe.run_id, keyframe.keyframe_id, keyframe.offset)

@@ -60,6 +60,8 @@ look."""
 _SEEN, _SURE, _FLOOR = 8.0, 512.0, 1.0 / 1024.0
 _MISSING = 0.1
 _LEAST_MISSES, _LEAST_HITS = 2, 2
+Metres = tuple[float, float]
+"""A position."""
 _Cell = tuple[int, int]
 
 
@@ -248,7 +250,7 @@ class Presence:
             there_x, there_y, *_ = known.estimate
             dx, dy = there_x - x, there_y - y
             ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
-            if ahead < _LEAST_AHEAD_M or abs(aside) > ahead * inner:
+            if not _is_inside(ahead, aside, inner):
                 continue
             if not _is_similar(dx, dy, there_x - vantage[0], there_y - vantage[1]):
                 continue
@@ -302,6 +304,20 @@ class Presence:
             elif not self._vantages[cell]:
                 del self._vantages[cell]
         known.cells = set()
+
+
+def would_see(pose: Pose, camera: CameraConstants, at: Metres, vantage: Metres) -> bool:
+    """Whether a keyframe looks for a thing that was seen from another one, a vantage."""
+    cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
+    half_cos, half_sin = half_field(camera.hfov_deg)
+    dx, dy = at[0] - pose.x_um / 1e6, at[1] - pose.y_um / 1e6
+    is_inside = _is_inside(dx * cos + dy * sin, dy * cos - dx * sin, half_sin / half_cos * _INNER)
+    return is_inside and _is_similar(dx, dy, at[0] - vantage[0], at[1] - vantage[1])
+
+
+def _is_inside(ahead: float, aside: float, inner: float) -> bool:
+    """Whether a thing, metres ahead and aside of a camera, lies well inside the picture."""
+    return ahead >= _LEAST_AHEAD_M and abs(aside) <= ahead * inner
 
 
 def _is_similar(dx: float, dy: float, vx: float, vy: float) -> bool:

@@ -12,21 +12,21 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import msgspec
 
 from eventsrc.envelope.model import Offset, RunId
+from projections.ask.object_changes import (
+    ObjectChanges,
+    ObjectRow,
+    became,
+    changes_document,
+    object_document,
+    object_rows,
+    object_shift_m,
+)
 from projections.fold.corrections import RecordedCommand
 from projections.map.digest import map_digest
 from projections.map.phrases import command_document
 from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
 from projections.store.history_records import Cause
-
-from .object_changes import (
-    ObjectChanges,
-    ObjectRow,
-    changes_document,
-    object_changes,
-    object_document,
-    object_shift_m,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ def rows_of(view: MapView) -> MapRows:
     return MapRows(
         keyframes=_by(keyframe_key, _keyframe_rows(view, view.keyframes)),
         places=_place_table(view),
-        objects=_by(object_key, _object_rows(view)),
+        objects=object_rows(view),
         edges=_edge_table(view),
     )
 
@@ -155,26 +155,6 @@ def _place_table(view: MapView) -> dict[str, PlaceRow]:
 def _edge_table(view: MapView) -> Edges:
     ids = [place.place_id for place in view.all_places]
     return _by(edge_key, (EdgeRow(ids[a], ids[b], n) for a, b, n in view.edges()))
-
-
-def _object_rows(view: MapView) -> Iterator[ObjectRow]:
-    ids = [place.place_id for place in view.all_places]
-    det_ids = view.det_ids()
-    for o in view.objects.values():
-        yield ObjectRow(
-            o.object_id,
-            o.class_name,
-            o.mean_x,
-            o.mean_y,
-            None if o.place is None else ids[o.place],
-            o.first_seen,
-            o.last_seen,
-            tuple(det_ids[number] for number in o.observations),
-            o.estimate,
-            o.missing_in is not None,
-            tuple(o.relocations),
-            o.confirmed,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,18 +241,6 @@ def difference_of(
     """The difference of two maps."""
     before, after = rows_of(first), rows_of(second)
     objects = changes(before.objects, after.objects)
-    ids, survivors = second.all_objects, second.object_survivors
-    joined = {
-        ids[number].object_id: ids[survivors.find(number)].object_id
-        for number in survivors.absorbed_by
-    }
-    became = object_changes(
-        before.objects,
-        after.objects,
-        objects.changed,
-        joined,
-        is_forward=first.next_offset <= second.next_offset,
-    )
     return Difference(
         start=first.next_offset,
         end=second.next_offset,
@@ -283,7 +251,7 @@ def difference_of(
         objects=objects,
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
-        became=became,
+        became=became(first, second, before.objects, after.objects),
         commands=tuple(commands),
     )
 

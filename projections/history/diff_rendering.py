@@ -7,10 +7,10 @@ have moved or be missing; new ones, confirmed first; shifts without a move are o
 from collections.abc import Iterator, Sequence
 
 from eventsrc.base.text import counted
+from projections.ask.object_changes import ObjectAbsence, ObjectMove, ObjectRow
 from projections.map.phrases import command_title
 
 from .diff import Difference, PlaceRow, place_shift_m
-from .object_changes import ObjectAbsence, ObjectMove, ObjectRow
 from .rendering import shortened
 
 _HINT = "--all shows them"

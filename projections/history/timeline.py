@@ -6,15 +6,20 @@ folds its log once for each set of commands that it is asked under, so once in a
 commands.
 """
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeAlias
 
+from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
+from eventsrc.log.seek import Note, resolve, time_of
+from projections.ask.what_changed import MapChanges, last_run_start, map_changes, run_span
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent
+from projections.map.naming import NoSuchThing
 from projections.map.own_events import read_commands
 from projections.map.view import MapView
 from projections.store.history import History
@@ -32,6 +37,8 @@ SettingsChoice: TypeAlias = Callable[[Corrections], Settings]
 """A function that returns the settings to fold with under some corrections, which may hold the
 settings recorded in the log."""
 
+_MOMENTS = "; or give a day such as 2026-03-24, a time, RUN:KEYFRAME, a number of events or end"
+_DAY = re.compile(r"\d{4}-\d{2}-\d{2}", re.ASCII)
 _MOST_HISTORIES = 4
 """Histories that are kept; each may take as much memory as the map."""
 _MOST_COMPILED = 16
@@ -182,6 +189,44 @@ class LogTimeline:
         before, after = self.knowing(known[0]).at(start), self.knowing(known[1]).at(last)
         absorbed = self._absorbed(before, last, known[1]) if start <= last else {}
         return difference_of(before, after, absorbed, self.commands(min(known), max(known)))
+
+    def changes(
+        self,
+        since: Offset | None = None,
+        end: Offset | None = None,
+        *,
+        known_at: Offset | None = None,
+    ) -> MapChanges:
+        """What changed in the building between two maps, both under the commands before the second
+        one, so that no correction is a change; by default since the last run began.
+
+        Raises MisuseError for a map that is not folded by evidence, and where ``since`` is later.
+        """
+        last = checked_end(self.reader, end)
+        known = self._known(last, known_at)
+        after = known.at(last)
+        if after.settings.fusion != "evidence":
+            raise MisuseError(
+                "only a map with fusion by evidence knows what has changed; fold it with"
+                " --preset full"
+            )
+        first = last_run_start(after) if since is None else checked_end(self.reader, since)
+        if first > last:
+            raise MisuseError(f"since is {first:,}, later than until, {last:,}; exchange them")
+        return map_changes(known.at(first), after)
+
+    def moment(self, text: str, *, is_end: bool, note: Note | None = None) -> Offset:
+        """The number of events before a moment: a day begins or ends then, a run's first event is
+        not yet there or its last one is, or it is a point as of `eventsrc.log.seek.resolve`."""
+        if _DAY.fullmatch(text):
+            text = f"{text}T23:59:59.999999Z" if is_end else text
+        elif not text.isdecimal() and text != "end":
+            span = run_span(view := self.at(), text)
+            if span is not None:
+                return span[is_end]
+            if time_of(text) is None and ":" not in text:
+                raise NoSuchThing("run", text, [run.run_id for run in view.runs], advice=_MOMENTS)
+        return resolve(self.reader, text, note=note)
 
     def facts(self, end: Offset | None = None, *, known_at: Offset | None = None) -> HistoryFacts:
         """The map after ``end`` events, for evaluating conditions."""

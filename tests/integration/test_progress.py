@@ -87,6 +87,7 @@ PROVOKED = {
     "merges": ["L"],
     "why": ["L", "run-a:3", "run-a:9"],
     "diff": ["L", "3"],
+    "changes": ["L"],
     "bisect": ["L", "place_count > 0"],
     "whatif": ["L", "--set", "eps_m=1"],
     "calibrate": ["L"],

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 import pytest
 
 from eventsrc.envelope.model import Offset
-from projections.fold.deltas import ObservationOrdinal
-from projections.history.object_changes import (
+from projections.ask.object_changes import (
     ObjectChanges,
     ObjectRow,
     changes_document,
     object_changes,
     object_shift_m,
 )
+from projections.fold.deltas import ObservationOrdinal
 from projections.map.records import EstimatedPosition, Relocation
 
 

@@ -49,6 +49,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "merges": "time_travel:merges",
         "why": "time_travel:why",
         "diff": "time_travel:diff",
+        "changes": "time_travel:changes",
         "bisect": "time_travel:bisect",
         "whatif": "whatif_command:whatif",
     },

@@ -1,4 +1,4 @@
-"""`mapfold merges`, `why`, `diff` and `bisect`: why a map is what it is."""
+"""`mapfold merges`, `why`, `diff`, `changes` and `bisect`: why a map is what it is."""
 
 import contextlib
 from collections.abc import Iterator
@@ -10,8 +10,9 @@ from typing import Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import advised
+from eventsrc.base.text import advised, counted
 from eventsrc.envelope.model import Offset
+from projections.ask.what_changed import changes_text
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
 from projections.history.condition_functions import functions_help
 from projections.history.diff_rendering import difference_text
@@ -245,6 +246,49 @@ def diff(
         emit(found.document())
     else:
         display(difference_text(found, most=None if all_ else MOST_LINES))
+
+
+def changes(
+    *,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            "--since",
+            metavar="W|DAY|RUN",
+            help="From here, a day or a run from its start [default: the start of the last run].",
+        ),
+    ] = None,
+    until: Annotated[
+        str,
+        typer.Option("--until", metavar="W|DAY|RUN", help="To here, a day or a run to its end."),
+    ] = "end",
+    known_at: Annotated[
+        str | None,
+        typer.Option(
+            "--known-at",
+            metavar="V",
+            help="Apply only the commands recorded before here [default: those before --until].",
+        ),
+    ] = None,
+    json_: JsonOption = False,
+    all_: AllOption = False,
+    past: PastLog,
+) -> None:
+    """Say what changed in the building: what moved, is missing, new or back again.
+
+    One sentence each, only what is sure, the largest first. `diff` shows how two maps differ.
+    """
+    with past.timeline() as timeline:
+        end = timeline.moment(until, is_end=True, note=say)
+        start = None if since is None else timeline.moment(since, is_end=False, note=say)
+        known = None if known_at is None else point(timeline.reader, known_at)
+        found = timeline.changes(start, end, known_at=known)
+    if json_:
+        emit(found.document())
+        return
+    display(changes_text(found, most=None if all_ else MOST_LINES))
+    if found.unsure:
+        say(f"+ {counted(found.unsure, 'change')} not sure; `mapfold diff` shows them")
 
 
 def bisect(

@@ -1,7 +1,8 @@
 """One table: Objects with fusion=page and by evidence, side by side, against the truth.
 
 scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
-    [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types | --bags]
+    [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types | --bags |
+    --ask]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
@@ -27,8 +28,10 @@ from types import ModuleType
 
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
+from projections.map.view import MapView
 
 from . import tables
+from .asking import AskedRow, asked_row, asked_table
 from .bags import BagRow, bag_row, bags_table
 from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
@@ -74,6 +77,12 @@ def main() -> None:
             _write(options.json, bags)
             return
         cases = _cases(generator, chosen, options, limit)
+        if options.ask:
+            asked = [_asked_row(generator, case) for case in cases]
+            print(f"{options.half} half, {options.moved:g} of the movable things moved")
+            print(asked_table(asked))
+            _write(options.json, asked)
+            return
         if options.places:
             rules = {**RULES, "rooms": RULES["rooms"].with_assignments(options.set)}
             places = [
@@ -122,7 +131,9 @@ def _world(case: Case) -> str:
     return case.name.rpartition(" ")[2]
 
 
-def _write(path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow]) -> None:
+def _write(
+    path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow]
+) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
         path.write_text(json.dumps(document, indent=1) + "\n")
@@ -204,6 +215,9 @@ def _options() -> argparse.Namespace:
         "--bags", action="store_true", help="bags of ROS 2 with walls, imported without an option"
     )
     parser.add_argument("--types", action="store_true", help="types of places against room names")
+    parser.add_argument(
+        "--ask", action="store_true", help="find, changes and goals; with --moved, instead"
+    )
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument(
         "--no-camera", action="store_true", help="with --localise: maps estimate the field of view"
@@ -276,12 +290,23 @@ def _row(case: Case, options: argparse.Namespace) -> tables.Row:
 
 def _told(case: Case, settings: Settings) -> ToldScores:
     """What a difference of the maps after run a and after run b says."""
+    return score_told(*_two_maps(case, settings), case.truth, case.things)
+
+
+def _two_maps(case: Case, settings: Settings) -> tuple[MapView, MapView]:
+    """The maps after run a and after run b."""
     runs = list(dict.fromkeys(each.envelope.run_id for each in case.events))
-    views = [
+    before, after = (
         fold_timed([e for e in case.events if e.envelope.run_id in runs[:count]], settings)[0]
         for count in (1, 2)
-    ]
-    return score_told(*views, case.truth, case.things)
+    )
+    return before, after
+
+
+def _asked_row(generator: ModuleType, case: Case) -> AskedRow:
+    settings = Settings(fusion="evidence", camera=case.camera_settings)
+    same = {word: name for name, words in generator.SYNONYMS.items() for word in words}
+    return asked_row(case.name, *_two_maps(case, settings), case.truth, case.things, same)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 
+from projections.ask.object_changes import object_shift_m
 from projections.history.diff import difference_of
-from projections.history.object_changes import object_shift_m
 from projections.localize.evaluate.truth import Truth
 from projections.map.view import MapView
 

@@ -49,6 +49,7 @@ class TrueThing:
     x: float
     y: float
     moved_to: tuple[float, float] | None = None
+    class_name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,6 +284,7 @@ def _things(folder: Path) -> list[TrueThing]:
             thing["x"],
             thing["y"],
             (to["x"], to["y"]) if (to := thing.get("moved_in_b")) else None,
+            thing["cls"] if "cls" in thing else thing["class_name"],
         )
         for thing in found
     ]

@@ -9,7 +9,7 @@ shift by more than the spread of the positions 3 % were moved, so none is called
 A change is *sure* when
 
 * the Object's estimate before, and after a move the new one, has a standard error of at most
-  `_KNOWN_M`; and
+  `KNOWN_M`; and
 * no other Object of its class stands, in the later map, where it stood: all are farther from there
   than both errors explain (`_BEYOND`). Otherwise it may have been exchanged for one that looks the
   same: where an alike one is at the old place, the one that is elsewhere is another.
@@ -25,8 +25,9 @@ from typing import Any, Final
 
 from projections.map.phrases import seen_times
 from projections.map.records import EstimatedPosition, Relocation
+from projections.map.view import MapView
 
-_KNOWN_M: Final = 0.5
+KNOWN_M: Final = 0.5
 _BEYOND: Final = 9.21
 """99 % of the squared normalised distances of two estimates of one position."""
 Point = tuple[float, float]
@@ -105,6 +106,48 @@ def object_shift_m(before: ObjectRow, after: ObjectRow) -> float:
     return math.dist(before.spot, after.spot)
 
 
+def object_rows(view: MapView) -> dict[str, ObjectRow]:
+    """The Objects of a map by id, in the order of the view."""
+    ids = [place.place_id for place in view.all_places]
+    det_ids = view.det_ids()
+    return {
+        o.object_id: ObjectRow(
+            o.object_id,
+            o.class_name,
+            o.mean_x,
+            o.mean_y,
+            None if o.place is None else ids[o.place],
+            o.first_seen,
+            o.last_seen,
+            tuple(det_ids[number] for number in o.observations),
+            o.estimate,
+            o.missing_in is not None,
+            tuple(o.relocations),
+            o.confirmed,
+        )
+        for o in view.objects.values()
+    }
+
+
+def became(
+    first: MapView,
+    second: MapView,
+    before: Mapping[str, ObjectRow],
+    after: Mapping[str, ObjectRow],
+) -> ObjectChanges:
+    """What became of the Objects of a map in another one; ``before`` and ``after`` are their
+    `object_rows`."""
+    ids, survivors = second.all_objects, second.object_survivors
+    joined = {
+        ids[number].object_id: ids[survivors.find(number)].object_id
+        for number in survivors.absorbed_by
+    }
+    both = [(row, after[name]) for name, row in before.items() if name in after]
+    changed = [pair for pair in both if pair[0] != pair[1]]
+    is_forward = first.next_offset <= second.next_offset
+    return object_changes(before, after, changed, joined, is_forward=is_forward)
+
+
 def object_changes(
     first: Mapping[str, ObjectRow],
     second: Mapping[str, ObjectRow],
@@ -121,7 +164,7 @@ def object_changes(
     for before, after in changed:
         old, new = (before, after) if is_forward else (after, before)
         is_relocated = any(each not in old.relocations for each in new.relocations)
-        is_moved = is_relocated and not _is_within(old.estimate, new.estimate)
+        is_moved = is_relocated and not is_within(old.estimate, new.estimate)
         if is_moved:
             errors = [row.estimate.est_sigma_m for row in (old, new) if row.estimate is not None]
             is_sure = _is_sure(old, later, max(errors, default=math.inf))
@@ -131,7 +174,7 @@ def object_changes(
             is_sure = _is_sure(old, later, error)
             missing.append(ObjectAbsence(before, after, before.missing, is_sure))
         if not is_moved and before.spot != after.spot:
-            if _is_within(before.estimate, after.estimate):
+            if is_within(before.estimate, after.estimate):
                 jitter += 1
             else:
                 corrected += 1
@@ -140,8 +183,8 @@ def object_changes(
 
 
 def _is_sure(old: ObjectRow, later: Mapping[str, list[ObjectRow]], error_m: float) -> bool:
-    return error_m <= _KNOWN_M and not any(
-        other.object_id != old.object_id and _is_within(old.estimate, other.estimate)
+    return error_m <= KNOWN_M and not any(
+        other.object_id != old.object_id and is_within(old.estimate, other.estimate)
         for other in later.get(old.class_name, ())
     )
 
@@ -153,7 +196,7 @@ def _by_class(rows: Mapping[str, ObjectRow]) -> dict[str, list[ObjectRow]]:
     return found
 
 
-def _is_within(one: EstimatedPosition | None, other: EstimatedPosition | None) -> bool:
+def is_within(one: EstimatedPosition | None, other: EstimatedPosition | None) -> bool:
     """Whether the errors of two estimates explain their distance; so for mean positions, whose
     shifts mean nothing."""
     if one is None or other is None:
