@@ -46,6 +46,7 @@ from .origin import command_for, refuse_mismatch, rows_dropped
 from .sink import Checkpoint
 from .statements import statements
 from .vector_rows import VectorRow, new_rows
+from .vector_sink import refuse_older_vectors
 
 _RELATION_KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
 
@@ -113,7 +114,7 @@ STREAM_ROWS: Final = 2_000
 BATCH_EVENTS: Final = 256
 _VECTORS: Final = """
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
-       embedding_model, embedding::real[],
+       camera, embedding_model, embedding::real[],
        (extract(epoch FROM ingested_at) * 1000000)::bigint
 FROM public.detection_embeddings ORDER BY det_pk
 """
@@ -294,6 +295,7 @@ def _compare_vectors(
     expected = (
         _vector_row(row) for _ in folding for row in new_rows(fold.tracker.drain(), fold.view)
     )
+    refuse_older_vectors(connection)
     # Binary, so that a float32 arrives as the float32 it is.
     with connection.cursor(name="check", binary=True) as cursor:
         cursor.itersize = STREAM_ROWS
@@ -326,7 +328,8 @@ def _vector_row(row: VectorRow) -> Keyed:
     pose, added = row.pose or (None, None, None), row.added
     return row.det_pk, (
         added.run_id, added.det_id, added.keyframe_id, added.class_name, added.confidence,
-        list(row.bbox), *pose, added.embedding_model, row.embedding.tolist(), row.ingested_us,
+        list(row.bbox), *pose, None if row.camera is None else list(row.camera),
+        added.embedding_model, row.embedding.tolist(), row.ingested_us,
     )  # fmt: skip
 
 

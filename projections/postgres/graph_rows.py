@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from json.encoder import encode_basestring
 from typing import Final
 
+from eventsrc.envelope.model import StatedCamera
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.exact import Q40, UM_PER_M
 from projections.map.changes import BatchChanges, FollowedRegions
@@ -217,7 +218,15 @@ def _keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRo
     base = BASE["Keyframe"]
     for i in keyframes:
         k = view.keyframes[i]
-        yield base + i, f'{{{_keyframe_key(k)}, "timestamp": {k.timestamp!r}}}'
+        properties = f'{{{_keyframe_key(k)}, "timestamp": {k.timestamp!r}{_camera(k.camera)}}}'
+        yield base + i, properties
+
+
+def _camera(camera: StatedCamera | None) -> str:
+    if camera is None:
+        return ""
+    fields = (f'"{name}": {getattr(camera, name)!r}' for name in StatedCamera.__struct_fields__)
+    return f', "camera": {{{", ".join(fields)}}}'
 
 
 def _pose_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRow]:

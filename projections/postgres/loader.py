@@ -17,7 +17,8 @@ for each row an int16 number of fields and for each field an int32 length (-1 fo
 bytes as the type's ``recv`` function takes them; an int16 -1 ends it. All big-endian.
 
     bigint int64 · text UTF-8 · double precision float64 · timestamptz int64 µs since 2000-01-01
-    real[] int32 dimensions, flags, element type's oid, length, lower bound, then length + float32
+    real[] int32 dimensions, flags, element type's oid, length, lower bound, then length + float32;
+           double precision[] likewise
     vector int16 dimension, int16 0, float32 … (pgvector's vector_recv)
 """
 
@@ -31,6 +32,7 @@ from psycopg import sql
 
 from projections.fold.deltas import ObservationAdded
 from projections.fold.exact import to_float32
+from projections.localize.relocalize.camera import CameraValues
 
 from .connection import Connection
 from .graph_rows import Row
@@ -39,7 +41,7 @@ from .statements import statements
 from .vector_rows import VectorRow
 
 COPIED: Final = (
-    "run_id", "keyframe_id", "map_x", "map_y", "map_yaw", "ingested_at",
+    "run_id", "keyframe_id", "map_x", "map_y", "map_yaw", "camera", "ingested_at",
     "det_pk", "confidence", "bbox", "det_id", "class_name", "embedding_model", "embedding",
 )  # fmt: skip
 """The columns in the order of the fields: first those that all rows of a keyframe share."""
@@ -48,6 +50,7 @@ _TRAILER: Final = struct.pack(">h", -1)
 _NULL: Final = struct.pack(">i", -1)
 _POSTGRES_EPOCH_US: Final = 946_684_800_000_000
 _FLOAT4_OID: Final = 700
+_FLOAT8_OID: Final = 701
 
 _count = struct.Struct(">h").pack
 _length = struct.Struct(">i").pack
@@ -57,6 +60,9 @@ _REALS: Final = struct.pack(">iiiiii", 52, 1, 0, _FLOAT4_OID, 4, 1)
 """The field of a ``real[]`` of four, up to its first element."""
 _fixed = struct.Struct(f">iqid{len(_REALS)}sififififi").pack
 _vector = struct.Struct(">ihh").pack
+_DOUBLES: Final = struct.pack(">iiiiii", 68, 1, 0, _FLOAT8_OID, 4, 1)
+"""The field of a ``double precision[]`` of four, up to its first element."""
+_doubles = struct.Struct(">idididid").pack
 
 
 def copy_document(rows: Sequence[VectorRow], first: bool, last: bool) -> bytes:
@@ -98,6 +104,7 @@ def _shared_fields(row: VectorRow) -> bytes:
         _text(row.added.run_id),
         _int64(8, row.added.keyframe_id),
         _NULL * 3 if row.pose is None else _pose_fields(row.pose),
+        _NULL if row.camera is None else _camera_field(row.camera),
         _int64(8, row.ingested_us - _POSTGRES_EPOCH_US),
     ))  # fmt: skip
 
@@ -114,6 +121,11 @@ def _numbers(
 def _pose_fields(pose: tuple[float, float, float]) -> bytes:
     x, y, yaw = pose
     return _pose(8, x, 8, y, 8, yaw)
+
+
+def _camera_field(camera: CameraValues) -> bytes:
+    hfov_deg, width, height, yaw = camera
+    return _DOUBLES + _doubles(8, hfov_deg, 8, width, 8, height, 8, yaw)
 
 
 def _text(value: str) -> bytes:
@@ -218,9 +230,10 @@ def _unnest(
 def _vector_fields(row: VectorRow) -> tuple[object, ...]:
     pose = row.pose or (None, None, None)
     bbox = "{" + ",".join(map(repr, row.bbox)) + "}"
+    camera = None if row.camera is None else "{" + ",".join(map(repr, row.camera)) + "}"
     embedding = "[" + ",".join(map(repr, row.embedding.tolist())) + "]"
     added = row.added
     return (
         row.det_pk, added.run_id, added.det_id, added.keyframe_id, added.class_name,
-        added.confidence, bbox, *pose, added.embedding_model, embedding, row.ingested_at,
+        added.confidence, bbox, *pose, camera, added.embedding_model, embedding, row.ingested_at,
     )  # fmt: skip

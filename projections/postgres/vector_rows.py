@@ -14,8 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope.model import StatedCamera
 from projections.fold.deltas import ObservationAdded, Pose
 from projections.fold.exact import UM_PER_M, UnitVector, to_float32
+from projections.localize.relocalize.camera import CameraValues, camera_values
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
@@ -27,11 +29,13 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One row: the delta that adds it; the values of the columns are computed on access.
 
-    ``keyframe_pose`` is None when the robot had no pose; the event was logged at ``logged_ns``.
+    ``keyframe_pose`` is None when the robot had no pose, ``stated`` when the envelope states no
+    camera; the event was logged at ``logged_ns``.
     """
 
     added: ObservationAdded
     keyframe_pose: Pose | None
+    stated: StatedCamera | None
     logged_ns: int
 
     @property
@@ -53,6 +57,11 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
         """Metres and radians; None when the robot had no pose."""
         at = self.keyframe_pose
         return None if at is None else (at.x_um / UM_PER_M, at.y_um / UM_PER_M, at.yaw_rad)
+
+    @property
+    def camera(self) -> CameraValues | None:
+        """The camera that the envelope states; None where it states none."""
+        return None if self.stated is None else camera_values(self.stated)
 
     @property
     def unit(self) -> UnitVector:
@@ -78,8 +87,8 @@ class VectorRow(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 def new_rows(changes: BatchChanges, view: MapView) -> list[VectorRow]:
     """The rows that a batch adds, in the order of their observations."""
-    keyframes = view.keyframes
-    return [VectorRow(added, keyframes[added.keyframe].pose, ns) for added, ns in changes.embedded]
+    made = ((added, view.keyframes[added.keyframe], ns) for added, ns in changes.embedded)
+    return [VectorRow(added, keyframe.pose, keyframe.camera, ns) for added, keyframe, ns in made]
 
 
 def _real(value: float) -> float:

@@ -160,7 +160,7 @@ def test_the_table_has_the_columns_of_the_design(
     assert dict(columns)["bbox"] == "real[]"
     assert [name for name, _ in columns] == [
         "det_pk", "run_id", "det_id", "keyframe_id", "class_name", "confidence", "bbox", "map_x",
-        "map_y", "map_yaw", "embedding_model", "embedding", "ingested_at",
+        "map_y", "map_yaw", "camera", "embedding_model", "embedding", "ingested_at",
     ]  # fmt: skip
     searchable = [o for o in view.observations if o.embedding_crc is not None]
     rows = vector_rows(module_database.vector_url)
@@ -247,7 +247,7 @@ def test_a_row_that_is_larger_than_a_page(tmp_path: Path, one_database: Targets)
     log = write_log(tmp_path / "log", [envelope(0, run_id=name, detections=[seen])])
     rebuild(log, one_database, SETTINGS)
     rows = vector_rows(one_database.vector_url)
-    assert [(row[1], row[2], row[4], row[10]) for row in rows] == [(name,) * 4]
+    assert [(row[1], row[2], row[4], row[11]) for row in rows] == [(name,) * 4]
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from projections.localize.relocalize import ExactIndex, QuestionCrop, rank, read
 from projections.localize.relocalize.track import Track
 from projections.map.fold import fold_log
 from projections.map.view import MapView
-from projections.postgres import rebuild
+from projections.postgres import rebuild, tail
+from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.queries.candidate_search import CandidateReader, relocalize
 from tests.support.commands import Commands
@@ -24,12 +25,14 @@ from tests.support.scenes import assert_equal, found
 from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
+CAMERA = {"hfov_deg": 50.3, "width_px": 640.0, "height_px": 480.0, "yaw_rad": -0.7}
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Two runs, since matches of different runs are treated differently."""
-    other = walk(30, seed=4, run_id="run-c")
+    """Two runs, since matches of different runs are treated differently; the robot of the second
+    states its camera."""
+    other = [{**each, "camera": CAMERA} for each in walk(30, seed=4, run_id="run-c")]
     return write_log(tmp_path / "log", [*walk(60, seed=3), *other])
 
 
@@ -68,7 +71,8 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
         for crops in questions():
             live, exact = reader.candidates(crops, 200), index.search(crops, 200)
             assert_equal(live, exact)
-            assert {m.run_id for row in live.matches for m in row} == {"run-a", "run-c"}
+            taken = {(m.run_id, m.camera) for row in live.matches for m in row}
+            assert taken == {("run-a", None), ("run-c", tuple(CAMERA.values()))}
             asked += 1
         assert asked > 5
         nothing = reader.candidates(())
@@ -157,6 +161,26 @@ def test_graph_and_vectors_of_different_origin_are_refused(
 def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:
     with pytest.raises(ProjectionMissing, match="mapfold replay"):
         relocalize(one_database, read_question([detection("cup", [1.0] * 8)]).crops)
+
+
+def test_a_table_of_an_older_version_is_refused_until_it_is_made_again(
+    log: Path, one_database: Targets
+) -> None:
+    """It lacks the cameras of its observations."""
+    rebuild(log, one_database, SETTINGS)
+    crops = next(questions())
+    with psycopg.connect(one_database.vector_url, autocommit=True) as connection:
+        connection.execute("ALTER TABLE detection_embeddings DROP COLUMN camera")
+    again = "an older mapfold made the .*camera.*run `mapfold replay`, which makes it again"
+    with pytest.raises(ProjectionMismatch, match=again):
+        relocalize(one_database, crops)
+    with pytest.raises(ProjectionMismatch, match=again):
+        tail(log, one_database, SETTINGS, once=True)
+    with pytest.raises(ProjectionMismatch, match=again):
+        check(log, one_database, SETTINGS)
+    rebuild(log, one_database, SETTINGS)
+    assert relocalize(one_database, crops).places
+    assert all(report.differing == 0 for report in check(log, one_database, SETTINGS))
 
 
 @pytest.mark.slow

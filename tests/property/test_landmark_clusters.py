@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraConstants
-from projections.localize.relocalize.camera import box_rows, focal_px, views
+from projections.localize.relocalize.camera import Cameras, box_rows, camera_values, views
 from projections.localize.relocalize.triangulation import (
     Points,
     cluster_points,
@@ -159,9 +159,11 @@ def test_more_views_from_one_spot_do_not_make_a_position_sure() -> None:
 def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> None:
     """A box of one size seen from four sides: its distance follows from the bearings."""
     boxes, poses = [], []
+    cameras = Cameras.of([camera_values(CameraConstants())])
+    focal = float(cameras.focal_px[0])
     for quarter in range(8):
         angle, far = quarter * math.pi / 4, 2.0 + 0.25 * (quarter % 3)
-        half = 0.5 * 0.8 * focal_px(CameraConstants()) / far
+        half = 0.5 * 0.8 * focal / far
         boxes.append((320.0 - half, 200.0 - half, 320.0 + half, 200.0 + half))
         poses.append((far * math.cos(angle), far * math.sin(angle), angle + math.pi))
     for usual in (1.0, 2.0, 4.0):
@@ -171,7 +173,7 @@ def test_views_that_cross_find_the_position_whatever_the_usual_distance() -> Non
         rows = box_rows([*boxes, *boxes])
         crops = triangulate(
             np.array(beside),
-            views(CameraConstants(), rows),
+            views(cameras, rows),
             np.ones(16),
             np.array([0, 8]),
             [5, 5],

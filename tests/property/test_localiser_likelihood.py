@@ -11,7 +11,15 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraConstants
 from projections.localize.relocalize import MapConstants
 from projections.localize.relocalize.appearance import DIRECTIONS, appearance_tables
-from projections.localize.relocalize.camera import Cue, SightLines, box_rows, half_field_rad, sights
+from projections.localize.relocalize.camera import (
+    Cameras,
+    Cue,
+    SightLines,
+    box_rows,
+    camera_values,
+    half_field_rad,
+    sights,
+)
 from projections.localize.relocalize.constants import MODEL, RankingModel
 from projections.localize.relocalize.landmarks import CropGroup, Landmarks
 from projections.localize.relocalize.likelihood import (
@@ -67,7 +75,12 @@ def random_group(
             box = (*box[:3], camera.height_px)
         boxes.append(box if boxed else None)
     first = np.cumsum([0, *counts_of[:-1]])
-    return CropGroup(marks, first, sights(camera, box_rows(boxes)), (True,) * len(counts_of))
+    return CropGroup(
+        marks,
+        first,
+        sights(Cameras.of([camera_values(camera)]), box_rows(boxes)),
+        (True,) * len(counts_of),
+    )
 
 
 def one_crop(group: CropGroup, crop: int) -> CropGroup:
@@ -312,7 +325,8 @@ def test_looks_are_those_written_out_for_each_observation(seed: int, counts: lis
     )
 )
 def test_whatever_a_box_holds_its_sights_are_finite(boxes: list[tuple[float, ...] | None]) -> None:
-    found: SightLines = sights(CameraConstants(), box_rows(boxes))  # type: ignore[arg-type]
+    cameras = Cameras.of([camera_values(CameraConstants())])
+    found: SightLines = sights(cameras, box_rows(boxes))  # type: ignore[arg-type]
     for values in (found.bearing, found.log_height, found.rise):
         assert np.isfinite(values).all()
     assert (np.abs(found.bearing) < math.pi / 2).all()

@@ -90,7 +90,7 @@ def vector_rows(url: str) -> list[tuple[Any, ...]]:
         connection.execute("SET timezone = 'UTC'")
         return connection.execute(
             "SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x,"
-            " map_y, map_yaw, embedding_model, embedding::text, ingested_at"
+            " map_y, map_yaw, camera, embedding_model, embedding::text, ingested_at"
             " FROM detection_embeddings ORDER BY det_pk"
         ).fetchall()
 
@@ -124,7 +124,13 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
     for k in view.keyframes:
         n = k.ordinal + 1
         name = {"run_id": k.run_id, "keyframe_id": k.keyframe_id}
-        rows["Keyframe"].append((gid("Keyframe", n), {**name, "timestamp": k.timestamp}))
+        taken: dict[str, Any] = {"timestamp": k.timestamp}
+        if k.camera is not None:
+            taken["camera"] = {
+                name: getattr(k.camera, name)
+                for name in ("hfov_deg", "width_px", "height_px", "yaw_rad")
+            }
+        rows["Keyframe"].append((gid("Keyframe", n), {**name, **taken}))
         run_end = gid("Run", k.run + 1)
         rows["HAS_KEYFRAME"].append((gid("HAS_KEYFRAME", n), run_end, gid("Keyframe", n), {}))
         if k.pose is not None:

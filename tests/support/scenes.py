@@ -36,7 +36,7 @@ from projections.localize.relocalize import (
     QuestionCrop,
     QuestionView,
 )
-from projections.localize.relocalize.camera import focal_px
+from projections.localize.relocalize.camera import half_field_rad
 from projections.localize.relocalize.question import Box
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
@@ -69,11 +69,12 @@ def box_of(thing: Thing, pose: Pose, camera: CameraConstants) -> Box | None:
     left = math.cos(pose[2]) * dy - math.sin(pose[2]) * dx
     if not 0.3 < ahead < FARTHEST_M:
         return None
-    middle = camera.width_px / 2 - focal_px(camera) * left / ahead
+    focal = camera.width_px / 2 / math.tan(half_field_rad(camera))
+    middle = camera.width_px / 2 - focal * left / ahead
     if not 0.0 < middle < camera.width_px:
         return None
-    half = 0.2 * focal_px(camera) / ahead
-    rise = focal_px(camera) / ahead
+    half = 0.2 * focal / ahead
+    rise = focal / ahead
     return (
         max(0.0, middle - half),
         max(0.0, camera.height_px / 2 - (thing.tall_m - UP_M) * rise),
@@ -184,6 +185,7 @@ def found(candidates: MapCandidates) -> list[list[tuple[object, ...]]]:
                 m.object_id,
                 m.object_place,
                 m.keyframe_place,
+                m.camera,
                 m.object_estimate,
             )
             for m in sorted(row, key=lambda m: m.observation)

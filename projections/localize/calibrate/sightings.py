@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from projections.fold.deltas import Pose
 from projections.fold.exact import Q40, UnitVector
 from projections.fold.settings import CameraConstants
-from projections.localize.relocalize.camera import box_rows, focal_px, views
+from projections.localize.relocalize.camera import Cameras, box_rows, camera_values, views
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -85,22 +85,13 @@ _PAIRS_AT_ONCE = 4096
 def sightings_of(rows: Iterable[Row]) -> Sightings:
     """The columns of observations."""
     rows = list(rows)
-    n = len(rows)
-    off_axis, height = np.zeros(n), np.full(n, np.nan)
-    cut, boxed = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    mounted, beyond = np.zeros(n), 0
-    by_camera: dict[CameraConstants, list[int]] = {}
-    for i, row in enumerate(rows):
-        by_camera.setdefault(row.camera, []).append(i)
-    for camera, of in by_camera.items():
-        read = views(camera, box_rows([rows[i].bbox for i in of]))
-        off_axis[of], cut[of], boxed[of] = np.arctan(read.slope), read.cut_x, read.known
-        whole = read.known & ~read.cut_y
-        height[of] = np.where(whole, read.height_px / focal_px(camera), np.nan)
-        mounted[of] = camera.yaw_rad
-        boxes = np.array([rows[i].bbox for i in of])
-        over = boxes - [0.0, 0.0, camera.width_px, camera.height_px]
-        beyond += int(((over[:, :2] < -_BEYOND_PX) | (over[:, 2:] > _BEYOND_PX)).any(axis=1).sum())
+    boxes = box_rows([row.bbox for row in rows])
+    cameras = Cameras.of([camera_values(row.camera) for row in rows])
+    read = views(cameras, boxes)
+    off_axis, whole = np.arctan(read.slope), read.known & ~read.cut_y
+    x0, y0, x1, y1 = boxes.T
+    beyond = (np.minimum(x0, y0) < -_BEYOND_PX) | (x1 > cameras.width_px + _BEYOND_PX)
+    beyond |= y1 > cameras.height_px + _BEYOND_PX
     heading = np.array([row.pose.yaw_rad for row in rows], dtype=np.float64)
     return Sightings(
         picture=np.array([row.picture for row in rows], dtype=np.int64),
@@ -108,14 +99,14 @@ def sightings_of(rows: Iterable[Row]) -> Sightings:
         x=np.array([row.pose.x_m for row in rows], dtype=np.float64),
         y=np.array([row.pose.y_m for row in rows], dtype=np.float64),
         heading=heading,
-        sight=heading + mounted + off_axis,
+        sight=heading + cameras.yaw_rad + off_axis,
         off_axis=off_axis,
-        cut=cut,
-        height=height,
-        boxed=boxed,
+        cut=read.cut_x,
+        height=np.where(whole, read.height_px / cameras.focal_px, np.nan),
+        boxed=read.known,
         classes=[row.class_name for row in rows],
         thing=np.array([row.thing for row in rows], dtype=np.int64),
         looks=[row.look for row in rows],
         looked=np.array([row.look is not None for row in rows], dtype=np.bool_),
-        beyond=beyond,
+        beyond=int(beyond.sum()),
     )

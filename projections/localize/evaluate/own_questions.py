@@ -22,6 +22,7 @@ from eventsrc.envelope.model import RunId
 from eventsrc.log.seek import Note
 from projections.fold.deltas import ObservationOrdinal
 from projections.fold.exact import to_float32
+from projections.fold.sights import camera_of
 from projections.localize.relocalize import Answer, ExactIndex, Match, QuestionCrop, rank
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
@@ -98,13 +99,14 @@ class OwnQuestions:
         constants = self._index.constants
         lowered = constants.evidence.session_shift * (1.0 - constants.different)
         asked = [_crop(self._view.observations[ordinal]) for ordinal in seen]
+        camera = camera_of(keyframe.camera, self._view.settings.camera)
         visit = _visit(self._runs, keyframe)
         shown = _observations_of_things(self._view, self._by_class, seen)
 
         def answered(taken_out: bool) -> OwnAnswer:
             found = self._index.search(asked, without=visit | shown if taken_out else visit)
             rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
-            answer = rank(asked, replace(found, matches=rows), top=1, camera=constants.camera)
+            answer = rank(asked, replace(found, matches=rows), top=1, camera=camera)
             pose = None if answer.pose is None else (answer.pose.x, answer.pose.y)
             return OwnAnswer(
                 self._crops,

@@ -18,12 +18,14 @@ from typing import TypeVar
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.envelope.model import StatedCamera
 from eventsrc.log import LogReader
 from eventsrc.log.reader import OnGap
 from projections.fold.corrections import Corrections
 from projections.fold.edited_events import Reembedded, relabelled
 from projections.fold.exact import quantise, to_float32
-from projections.fold.settings import Settings
+from projections.fold.settings import CameraSettings, Settings
+from projections.fold.sights import camera_of
 from projections.localize import relocalize
 from projections.localize.relocalize import QuestionCrop, QuestionView
 from projections.map.own_events import read_corrections, vectors_of
@@ -119,8 +121,8 @@ def make_view_questions(
     keyframes: Sequence[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
 ) -> list[ScoredQuestion]:
     """One question from each keyframe that has truth and an embedding: it and the keyframes before
-    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each. Where no keyframe
-    has an embedding detections do.
+    it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each, by one camera.
+    Where no keyframe has an embedding detections do.
 
     None from one before which there are too few within 4 · ``views`` keyframes of its run.
     """
@@ -128,7 +130,7 @@ def make_view_questions(
     recent: deque[tuple[int, Accepted, list[int]]] = deque(maxlen=views)
     bare = _are_bare(keyframes)
     for number, keyframe in enumerate(keyframes):
-        if recent and recent[-1][1].envelope.run_id != keyframe.envelope.run_id:
+        if recent and _taken_by(recent[-1][1]) != _taken_by(keyframe):
             recent.clear()
         drawn = _draw(keyframe, VIEW_CROPS, seed, bare)
         if not drawn or _key(keyframe) not in truth.keyframes:
@@ -157,6 +159,11 @@ def check_truth(keyframes: Iterable[Accepted], truth: Truth) -> None:
         f"no truth for any query keyframe of {', '.join(sorted(runs)) or 'any run'}; give the"
         " runs' truth files with --truth"
     )
+
+
+def _taken_by(keyframe: Accepted) -> tuple[str, StatedCamera | None]:
+    """The run, and the camera as its envelope states it."""
+    return keyframe.envelope.run_id, keyframe.envelope.camera
 
 
 def _key(keyframe: Accepted) -> Key:
@@ -190,10 +197,11 @@ def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> 
         crops = tuple(_crop(keyframe, index) for index in indices)
         views.append(QuestionView(*_moved(_pose(before), _pose(keyframe)), crops))
         before = keyframe
-    key = _key(before)
+    key, stated = _key(before), before.envelope.camera
+    camera = None if stated is None else camera_of(stated, CameraSettings())
     return ScoredQuestion(
         key,
-        relocalize.Question(tuple(views)),
+        relocalize.Question(tuple(views), camera),
         *_pose(before),
         truth.room(key),
         tuple(truth.instance(_key(k), index) for k, indices in drawn for index in indices),

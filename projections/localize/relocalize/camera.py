@@ -20,11 +20,12 @@ estimated, but then it is larger, too, and looks the same from that spot.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope.model import StatedCamera
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraConstants
 
@@ -40,14 +41,44 @@ _FARTHEST_PX = 1e6
 """The limit of coordinates, which keeps squares in the geometry finite."""
 
 
-def focal_px(camera: CameraConstants) -> float:
-    """The focal length in pixels."""
-    return camera.width_px / 2.0 / math.tan(half_field_rad(camera))
+CameraValues: TypeAlias = tuple[float, float, float, float]
+"""Horizontal field of view in degrees, width and height in pixels, and the angle at which the
+camera is mounted, radians to the left."""
+
+
+def camera_values(camera: CameraConstants | StatedCamera) -> CameraValues:
+    """The values of a camera of the settings or of an envelope."""
+    return camera.hfov_deg, camera.width_px, camera.height_px, camera.yaw_rad
 
 
 def half_field_rad(camera: CameraConstants) -> float:
     """Half the horizontal field of view."""
     return math.radians(camera.hfov_deg) / 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cameras:
+    """The cameras that n boxes come from: arrays (n,), or (1,) where one took all pictures."""
+
+    width_px: Floats
+    height_px: Floats
+    focal_px: Floats
+    yaw_rad: Floats
+
+    @classmethod
+    def of(cls, cameras: Sequence[CameraValues]) -> "Cameras":
+        """The cameras of boxes, one for each of them."""
+        one = all(each == cameras[0] for each in cameras)
+        values = np.array(cameras[:1] if one else cameras, np.float64).reshape(-1, 4)
+        hfov_deg, width, height, yaw = values.T
+        return cls(width, height, width / 2.0 / np.tan(np.radians(hfov_deg) / 2.0), yaw)
+
+    def take(self, index: NDArray[np.intp]) -> "Cameras":
+        """The cameras of the boxes at ``index``."""
+        if len(self.width_px) == 1:
+            return self
+        each = self.width_px, self.height_px, self.focal_px, self.yaw_rad
+        return Cameras(*(values.take(index) for values in each))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,16 +106,16 @@ def box_rows(boxes: Sequence[_Box | None]) -> Floats:
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
-def views(camera: CameraConstants, rows: Floats) -> Views:
+def views(cameras: Cameras, rows: Floats) -> Views:
     """The slopes and heights of boxes of `box_rows`."""
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -_FARTHEST_PX), _FARTHEST_PX)
     known = (x1 > x0) & (y1 > y0)
-    slope = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / focal_px(camera)
+    slope = (cameras.width_px / 2.0 - (x0 + x1) / 2.0) / cameras.focal_px
     return Views(
         slope=np.where(known, slope, 0.0),
         height_px=np.where(known, np.maximum(y1 - y0, _MIN_HEIGHT_PX), _UNKNOWN_HEIGHT_PX),
-        cut_x=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
-        cut_y=(y0 <= _EDGE_PX) | (y1 >= camera.height_px - _EDGE_PX),
+        cut_x=(x0 <= _EDGE_PX) | (x1 >= cameras.width_px - _EDGE_PX),
+        cut_y=(y0 <= _EDGE_PX) | (y1 >= cameras.height_px - _EDGE_PX),
         known=known,
     )
 
@@ -127,22 +158,22 @@ class SightLines:
         )
 
 
-def sights(camera: CameraConstants, rows: Floats) -> SightLines:
+def sights(cameras: Cameras, rows: Floats) -> SightLines:
     """The lines of sight of boxes of `box_rows`; parts farther outside the picture than the picture
     is large are cut off."""
-    most = np.array((camera.width_px, camera.height_px) * 2)[:, None]
+    most = np.stack((cameras.width_px, cameras.height_px) * 2)
     x0, y0, x1, y1 = np.minimum(np.maximum(rows.T, -most), 2.0 * most)
     known = (x1 > x0) & (y1 > y0)
-    tangent = (camera.width_px / 2.0 - (x0 + x1) / 2.0) / focal_px(camera)
-    per_px = 1.0 / (focal_px(camera) * np.sqrt(1.0 + tangent * tangent))
-    rise = (camera.height_px / 2.0 - np.stack((y0, y1))) * per_px
-    inside = np.stack((y0 > _EDGE_PX, y1 < camera.height_px - _EDGE_PX))
+    tangent = (cameras.width_px / 2.0 - (x0 + x1) / 2.0) / cameras.focal_px
+    per_px = 1.0 / (cameras.focal_px * np.sqrt(1.0 + tangent * tangent))
+    rise = (cameras.height_px / 2.0 - np.stack((y0, y1))) * per_px
+    inside = np.stack((y0 > _EDGE_PX, y1 < cameras.height_px - _EDGE_PX))
     return SightLines(
-        bearing=np.where(known, np.arctan(tangent) + camera.yaw_rad, 0.0),
+        bearing=np.where(known, np.arctan(tangent) + cameras.yaw_rad, 0.0),
         log_height=np.log(np.maximum(y1 - y0, _MIN_HEIGHT_PX) * per_px),
         rise=rise,
         whole=inside & known & (np.abs(rise) < _STEEPEST),
-        cut=(x0 <= _EDGE_PX) | (x1 >= camera.width_px - _EDGE_PX),
+        cut=(x0 <= _EDGE_PX) | (x1 >= cameras.width_px - _EDGE_PX),
         known=known,
     )
 

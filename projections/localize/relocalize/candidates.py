@@ -26,6 +26,7 @@ from projections.fold.map_errors import QuestionError
 from projections.map.records import EstimatedPosition
 from projections.map.view import MapView
 
+from .camera import CameraValues, camera_values
 from .constants import FOLLOWERS, Cosines, MapConstants, Sample
 from .ground import WallMap
 from .question import Box, QuestionCrop, Vector, describe_value
@@ -65,6 +66,7 @@ class Match(NamedTuple):
     ``object_place`` is where its Object is located and ``keyframe_place`` where the robot was:
     ordinals of Places, None for noise. ``class_name`` is the Object's if there is one.
     ``object_estimate`` is the estimated position of the Object, None under the default fusion.
+    ``camera`` is that of the keyframe, None where its envelope does not state one.
 
     A tuple, because a question makes hundreds, each of which would take 4 µs as a frozen dataclass.
     """
@@ -80,6 +82,7 @@ class Match(NamedTuple):
     object_place: PlaceOrdinal | None = None
     keyframe_place: PlaceOrdinal | None = None
     object_estimate: ObjectEstimate | None = None
+    camera: CameraValues | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +253,7 @@ class ExactIndex:
         observation = self._view.observations[ordinal]
         keyframe = self._view.keyframes[observation.keyframe]
         found = None if observation.object is None else self._view.objects[observation.object]
-        pose = keyframe.pose
+        pose, camera = keyframe.pose, keyframe.camera
         return Match(
             ordinal,
             observation.det_id,
@@ -263,6 +266,7 @@ class ExactIndex:
             None if found is None else found.place,
             keyframe.place,
             None if found is None else _in_metres(found.estimate),
+            None if camera is None else camera_values(camera),
         )
 
 

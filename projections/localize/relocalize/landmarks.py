@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 from projections.fold.settings import CameraConstants
 
 from .appearance import DIRECTIONS, appearance_tables, relative, subtract_shifts
-from .camera import Cue, Floats, SightLines, box_rows, cues, sights, views, with_class_sizes
+from .camera import (
+    Cameras,
+    Cue,
+    Floats,
+    SightLines,
+    box_rows,
+    camera_values,
+    cues,
+    sights,
+    views,
+    with_class_sizes,
+)
 from .candidates import Match, ObjectEstimate
 from .constants import MapConstants, RankingModel
 from .question import QuestionCrop
@@ -153,7 +164,7 @@ def crop_groups(
     """
     seen = [each for view in views_seen for each in view]
     view_of = [number for number, view in enumerate(views_seen) for _ in view]
-    boxes = sights(camera, box_rows([each.crop.bbox for each in seen]))
+    boxes = sights(Cameras.of([camera_values(camera)]), box_rows([each.crop.bbox for each in seen]))
     known = boxes.known.tolist()
     order = sorted(range(len(seen)), key=lambda crop: (view_of[crop], not known[crop]))
     seen, boxes = [seen[crop] for crop in order], boxes.take(np.array(order))
@@ -189,15 +200,17 @@ def _landmarks(
     begins = np.cumsum([0, *(len(each.matches) for each in seen[:-1])])
     poses = np.array([match.pose for match in matches], dtype=np.float64)
     rows = box_rows([match.bbox for match in matches])
+    otherwise = camera_values(constants.camera)
+    cameras = Cameras.of([match.camera or otherwise for match in matches])
     likeness = np.concatenate([each.likeness for each in seen])
-    of_crops = _things(seen, begins, poses, rows, likeness, constants)
+    of_crops = _things(seen, begins, poses, rows, cameras, likeness, constants)
     things = [thing for of_crop in of_crops for thing in of_crop]
     first = np.cumsum([0, *(len(of_crop) for of_crop in of_crops)])
     members = np.concatenate([thing.members for thing in things])
     counts = np.array([len(thing.members) for thing in things])
     starts = np.cumsum(counts) - counts
     owner = np.arange(len(things)).repeat(counts)
-    boxes = sights(constants.camera, rows.take(members, axis=0))
+    boxes = sights(cameras.take(members), rows.take(members, axis=0))
     poses, likeness = poses.take(members, axis=0), likeness.take(members)
     raw = np.concatenate([each.raw for each in seen]).take(members)
     xy = np.array([(thing.x, thing.y) for thing in things])
@@ -226,6 +239,7 @@ def _things(
     begins: Indices,
     poses: Floats,
     boxes: Floats,
+    cameras: Cameras,
     likeness: Floats,
     constants: MapConstants,
 ) -> list[list[_Thing]]:
@@ -249,7 +263,7 @@ def _things(
         )
         others.append(rest)
     if any(others):
-        _add_triangulated(found, seen, others, poses, boxes, likeness, constants)
+        _add_triangulated(found, seen, others, poses, boxes, cameras, likeness, constants)
     for of_crop, each in zip(found, seen, strict=True):
         best = [float(likeness[thing.members].max()) for thing in of_crop]
         order = sorted(range(len(best)), key=lambda i: (-best[i], int(of_crop[i].members[0])))
@@ -267,6 +281,7 @@ def _add_triangulated(
     others: Sequence[list[int]],
     poses: Floats,
     boxes: Floats,
+    cameras: Cameras,
     likeness: Floats,
     constants: MapConstants,
 ) -> None:
@@ -284,9 +299,9 @@ def _add_triangulated(
         weights.append(np.minimum(np.maximum((alike - least) / _FULL_WEIGHT, 0.1), 1.0))
     index = np.concatenate(indices)
     sizes = np.array([len(each) for each in indices])
-    turned = poses.take(index, axis=0)
-    turned[:, 2] += constants.camera.yaw_rad
-    looked = views(constants.camera, boxes.take(index, axis=0))
+    turned, cameras = poses.take(index, axis=0), cameras.take(index)
+    turned[:, 2] += cameras.yaw_rad
+    looked = views(cameras, boxes.take(index, axis=0))
     rows: list[list[Triangulated]] = triangulate(
         turned,
         looked,

@@ -11,6 +11,7 @@ sum wins; the pose is its centroid.
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal
@@ -143,7 +144,8 @@ def rank(
     model: RankingModel = MODEL,
 ) -> Answer:
     """The answer to a question, or to the crops of one picture; ``candidates.matches`` run parallel
-    to the crops. The camera is that of the question, else ``camera``, else that of the map."""
+    to the crops. The camera is that of the question, else ``camera``, else the one that took most
+    of the observations found."""
     asked = question if isinstance(question, Question) else Question.of(question)
     if candidates.by_class:
         asked = asked.by_class()
@@ -155,10 +157,22 @@ def rank(
         return replace(_rank_plain(candidates, crops, top), known=known, thin=thin)
     floors = Layout.of(candidates)
     candidates = floors.laid_out(candidates)
-    camera = asked.camera or camera or candidates.constants.camera
+    camera = asked.camera or camera or _camera_of_most(candidates)
     scene = Scene(candidates.constants, camera, model, floors.walls(candidates.walls))
     posterior = locate(views, candidates.matches, scene)
     return replace(_answer(candidates, crops, posterior, top, floors), known=known, thin=thin)
+
+
+def _camera_of_most(candidates: MapCandidates) -> CameraConstants:
+    """The camera of most matches; of several with as many, that of the earliest match."""
+    counts = Counter(match.camera for row in candidates.matches for match in row)
+    most = max(counts, key=counts.__getitem__, default=None)
+    if most is None:
+        return candidates.constants.camera
+    hfov_deg, width_px, height_px, yaw_rad = most
+    return CameraConstants(
+        hfov_deg=hfov_deg, width_px=width_px, height_px=height_px, yaw_rad=yaw_rad
+    )
 
 
 def _in_order(

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple, Self, TypeAlias
 from pydantic import ValidationError
 
 from eventsrc.base.text import advised
+from eventsrc.envelope.model import StatedCamera
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import ObservationOrdinal, PlaceOrdinal
 from projections.fold.map_errors import (
@@ -27,6 +28,7 @@ from projections.localize.relocalize import (
     ObjectEstimate,
     WallMap,
 )
+from projections.localize.relocalize.camera import camera_values
 from projections.localize.relocalize.constants import FOLLOWERS, SAMPLED, Cosines
 from projections.localize.relocalize.question import Box
 from projections.postgres.labels import number_of
@@ -158,7 +160,7 @@ def assemble(crops: int, near: Rows, linked: Linked, known: KnownConstants) -> M
     ordered = sorted(near, key=lambda row: (row[0], -row[1], row[2]))
     matches: list[list[Match]] = [[] for _ in range(crops)]
     ordinals = {place: ordinal for place, (ordinal, _) in linked.places.items()}
-    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, _ in ordered:
+    for crop, similarity, det_pk, det_id, run_id, class_name, bbox, x, y, yaw, camera, _ in ordered:
         thing_id, its, there = linked.ids.get(det_pk, _NO_EDGES)
         thing = linked.things.get(thing_id)
         matches[crop].append(
@@ -174,18 +176,20 @@ def assemble(crops: int, near: Rows, linked: Linked, known: KnownConstants) -> M
                 ordinals.get(its),
                 ordinals.get(there),
                 None if thing is None else thing.estimate,
+                None if camera is None else tuple(camera),
             )
         )
     rows = tuple(map(tuple, matches))
     return MapCandidates(rows, dict(linked.places.values()), known.constants, known.walls)
 
 
-def bare_row(det_pk: int, observation: str, pose: str) -> tuple[Any, ...]:
+def bare_row(det_pk: int, observation: str, pose: str, keyframe: str) -> tuple[Any, ...]:
     """The columns of the statement ``described`` from ``similarity`` on, made of the properties of
-    an observation's node and of its keyframe's Pose."""
-    seen, at = json.loads(observation), json.loads(pose)
+    an observation's node and of its keyframe's Pose and Keyframe."""
+    seen, at, camera = json.loads(observation), json.loads(pose), json.loads(keyframe).get("camera")
+    stated = None if camera is None else camera_values(StatedCamera(**camera))
     named = (seen["det_id"], seen["run_id"], seen["class_name"], f"{{{str(seen['bbox'])[1:-1]}}}")
-    return 1.0, det_pk, *named, at["map_x"], at["map_y"], at["map_yaw"], None
+    return 1.0, det_pk, *named, at["map_x"], at["map_y"], at["map_yaw"], stated, None
 
 
 def _box(array: str) -> Box:

@@ -68,7 +68,7 @@ from .candidate_rows import (
 )
 from .graph_reads import map_errors
 
-_NEAR: Final = 12
+_NEAR: Final = 13
 """Number of columns of the statement ``near``."""
 
 
@@ -273,10 +273,16 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
 
 @contextlib.contextmanager
 def _query_errors(url: str) -> Iterator[None]:
-    """As `map_errors`, and raises QuestionError for a question that does not fit the map."""
+    """As `map_errors`, and raises QuestionError for a question that does not fit the map,
+    ProjectionMismatch for a map of an older version."""
     with map_errors(url):
         try:
             yield
+        except psycopg.errors.UndefinedColumn as error:
+            raise ProjectionMismatch(
+                f"{describe_target(url)}: an older mapfold made the map there"
+                f" ({error.diag.message_primary}); run `{advised('replay')}`, which makes it again"
+            ) from None
         except psycopg.errors.DataException as error:
             raise QuestionError(
                 f"the question does not fit the map: {error.diag.message_primary}; ask with the"

@@ -74,7 +74,7 @@ CASE WHEN row_number() OVER () = 1 THEN ARRAY(SELECT place FROM in_place)::text:
 
 -- name: observed
 near.det_pk, near.det_id, near.run_id, near.class_name, near.bbox::text AS bbox, near.map_x, near.map_y,
-near.map_yaw, near.embedding_model
+near.map_yaw, near.camera, near.embedding_model
 
 -- name: followed
 -- From `found.det_pk` along the graph: to Objects and on to their Places, and to keyframes and on to theirs.
@@ -100,7 +100,7 @@ observes AS MATERIALIZED (
 WITH question (crop, wanted) AS ({questions})
 SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}
 FROM question LEFT JOIN LATERAL (
-    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, camera, embedding_model,
            embedding <=> question.wanted AS distance
     FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
 ) AS near ON true
@@ -112,11 +112,13 @@ FROM (SELECT 1) AS one
 LEFT JOIN public.detection_embeddings AS near ON near.det_pk = ANY(%(det_pks)s::bigint[])
 
 -- name: bare
--- These observations and the poses of their keyframes, from the graph's database: of those that have no
--- embedding the vectors' has no row. A Pose has the number of its keyframe.
-SELECT seen.id::text::bigint & 281474976710655, concat(seen.properties), concat(pose.properties)
+-- These observations, the poses of their keyframes, and these, from the graph's database: of those that
+-- have no embedding the vectors' has no row. A Pose has the number of its keyframe.
+SELECT seen.id::text::bigint & 281474976710655, concat(seen.properties), concat(pose.properties),
+       concat(keyframe.properties)
 FROM {observation} AS seen
 JOIN {has_observation} AS has ON has.end_id = seen.id
+JOIN {keyframe} AS keyframe ON keyframe.id = has.start_id
 JOIN {pose} AS pose ON pose.id = ag_catalog._graphid(%(pose)s, has.start_id::text::bigint & 281474976710655)
 WHERE seen.id = ANY(ARRAY(SELECT ag_catalog._graphid(%(observation)s, det_pk)
                           FROM unnest(%(det_pks)s::bigint[]) AS given (det_pk)))
@@ -133,13 +135,13 @@ SELECT {of_graph}
 WITH question (crop, wanted) AS ({questions}), found AS MATERIALIZED (
     SELECT question.crop, 1 - near.distance AS similarity, {observed}
     FROM question LEFT JOIN LATERAL (
-        SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, embedding_model,
+        SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, camera, embedding_model,
                embedding <=> question.wanted AS distance
         FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
     ) AS near ON true
 ), {followed}
 SELECT {of_vectors}, crop, similarity, det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw,
-       embedding_model, {of_graph}
+       camera, embedding_model, {of_graph}
 FROM found
 
 -- name: of_classes

@@ -13,6 +13,8 @@ CREATE TABLE {schema}.detection_embeddings (
     map_x           double precision,              -- metres; NULL when the robot had no pose
     map_y           double precision,
     map_yaw         double precision,              -- radians
+    camera          double precision[],            -- field of view in degrees, width and height in pixels,
+                                                   -- mounting in radians; NULL where none is stated
     embedding_model text,
     embedding       {vector}({dimension}) NOT NULL,  -- unit length
     ingested_at     timestamptz NOT NULL           -- when the event was logged
@@ -57,17 +59,19 @@ ALTER TABLE mapfold.detection_embeddings SET SCHEMA public
 -- name: insert
 INSERT INTO {schema}.detection_embeddings
     (det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
-     embedding_model, embedding, ingested_at)
+     camera, embedding_model, embedding, ingested_at)
 SELECT det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox::real[], map_x, map_y,
-       map_yaw, embedding_model, embedding::{vector}, ingested_at
+       map_yaw, camera::float8[], embedding_model, embedding::{vector}, ingested_at
 FROM unnest(%s::bigint[], %s::text[], %s::text[], %s::bigint[], %s::text[], %s::float8[], %s::text[],
-            %s::float8[], %s::float8[], %s::float8[], %s::text[], %s::text[], %s::timestamptz[])
+            %s::float8[], %s::float8[], %s::float8[], %s::text[], %s::text[], %s::text[], %s::timestamptz[])
     AS r(det_pk, run_id, det_id, keyframe_id, class_name, confidence, bbox, map_x, map_y, map_yaw,
-         embedding_model, embedding, ingested_at)
+         camera, embedding_model, embedding, ingested_at)
 
 -- name: state
--- NULL when there is no such table, else its comment and the declared dimension.
-SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod
+-- NULL when there is no such table, else its comment, the declared dimension, and whether it has the
+-- column of cameras: that of an older version has none.
+SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod, EXISTS (
+    SELECT 1 FROM pg_attribute WHERE attrelid = c.oid AND attname = 'camera' AND NOT attisdropped)
 FROM pg_class c LEFT JOIN pg_attribute a ON a.attrelid = c.oid AND a.attname = 'embedding'
 WHERE c.oid = to_regclass(%(table)s)
 

@@ -186,7 +186,7 @@ def _refuse_alone(method: Method, camera: CameraOptions) -> None:
     if unread:
         raise MisuseError(
             f"{' and '.join(unread)}: --self alone asks by the method joint, which it compares with"
-            " the plain one, and with the camera of the map's settings; leave it out, or ask from"
+            " the plain one, and with the camera of each picture; leave it out, or ask from"
             " --query too"
         )
 

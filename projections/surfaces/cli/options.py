@@ -186,7 +186,7 @@ _HfovOption = Annotated[
         "--hfov",
         metavar="DEGREES",
         help="Horizontal field of view of the robot's camera [default: that of the map's"
-        " settings].",
+        " pictures].",
         show_default=False,
     ),
 ]
@@ -195,7 +195,7 @@ _ImageOption = Annotated[
     typer.Option(
         "--image",
         metavar="WxH",
-        help="Size of the camera's pictures in pixels [default: that of the map's settings].",
+        help="Size of the camera's pictures in pixels [default: that of the map's pictures].",
         show_default=False,
     ),
 ]
