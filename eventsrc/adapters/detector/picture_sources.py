@@ -20,12 +20,13 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from eventsrc.base.errors import MisuseError
+from eventsrc.base.errors import MisuseError, TransportError
 from eventsrc.base.machine import Clock, system_clock
 from eventsrc.base.text import visible
 from eventsrc.base.user_files import FileFault, open_file
@@ -261,7 +262,7 @@ class LivePictures:
         queue: int = QUEUE,
         clock: Clock = system_clock,
     ) -> None:
-        self._stop, self._clock = stop, clock
+        self._session, self._stop, self._clock = session, stop, clock
         self.queue = NewestQueue(queue)
         self.poses: LivePoses | None = None
         if pose_key is not None:
@@ -271,12 +272,14 @@ class LivePictures:
                 pose_key,
                 lambda message: poses.put(message.payload, self._now_s()),
                 SizeLimit(_MAX_POSE_BYTES, lambda: poses.refuse(too_large)),
+                in_order=True,
             )
         if image_key is not None:
             session.subscribe(
                 image_key,
                 lambda message: self.queue.put(message, self._now_s()),
                 SizeLimit(MAX_PICTURE_BYTES, self.queue.refuse),
+                in_order=True,  # behind its pose
             )
         session.confirm()
 
@@ -293,6 +296,8 @@ class LivePictures:
                 yield picture_of(message.payload, name, received_s)
             except MessageError as error:
                 yield Picture(name, received_s, _decoder(PictureError(str(error))))
+        with suppress(TransportError):
+            self._session.confirm()  # what the router has by now is here, and counted
         self.queue.close()
 
     def _now_s(self) -> float:

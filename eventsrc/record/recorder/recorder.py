@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Final
 
 from eventsrc.base.errors import TransportError
@@ -86,7 +87,9 @@ class Recorder:
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             )
         ]
-        self._subscriptions += [session.subscribe(key, self._receive_crop) for key in crops]
+        self._subscriptions += [
+            session.subscribe_batches(key, self._receive_crops) for key in crops
+        ]
         if edits is not None:
             key = edit_key(writer.log_id)
             self._subscriptions.append(session.queryable(key, self._receive_edit))
@@ -120,7 +123,7 @@ class Recorder:
         every_s: float = 1.0,
         watch: Callable[[RecorderReport], None] | None = None,
     ) -> RecorderReport:
-        """Record until ``stop`` is set, then drain the queue and sync.
+        """Record until ``stop`` is set, then what the router has by then, and sync.
 
         ``watch`` is called in this thread about every ``every_s`` seconds. ``stop`` is also set
         when ``max_events`` is reached or the log cannot be written; the latter raises LogError, and
@@ -150,6 +153,9 @@ class Recorder:
                 watch(self.report())
 
     def _drain(self, writing: "Future[None]") -> None:
+        if not writing.done():
+            with suppress(TransportError):
+                self._session.confirm()  # its reply comes behind what the router sends us
         for subscription in self._subscriptions:
             subscription.close()
         self._queue.close()
@@ -164,8 +170,8 @@ class Recorder:
     def _receive_bridged(self, message: Received) -> None:
         self._queue.put(BridgedMessage(message.key, message.payload, message.number))
 
-    def _receive_crop(self, message: Received) -> None:
-        self._queue.put(CropMessage(message.key, message.payload, message.number))
+    def _receive_crops(self, messages: Sequence[Received]) -> None:
+        self._queue.put_all([CropMessage(m.key, m.payload, m.number) for m in messages])
 
     def _receive_edit(self, query: Query) -> None:
         request = EditRequest(query)
