@@ -49,9 +49,16 @@ def opened(page: Page, url: str) -> Page:
     return page
 
 
+_TWO_FRAMES = """() => new Promise(done =>
+    requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done))))"""
+
+
 def answered(page: Page) -> None:
-    """Waits until every question of the page has its answer."""
+    """Waits until every question of the page has its answer. A part of the page asks, and draws on
+    a canvas of its own, in the frame after it is there."""
+    page.evaluate(_TWO_FRAMES)
     page.wait_for_selector("html[data-unanswered='0']", timeout=WAIT_MS)
+    page.evaluate(_TWO_FRAMES)
 
 
 def digest(page: Page) -> str:
@@ -61,17 +68,30 @@ def digest(page: Page) -> str:
     return shown.get_attribute("data-digest") or ""
 
 
+_DRAWN = "document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
+
+
 def pixels(page: Page, side: str = "main") -> str:
     """What a map's canvas shows, without what lies over it, when drawing has rested. The types of
     places are drawn when they come with the digest."""
     digest(page)
     answered(page)
-    drawn = "side => document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
     before = ""
-    while (now := str(page.evaluate(drawn, side))) != before:
+    while (now := str(page.evaluate(f"side => {_DRAWN}", side))) != before:
         before = now
-        page.wait_for_timeout(150)
+        page.evaluate(_TWO_FRAMES)
     return now
+
+
+def other_pixels(page: Page, before: str, side: str = "main") -> str:
+    """Those of the canvas when it shows something else than ``before``."""
+    page.wait_for_function(f"([side, before]) => {_DRAWN} !== before", arg=[side, before])
+    return pixels(page, side)
+
+
+def wait_for_pixels(page: Page, wanted: str) -> None:
+    """Waits until the canvas of the map shows them."""
+    page.wait_for_function(f"([side, wanted]) => {_DRAWN} === wanted", arg=["main", wanted])
 
 
 def point_over(page: Page, name: str) -> tuple[float, float]:

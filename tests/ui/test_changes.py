@@ -14,7 +14,7 @@ from eventsrc.log import LogReader
 from tests.support.commands import Commands
 from tests.support.logs import append_raw
 from tests.support.ui_page import UiServer, showing
-from tests.ui.browser import point_over
+from tests.ui.browser import digest, point_over
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
 
@@ -152,8 +152,11 @@ def test_the_view_is_taken_away_as_picture_state_and_command(
     assert {p["place_id"]: p["keyframes"] for p in saved["places"]} == places
     assert len(saved["objects"]) == wanted["counts"]["objects"]
     page.get_by_role("button", name="Take away").click()
+    digest(page)  # the command comes with it
     page.get_by_role("menuitem", name="Copy as command").click()
-    command = page.evaluate("() => navigator.clipboard.readText()")
+    clipboard = "navigator.clipboard.readText()"
+    page.wait_for_function(f"async () => (await {clipboard}).startsWith('mapfold ')")
+    command = page.evaluate(f"() => {clipboard}")
     program, *words = shlex.split(command)
     assert program == "mapfold"
     assert wanted["digest"] in mapfold(*words).out

@@ -12,6 +12,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import write_log
 from tests.support.ui_page import UiServer, showing
+from tests.ui.browser import answered
 from tests.ui.conftest import Visit
 
 BUSY = json.dumps({"error": {"kind": "too_much", "message": "too many questions are waiting"}})
@@ -119,12 +120,14 @@ def test_the_marks_of_a_found_event_come_back_with_its_panel(
 ) -> None:
     page = visit(sample, "#at=100&panel=find")
     marks = "() => document.querySelector('canvas.marks').toDataURL()"
+    answered(page)
     without = page.evaluate(marks)
     page.get_by_label("Condition over the map").fill("place_count() == 5")
     page.get_by_label("every turn").check()
     page.get_by_role("button", name="Find", exact=True).click()
     expect(page.locator(".steps > li").first).to_be_visible()
     page.wait_for_function(f"before => ({marks})() !== before", arg=without)
+    answered(page)
     found = page.evaluate(marks)
     page.get_by_role("tab", name="Why").click()
     page.wait_for_function(f"before => ({marks})() === before", arg=without)
@@ -225,8 +228,9 @@ def test_two_pages_correct_one_log(mapfold: Commands, visit: Visit, tmp_path: Pa
             page.locator(".corrections > li").first.get_by_role("button", name="Undo").click()
             page.get_by_role("button", name="Preview").click()
             page.get_by_label("Reason").fill("it is no kitchen")
-        for page in (one, other):
-            page.get_by_role("button", name="Record it").click()
+        with one.expect_response("**/api/edit"):
+            one.get_by_role("button", name="Record it").click()
+        other.get_by_role("button", name="Record it").click()
         expect(other.locator("form [role=alert]")).to_contain_text("undone")
         undone = [each["undone_by"] for each in server.api("corrections")["corrections"]]
         assert len(undone) == 3

