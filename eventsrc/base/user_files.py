@@ -65,7 +65,7 @@ def read_file(path: Path, max_bytes: int) -> bytes:
     except OSError as error:
         raise FileFault(error.strerror or str(error)) from None
     if len(content) > max_bytes:
-        raise FileFault(f"larger than {max_bytes:,} bytes; is this the right file?")
+        raise FileFault(f"larger than {max_bytes:,} bytes, too much for such a file")
     return content
 
 

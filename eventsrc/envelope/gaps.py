@@ -153,6 +153,14 @@ class GapLedger(Generic[Source]):
         else:
             self._fill(run, keyframe_id)
 
+    def has(self, run_id: Source, keyframe_id: int) -> bool:
+        """Whether a keyframe is recorded."""
+        run = self._runs.get(run_id)
+        if run is None or not run.first <= keyframe_id <= run.last:
+            return False
+        index = run.holes_before(keyframe_id) - 1
+        return index < 0 or keyframe_id > run.holes[index].last
+
     def expect(self, run_id: Source, last: int, now_ns: int) -> None:
         """Add a publisher's announcement, received at ``now_ns``, that it has sent keyframe
         ``last``."""

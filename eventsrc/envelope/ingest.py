@@ -80,11 +80,15 @@ class CheckedEnvelope(msgspec.Struct, frozen=True, gc=False):
     run_id: RunId
     keyframe_id: KeyframeId
     stamp_ns: int
+    numbered: bool | None = None
+    """Whether all classes are numbers; None without detections."""
 
     @classmethod
     def of(cls, envelope: Envelope) -> "CheckedEnvelope":
         """Run, keyframe and time of ``envelope``."""
-        return cls(envelope.run_id, envelope.keyframe_id, envelope.stamp_ns)
+        detections = envelope.detections
+        numbered = all(d.class_name.isdecimal() for d in detections) if detections else None
+        return cls(envelope.run_id, envelope.keyframe_id, envelope.stamp_ns, numbered)
 
 
 class _RejectionError(Exception):

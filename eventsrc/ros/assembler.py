@@ -1,24 +1,27 @@
 """Assemble envelopes from decoded ROS messages, given in the order in which they were received.
 
 Each message of a stream's detections becomes one envelope, a keyframe with the next number of its
-run. It waits for its pose, camera and embeddings, at most until a message was received ``wait_ns``
-after it or ``max_waiting`` others wait behind it; then it is made without those missing. Output has
-the order of the input. There is no clock and no chance: equal messages make equal envelopes.
+run. It waits for its pose, camera, embeddings and names of classes, at most until a message was
+received ``wait_ns`` after it or ``max_waiting`` others wait behind it; then it is made without
+those missing. Output has the order of the input. There is no clock and no chance: equal messages
+make equal envelopes.
 """
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 
+from .class_names import ClassNames
 from .messages import (
     CAMERA_INFO,
     DETECTIONS,
     FLOATS,
     TEXT,
+    UNCLASSIFIED,
     BadMessage,
     Detected,
     Lens,
@@ -177,6 +180,8 @@ class _StreamState:
         self.counts = Counts()
         self.poses = PoseSource(stream, buffer, self.counts)
         self._lens: Lens | None = None
+        self._names = ClassNames()
+        self._told: Mapping[str, str] = {}
         self._embeddings: dict[int, StampedEmbeddings] = {}
         self._next = stream.first_keyframe
 
@@ -188,6 +193,7 @@ class _StreamState:
             handlers |= dict.fromkeys((stream.tf, stream.tf_static), self.poses.add_transforms)
         handlers |= dict.fromkeys((stream.pose, stream.covariance), self.poses.add_pose)
         handlers |= {stream.camera: self._set_lens, stream.embeddings: self._keep_embeddings}
+        handlers |= dict.fromkeys(stream.classes, self._add_names)
         return {
             topic: self._counting(handler)
             for topic, handler in handlers.items()
@@ -209,8 +215,7 @@ class _StreamState:
         """The detections of a message, with the next keyframe id. Raises BadMessage."""
         if type_name != DETECTIONS:
             raise BadMessage(f"it is {type_name:.80}, not {DETECTIONS}")
-        labels = self.stream.labels
-        detected = read(lambda message: detections_of(message, labels), content)
+        detected = read(detections_of, content)
         self._next += 1
         return _Picture(received_ns, self, detected, self._next - 1)
 
@@ -226,6 +231,8 @@ class _StreamState:
                 return False
         stream = self.stream
         if stream.camera is not None and self._lens is None:
+            return False
+        if stream.classes and not self._told:
             return False
         return stream.embeddings is None or picture.detected.stamp_ns in self._embeddings
 
@@ -254,6 +261,7 @@ class _StreamState:
                 "height_px": self._lens.height_px,
                 "yaw_rad": 0.0 if pose is None else pose.camera_yaw,
             }
+        self._name_classes(detected)
         self._attach_embeddings(detected)
         document["detections"] = detected.detections
         payload = _encode(document)
@@ -271,6 +279,18 @@ class _StreamState:
         else:
             fields["pose_covariance"] = list(pose.covariance)
         return fields
+
+    def _name_classes(self, detected: Detected) -> None:
+        given, told = self.stream.labels, self._told
+        for detection in detected.detections:
+            class_id = detection["class"]
+            if class_id != UNCLASSIFIED:
+                detection["class"] = given.get(class_id) or told.get(class_id, class_id)
+            self.counts.numbered += detection["class"].isdecimal()
+
+    def _add_names(self, _topic: str, type_name: str, content: Any) -> None:
+        if self._names.add(type_name, content):
+            self._told = self._names.of(self.stream.detections).labels
 
     def _attach_embeddings(self, detected: Detected) -> None:
         given = self._embeddings.pop(detected.stamp_ns, None)

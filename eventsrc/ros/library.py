@@ -38,6 +38,9 @@ VISION_MSGS: Final[Mapping[str, str]] = {
     "vision_msgs/msg/LabelInfo": (
         f"{_HEADER}vision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
     ),
+    "vision_msgs/msg/VisionInfo": (
+        f"{_HEADER}string method\nstring database_location\nint32 database_version\n"
+    ),
 }
 """The definitions of vision_msgs 4, which ROS does not ship with its own messages. Those of version
 3 differ in the name of a nested type only: in CDR both are the same bytes."""

@@ -19,6 +19,8 @@ from .transforms import Transform, unit_transform
 
 DETECTIONS: Final = "vision_msgs/msg/Detection2DArray"
 LABELS: Final = "vision_msgs/msg/LabelInfo"
+VISION_INFO: Final = "vision_msgs/msg/VisionInfo"
+PARAMETERS: Final = "rcl_interfaces/msg/ParameterEvent"
 TF: Final = "tf2_msgs/msg/TFMessage"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -158,25 +160,19 @@ def lens_of(message: Any) -> Lens:
     return Lens(frame_name(message.header.frame_id), hfov, width, height)
 
 
-def detections_of(message: Any, labels: Mapping[str, str]) -> Detected:
+def detections_of(message: Any) -> Detected:
     """The detections of a Detection2DArray of vision_msgs 2, 3 or 4. Of several hypotheses the one
-    with the highest score counts, of equal ones the first. ``labels`` names classes by id."""
+    with the highest score counts, of equal ones the first; its class is the id as it is."""
     made: list[dict[str, Any]] = []
     ids: list[str] = []
     unclassified = 0
     for each in message.detections:
-        class_name, score = _best(each.results, labels)
+        class_name, score = _best(each.results)
         unclassified += class_name == UNCLASSIFIED
         made.append({"class": class_name, "confidence": score, "bbox": _box(each.bbox)})
         ids.append(str(getattr(each, "id", "")))
     header = message.header
     return Detected(stamp_of(header.stamp), frame_name(header.frame_id), made, ids, unclassified)
-
-
-def labels_of(message: Any) -> dict[str, str]:
-    """The names of a LabelInfo by class id, as detections write it."""
-    named = ((str(int(each.class_id)), str(each.class_name)) for each in message.class_map)
-    return {class_id: name for class_id, name in named if name}
 
 
 def embeddings_of_text(message: Any) -> StampedEmbeddings:
@@ -219,7 +215,7 @@ def embeddings_of_floats(message: Any) -> StampedEmbeddings:
     )
 
 
-def _best(results: Sequence[Any], labels: Mapping[str, str]) -> tuple[str, float]:
+def _best(results: Sequence[Any]) -> tuple[str, float]:
     """Class and score of the best hypothesis."""
     best, class_id = -math.inf, None
     for result in results:
@@ -232,7 +228,7 @@ def _best(results: Sequence[Any], labels: Mapping[str, str]) -> tuple[str, float
             )
     if not class_id:
         return UNCLASSIFIED, max(best, 0.0)
-    return labels.get(class_id, class_id), best
+    return class_id, best
 
 
 def _box(bbox: Any) -> list[float]:

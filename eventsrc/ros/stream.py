@@ -36,8 +36,9 @@ class Stream:
     ``pose`` is the topic of an Odometry or PoseWithCovarianceStamped, whose frame is then the
     map's; None for the transforms from ``map_frame`` down to ``base_frame`` and the camera.
     ``covariance`` is the topic whose latest covariance, of a pose in ``map_frame``, goes with poses
-    of transforms. ``embeddings`` and ``camera`` are topics, None without any. ``labels`` names
-    classes by id. ``heights`` says whether ``map_z`` is stated. ``wait_ns`` and ``max_waiting``
+    of transforms. ``embeddings`` and ``camera`` are topics, None without any. ``classes`` are the
+    topics of `eventsrc.ros.class_names`; ``labels`` names classes by id itself, and counts before
+    what they say. ``heights`` says whether ``map_z`` is stated. ``wait_ns`` and ``max_waiting``
     bound how long detections wait for the rest, ``max_gap_ns`` between which two samples a pose is
     interpolated.
     """
@@ -59,6 +60,7 @@ class Stream:
     wait_ns: int = DEFAULT_WAIT_NS
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
     max_waiting: int = MAX_WAITING
+    classes: tuple[str, ...] = ()
 
     @property
     def has_poses(self) -> bool:
@@ -85,6 +87,8 @@ class Counts:
     """Detections that have an embedding."""
     unclassified: int = 0
     """Detections without a hypothesis."""
+    numbered: int = 0
+    """Detections whose class is a number, which nothing names."""
     unused: dict[str, int] = field(default_factory=dict)
     """Number of messages, or transforms in them, that could not be used, by topic."""
     reasons: dict[str, str] = field(default_factory=dict)

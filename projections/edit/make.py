@@ -8,6 +8,7 @@ contradicts it, or when the map would not change.
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from pydantic import ValidationError
@@ -32,7 +33,7 @@ from eventsrc.envelope.commands import (
     UseSettings,
 )
 from eventsrc.envelope.model import DetId, KeyframeId, RunId, describe_error
-from projections.fold.corrections import Keyframe, RecordedCommand
+from projections.fold.corrections import Keyframe, RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
 from projections.map.naming import NoSuchThing
 
@@ -237,16 +238,61 @@ def labels_of(assignments: Sequence[str]) -> dict[str, str]:
     return labels
 
 
-def relabel(current: MapToEdit, stamp: Stamp, labels: Mapping[str, str]) -> Relabel:
-    """The command that names the classes of recorded labels."""
+def relabel(
+    current: MapToEdit,
+    stamp: Stamp,
+    given: Mapping[str, str],
+    listed: Mapping[str, str] = MappingProxyType({}),
+) -> Relabel:
+    """The command that names the classes of recorded labels. The log must have each label that is
+    ``given``, and one of those that are ``listed``, as all that a detector knows: the others name
+    what is recorded later."""
+    labels = {**listed, **given}
     named = current.corrections.labels
     if all(named.get(label, label) == name for label, name in labels.items()):
         raise EditRefused("these labels have these names already")
-    classes = {each.class_name for each in current.view.observations}
-    if not any(named.get(label, label) in classes for label in labels):
-        there = [label for label in named if named[label] in classes]
-        raise NoSuchThing("label", next(iter(labels)), dict.fromkeys([*sorted(classes), *there]))
+    recorded = _recorded_labels(current)
+    for label in given:
+        if label not in recorded:
+            raise _no_label(current, label, labels[label], recorded)
+    found = [label for label in recorded if label in labels]
+    if not found:
+        label, name = next(iter(labels.items()))
+        raise _no_label(current, label, name, recorded)
+    later = sum(label not in recorded for label in listed)
+    if later:
+        of = f"{len(labels):,} labels, {', '.join(found[:_MOST_LABELS])}"
+        more = len(found) - _MOST_LABELS
+        rest = f" and {more:,} more" if more > 0 else ""
+        current.note(
+            visible(f"the log has {len(found):,} of {of}{rest}; the others name what comes later")
+        )
     return build(Relabel, stamp, labels=tuple(labels.items()))
+
+
+_MOST_LABELS = 10
+
+
+def _recorded_labels(current: MapToEdit) -> dict[str, None]:
+    """The classes as the log has them, whatever they are called now."""
+    view = current.view
+    if current.corrections.labels:
+        others = [c for c in current.commands if not isinstance(c.command, Relabel)]
+        view = current.fold(compile_corrections(others), current.settings)
+    return dict.fromkeys(sorted({each.class_name for each in view.observations}))
+
+
+def _no_label(
+    current: MapToEdit, label: str, name: str, recorded: Mapping[str, None]
+) -> MisuseError:
+    """The error for a label that the log does not have, also if it is the name of one."""
+    named = current.corrections.labels
+    of = next((each for each in recorded if named.get(each) == label), None)
+    if of is None:
+        return NoSuchThing("label", label, recorded)
+    return EditRefused(
+        f"{label!r} is no label, but the name of {of!r}; `{of}={name}` gives that another name"
+    )
 
 
 def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> UseSettings:

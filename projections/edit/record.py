@@ -24,6 +24,7 @@ from eventsrc.envelope.commands import (
     Join,
     KeepApart,
     NamePlace,
+    Relabel,
     SameObject,
     UndoMerge,
     encode_command,
@@ -48,12 +49,14 @@ from .make import Stamp
 
 class Outcome(NamedTuple):
     """``effect`` is None if it cannot be computed, ``unknown`` is then the reason; ``void`` are the
-    commands that have no effect any more, with reasons."""
+    commands that have no effect any more, with reasons; ``rooms`` tells which places
+    became another type of room by names of classes."""
 
     change: Change
     effect: Effect | None
     unknown: str = ""
     void: tuple[tuple[RecordedCommand, str], ...] = ()
+    rooms: tuple[str, ...] = ()
 
 
 def outcome_of(current: MapToEdit, command: Command, *, recorded: bool) -> Outcome:
@@ -71,7 +74,26 @@ def outcome_of(current: MapToEdit, command: Command, *, recorded: bool) -> Outco
     if recorded:
         return Outcome(change, effect)
     _check_does(change, command, effect)
-    return Outcome(change, effect, void=tuple(_void(change)))
+    rooms = tuple(_other_rooms(change)) if isinstance(command, Relabel) else ()
+    return Outcome(change, effect, void=tuple(_void(change)), rooms=rooms)
+
+
+def _other_rooms(change: Change) -> Iterator[str]:
+    """A line for each place that is another type of room after the change than before."""
+    before, after = (
+        {
+            place.place_id: (view.type_of(number), place.name)
+            for number, place in view.places.items()
+        }
+        for view in (change.current.view, change.after)
+    )
+    for place_id, (found, name) in after.items():
+        was, _ = before.get(place_id, (None, None))
+        types = [None if each is None else each.type for each in (was, found)]
+        if types[0] != types[1]:
+            called = place_id if name is None else f"{place_id} ({name})"
+            then, now = (each or "of no certain type" for each in types)
+            yield visible(f"{called} was {then}, is {now} now, by the names of what is in it")
 
 
 def _is_the_cause(change: Change) -> bool:

@@ -336,8 +336,32 @@ def test_numbered_classes_get_the_names_of_a_label_info(mapfold: Commands, topic
     (made,) = envelopes(mapfold.folder / "other")
     assert [each["class"] for each in made["detections"]] == ["person", "stool", "bicycle"]
     said = mapfold("import", "log", "drive", "--labels", "names.json").err
-    assert "nothing is new: the first recording of a keyframe counts; " in said
+    assert "nothing is new: the first recording of a keyframe counts, so only other" in said
     assert "`mapfold edit log relabel --labels FILE` names its classes" in said
+
+
+def test_numbered_classes_get_the_names_of_a_parameter(mapfold: Commands) -> None:
+    seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "2", "7")]
+    shown = ("/detections", START, ros.detections(START, "camera", *seen))
+    names = ["person", "bicycle", "chair"]
+    others = [ros.parameter_event(f"/node{n}", {"rate": n, "frame": "map"}) for n in range(20)]
+    others.append(ros.parameter_event("/yolo", {"weights_info": names}))
+    events = [("/parameter_events", START + n, each) for n, each in enumerate(others)]
+    info = ("/vision_info", START + 99, ros.vision_info(START, "/yolo/weights_info"))
+    write_bag(mapfold.folder / "drive", [shown, *events, info], "sqlite")
+    said = mapfold("import", "log", "drive").err
+    assert "rcl_interfaces/msg/ParameterEvent: names of classes by weights_info of /yolo" in said
+    assert "3 detections, 0 with an embedding; 1 with a number as the class" in said
+    (made,) = envelopes(mapfold.folder / "log")
+    assert [each["class"] for each in made["detections"]] == ["person", "chair", "7"]
+    write_bag(mapfold.folder / "other", [shown, info])
+    said = mapfold("import", "of-file", "other").err
+    assert "note: /detections: no parameter '/yolo/weights_info', which a VisionInfo nam" in said
+    mapfold("import", "none", "drive", "--classes", "none")
+    (made,) = envelopes(mapfold.folder / "none")
+    assert [each["class"] for each in made["detections"]] == ["0", "2", "7"]
+    wrong = mapfold("import", "no", "drive", "--classes", "/detections", code=2).err
+    assert "--classes /detections: it is of type vision_msgs/msg/Detection2DArray, not" in wrong
 
 
 def test_a_label_info_that_cannot_be_read_names_nothing(mapfold: Commands) -> None:

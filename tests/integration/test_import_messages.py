@@ -75,7 +75,7 @@ def test_ctrl_c_prints_what_is_kept_and_its_last_place(mapfold: Commands) -> Non
     kept, ended = said.decode().splitlines()
     assert kept == (
         "L: kept 4 events, offsets 0 to 3, up to line 5 of standard input; "
-        "import only what comes after that, or the log holds the rest twice"
+        "import it again to go on: what is in the log is passed over"
     )
     assert ended == "mapfold: interrupted"
     assert len(read_log(mapfold.folder / "L")) == 4

@@ -83,17 +83,19 @@ def test_a_bag_among_lines_and_a_file_of_a_bag_make_a_full_log(run: Commands) ->
     assert said_by(run.folder / "file") == FULL
 
 
+def told(said: str) -> list[str]:
+    """The words of the `edit` that a text names."""
+    return ["edit", *said.partition("`mapfold edit ")[2].partition("`")[0].split()]
+
+
 def test_the_advised_command_changes_a_classic_log(run: Commands) -> None:
-    said = run("import", "log", "run.jsonl").err
-    told = said[said.index("`mapfold ") + 1 : said.rindex("`")].split()[1:]
-    run(*told)
+    run(*told(run("import", "log", "run.jsonl").err))
     assert run("state", "log", "--json").json["settings"]["fusion"] == "evidence"
     write_log(run.folder / "old", [envelope(1)])
     said = run("import", "old", "bag").err
     assert "old: a log of --preset classic; with --preset full places are rooms" in said
     assert said_by(run.folder / "old") is None
-    told = said[said.index("`mapfold ") + 1 : said.rindex("`")].split()[1:]
-    assert told == ["edit", "old", "use-settings", "--preset", "full", "--reason", "WHY"]
+    assert told(said) == ["edit", "old", "use-settings", "--preset", "full", "--reason", "WHY"]
 
 
 def test_other_settings_than_a_log_has_are_refused_with_the_edit_that_changes_them(
@@ -165,16 +167,42 @@ def test_a_copy_of_a_log_begins_as_that_one(run: Commands) -> None:
     said = run("import", "told", "b", "--preset", "rooms").err
     assert "other settings than were chosen for the new log" in said
     assert said_by(run.folder / "told") == ROOMS
+
+
+def test_settings_of_a_source_are_compared_by_what_they_mean(run: Commands) -> None:
     run("import", "plain", "run.jsonl")
-    assert "key 'mapfold/command' is reserved" in run("import", "plain", "b", code=3).err
+    run("import", "classic", "bag", "--preset", "classic")
+    said = run("import", "plain", "classic").err
+    assert "passed over: mapfold/command: 1 message, in the log already" in said
+    run("import", "full", "bag", "--run-id", "other")
+    said = run("import", "plain", "full", code=3).err
+    assert (
+        "rejected: the source has fusion=evidence, places=rooms, this log has not; to change it:"
+        " `mapfold edit plain use-settings --preset full --reason WHY`" in said
+    )
     assert said_by(run.folder / "plain") is None
+    run(*told(said))
+    again = run("import", "plain", "full").err
+    assert "2 messages" not in again
+    assert "passed over: mapfold/command: 1 message, in the log already" in again
+    run("import", "own", "bag", "--set", "rooms.cell_m=0.5")
+    said = run("import", "plain", "own", code=3).err
+    assert "the source has fusion=page, places=page, rooms.cell_m=0.5, this log has not" in said
+    run(*told(said))
+    assert "rejected: " not in run("import", "plain", "own").err
+    # written by another version: a default less
+    text = run("log", "cat", "full", "--json").out.replace('"min_samples":3,', "", 1)
+    assert "passed over: mapfold/command: 1" in (
+        run("import", "full", "-", stdin=text.encode()).err
+    )
 
 
 def test_a_source_with_settings_that_no_fold_can_use_does_not_begin_a_log(run: Commands) -> None:
     command = UseSettings(command_id="c", issued_by="b", settings={"eps_m": -1.0})
     line = '{"offset":0,"logged_ns":1,"stamp_ns":1,"key":"mapfold/command","payload":%s}\n'
     text = (line % command.model_dump_json()).encode() + LINES
-    run("import", "log", "-", stdin=text, code=3)
+    said = run("import", "log", "-", stdin=text, code=3).err
+    assert "rejected: settings that no map can have: eps_m is -1.0: " in said
     assert said_by(run.folder / "log") is None
 
 

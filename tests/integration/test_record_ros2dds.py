@@ -6,6 +6,7 @@ import math
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,6 +42,9 @@ from tests.support.ros_messages import (
     box,
     detection,
     detections,
+    label_info,
+    parameter_event,
+    vision_info,
 )
 
 Sessions = Callable[[], Session]
@@ -136,6 +140,47 @@ def test_what_a_bridge_keeps_for_who_comes_late_is_recorded(
             running.wait_until(lambda r: r.messages >= len(sent))
     assert [e.payload for e in envelopes(read_log(log_path))] == expected_envelopes(sent, "bot1")
     assert sum(event.key == MAP_KEY for event in read_log(log_path)) == 1
+    check_derived(log_path)
+
+
+@pytest.mark.parametrize(
+    ("told", "is_latched"),
+    [
+        ({"/label_info": label_info(START, {3: "cup", 4: "mug"})}, True),
+        ({"/parameter_events": parameter_event("/yolo", {"labels.3": "cup"})}, False),
+        (
+            {
+                "/vision_info": vision_info(START, "yolo/table_9"),
+                "/parameter_events": parameter_event("/yolo", {"table_9": [*"abc", "cup"]}),
+            },
+            False,
+        ),
+    ],
+)
+def test_classes_have_the_names_that_a_robot_tells(
+    log_path: Path, endpoint: str, connected: Sessions, told: dict[str, Any], is_latched: bool
+) -> None:
+    seen = detection([("3", 0.9)], box(9, 9, 2, 2))
+    shown = detections(START, "camera", seen)
+    topics = tuple(told)
+    own = new_bridge("bot1", classes=topics, embeddings=None, pose="none", grid="none")
+    with ros2dds.bridge(endpoint, namespace="bot1") as bridge:
+        bridge.advertise("/detections")
+        bridge.announce("/detections", BOXES)
+        for topic, message in told.items():
+            bridge.advertise(topic, latched=is_latched)
+            bridge.announce(topic, message.__msgtype__, latched=is_latched)
+            if is_latched:
+                bridge.send(topic, message)  # long before the recorder
+        with recording(connected(), log_path, own) as running:
+            names = [] if is_latched else [*told.items()]
+            send_all(bridge, [("/detections", shown), *names])
+            running.wait_until(lambda r: r.messages >= 1 + len(told))
+    (made,) = envelopes(read_log(log_path))
+    assert [each["class"] for each in json.loads(made.payload)["detections"]] == ["cup"]
+    assert {event.key for event in verbatim(read_log(log_path))} == {
+        f"/bot1{topic}" for topic in ("/detections", *told)
+    }
     check_derived(log_path)
 
 

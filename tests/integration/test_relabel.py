@@ -89,13 +89,43 @@ def test_the_later_name_of_a_label_counts(mapfold: Commands, log: Path) -> None:
         (("72=72",), "these labels have these names already"),
         (("17=chair",), "no label '17' in this log; near it: 4, 61, 71, 72"),
         (("72=\x1b",), "control character"),
+        (("72=fridge", "17=chair"), "no label '17' in this log; near it: 4, 61, 71, 72"),
         (("--labels", "none.json"), "--labels none.json: No such file"),
+        (("--labels", "others.txt"), "no label '0' in this log; near it: 4, 61, 71, 72"),
     ],
 )
 def test_what_names_nothing_is_refused(
     mapfold: Commands, log: Path, words: tuple[str, ...], says: str
 ) -> None:
+    (mapfold.folder / "others.txt").write_text("person\nbicycle\n")
     assert says in mapfold("edit", log, "relabel", *words, *WHY, code=2).err
+
+
+def test_the_name_of_a_label_is_no_label(mapfold: Commands, log: Path) -> None:
+    mapfold("edit", log, "relabel", "72=fridge", "71=61")
+    said = mapfold("edit", log, "relabel", "fridge=refrigerator", code=2).err
+    assert "'fridge' is no label, but the name of '72'; `72=refrigerator` gives that anot" in said
+    mapfold("edit", log, "relabel", "72=71", "61=toilet", "71=sink"), "labels, and names, too"
+    assert classes(mapfold, log) == ["4", "71", "sink", "sink", "toilet"]
+
+
+def test_a_file_of_all_that_a_detector_knows_says_what_of_it_is_there(
+    mapfold: Commands, log: Path
+) -> None:
+    every = {str(n): f"thing-{n}" for n in range(70, 80)}
+    (mapfold.folder / "all.json").write_text(json.dumps(every))
+    said = mapfold("edit", log, "relabel", "--labels", "all.json").err
+    assert "the log has 2 of 10 labels, 71, 72; the others name what comes later" in said
+    assert classes(mapfold, log) == ["4", "61", "thing-71", "thing-71", "thing-72"]
+
+
+def test_places_that_become_another_type_of_room_are_told(mapfold: Commands, log: Path) -> None:
+    words = ("edit", log, "relabel", "--labels", "labels.json")
+    for said in (mapfold(*words, "--dry-run").err, mapfold(*words).err):
+        assert f"{KITCHEN} was of no certain type, is kitchen now, by the names" in said
+    assert "kitchen" in mapfold("state", log).out
+    said = mapfold("edit", log, "relabel", "72=toilet", "71=toilet").err
+    assert f"{KITCHEN} was kitchen, is bathroom now" in said
 
 
 def test_questions_go_by_the_names_and_by_the_labels(mapfold: Commands, log: Path) -> None:
@@ -125,3 +155,29 @@ def test_a_tail_folds_again_when_a_label_is_named(
         prepare_graph(connection)
         found = LiveMap(connection).all_objects()
     assert {each["class_name"] for each in found} == {*NUMBERS}
+
+
+def test_a_copy_of_a_log_keeps_its_names(mapfold: Commands, log: Path) -> None:
+    mapfold("edit", log, "relabel", "--labels", "labels.json", "--command-id", "c1")
+    mapfold("edit", log, "relabel", "4=crate", "--command-id", "c2")
+    named = classes(mapfold, log)
+    said = mapfold("import", "copy", log).err
+    assert "2 events of mapfold's own taken over, 0 rejected" in said
+    copy = mapfold.folder / "copy"
+    assert classes(mapfold, copy) == named
+    assert [each["command_id"] for each in mapfold("edits", "copy", "--json").json] == ["c1", "c2"]
+    mapfold("edit", log, "undo", "c2", "--command-id", "u", *WHY)
+    mapfold("edit", log, "name-place", KITCHEN, "Kitchen")
+    said = mapfold("import", "copy", log, code=3).err
+    assert "passed over: mapfold/command: 2 messages, in the log already" in said
+    assert (
+        "rejected: name-place is about things of its own log; `mapfold edit copy name-place`"
+        " gives it here" in said
+    )
+    assert classes(mapfold, copy) == classes(mapfold, log) != named, "the undo came along"
+    write_log(mapfold.folder / "other", map(numbered, DOCUMENTS))
+    mapfold("edit", "other", "relabel", "72=fridge")
+    said = mapfold("import", "other", log, code=3).err
+    assert "it calls label '72' 'refrigerator', which is 'fridge' in this log; " in said
+    assert "`mapfold edit other relabel 72=refrigerator` changes that" in said
+    assert "rejected: undo is" not in said

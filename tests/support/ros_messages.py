@@ -166,6 +166,50 @@ def label_info(ns: int, names: dict[int, str]) -> Any:
     )
 
 
+def vision_info(ns: int, location: str) -> Any:
+    """Says where the names of classes are."""
+    return make(
+        "vision_msgs/msg/VisionInfo",
+        header=header(ns, ""),
+        method="yolo",
+        database_location=location,
+        database_version=1,
+    )
+
+
+def parameter_event(node: str, values: dict[str, Any], *, changed: bool = False) -> Any:
+    """A node announces parameters: texts, lists of texts, and whole numbers."""
+    nothing = np.zeros(0)
+    made = [
+        make(
+            "rcl_interfaces/msg/Parameter",
+            name=name,
+            value=make(
+                "rcl_interfaces/msg/ParameterValue",
+                type={str: 4, list: 9, int: 2}[type(value)],
+                bool_value=False,
+                integer_value=value if isinstance(value, int) else 0,
+                double_value=0.0,
+                string_value=value if isinstance(value, str) else "",
+                byte_array_value=nothing.astype(np.uint8),
+                bool_array_value=nothing.astype(np.bool_),
+                integer_array_value=nothing.astype(np.int64),
+                double_array_value=nothing,
+                string_array_value=value if isinstance(value, list) else [],
+            ),
+        )
+        for name, value in values.items()
+    ]
+    return make(
+        "rcl_interfaces/msg/ParameterEvent",
+        stamp=stamp(START),
+        node=node,
+        new_parameters=[] if changed else made,
+        changed_parameters=made if changed else [],
+        deleted_parameters=[],
+    )
+
+
 def text(data: str) -> Any:
     return make("std_msgs/msg/String", data=data)
 

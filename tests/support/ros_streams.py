@@ -25,6 +25,7 @@ TYPES = {
     "/camera_info": "sensor_msgs/msg/CameraInfo",
     "/embeddings": "std_msgs/msg/String",
     "/floats": "std_msgs/msg/Float32MultiArray",
+    "/label_info": "vision_msgs/msg/LabelInfo",
 }
 
 

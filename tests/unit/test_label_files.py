@@ -40,7 +40,7 @@ def test_names_are_read(content: bytes, names: list[Any], tmp_path: Path) -> Non
         (b"\xff\xfe", "no UTF-8 text"),
         (b"[", "no JSON list"),
         (b"[" * 100_000, "no JSON list"),
-        (b"x\n" * 600_000, "larger than 1,000,000 bytes"),
+        (b"x\n" * 600_000, "larger than 1,000,000 bytes, too much for such a file; check the path"),
         (b"\xff" * 1_100_000, "larger than 1,000,000 bytes"),
     ],
 )
@@ -56,7 +56,7 @@ def test_numbers_are_no_names(tmp_path: Path) -> None:
     (tmp_path / "labels").write_text('["a", 1]')
     with pytest.raises(MisuseError, match="not a list of names"):
         read_labels(tmp_path / "labels")
-    with pytest.raises(MisuseError, match="give names by label"):
+    with pytest.raises(MisuseError, match="give a file with the names of cl"):
         read_labels(tmp_path / "none")
 
 
@@ -98,7 +98,8 @@ def test_labels_are_read(name: str, content: str, labels: dict[str, str], tmp_pa
         ("a.yaml", "17: !!python/object:os.system x", "give names by label as YAML"),
         ("a.yaml", "true: x", "True is no label"),
         ("a.yaml", "x: " + "[" * 200 + "]" * 200, "give names by label as YAML"),
-        ("none.yaml", None, "give names by label as YAML"),
+        ("a.json", '["' + "x" * 1_000_000, "too much for such a file; give a file with the names"),
+        ("none.yaml", None, "give a file with the names of classes"),
     ],
 )
 def test_what_names_no_labels_says_why(

@@ -135,7 +135,10 @@ def test_what_is_wrong_is_named_in_one_line(
         (b"resolution: .nan\nimage: a\norigin: [0,0,0]", "resolution: Input should be a finite"),
         (b"resolution: " + b"9" * 5000, "no YAML: "),
         (b"[" * rounds(20_000, 1_000), "no YAML: "),
-        (b"x" * (MAX_YAML_BYTES + 1), "larger than 65,536 bytes; is this the right file?"),
+        (
+            b"x" * (MAX_YAML_BYTES + 1),
+            "larger than 65,536 bytes, too much for such a file; check the path",
+        ),
         (b"!!python/object/apply:os.system ['true']", "no YAML: could not determine"),
     ],
 )

@@ -40,6 +40,23 @@ def test_of_several_hypotheses_the_best_counts_and_labels_name_ids() -> None:
     assert made["detections"][3]["class"] == "13"
 
 
+def test_classes_have_the_names_that_messages_tell_and_detections_wait_for_them() -> None:
+    seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "17", "5", "cup")]
+    told = message("/label_info", 40, ros.label_info(START, {0: "person", 17: "chair"}))
+    of_user = stream(classes=("/label_info",), labels={"17": "stool"}, tf=None, tf_static=None)
+    assembler: Assembler[Any] = Assembler([of_user])
+    assert assembler.add(picture(0, *seen)) == []
+    (made,) = assembler.add(told)
+    classes = [each["class"] for each in json.loads(made.payload)["detections"]]
+    assert classes == ["person", "stool", "5", "cup"]
+    assert assembler.counts["/detections"].numbered == 1
+    # what never comes is not waited for longer than a second
+    (early, later), assembler = run([picture(0, *seen), picture(1_500, *seen)], of_user)
+    assert [each["class"] for each in early["detections"]] == ["0", "stool", "5", "cup"]
+    assert early["detections"] == later["detections"]
+    assert assembler.counts["/detections"].numbered == 4
+
+
 def test_older_forms_of_detections_are_read() -> None:
     """vision_msgs 3 has the centre without a position, version 2 the id without a hypothesis."""
     center = SimpleNamespace(x=100.0, y=50.0, theta=0.0)

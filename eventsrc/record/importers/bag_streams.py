@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.ros import messages as ros
+from eventsrc.ros.class_names import CLASS_TYPES, ClassNames, nearest
 from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
@@ -29,7 +30,12 @@ _MAP: Final = "map"
 _FIRST_TRANSFORMS: Final = 300
 _EVERY_TRANSFORM: Final = 101
 _LAST_TRANSFORM: Final = 100_000
+_FIRST_PARAMETERS: Final = 10_000
 _POSE_TYPES: Final = (ros.POSE, ros.ODOMETRY)
+_FIRST_WANTED: Final = (
+    *(ros.DETECTIONS, ros.LABELS, ros.VISION_INFO, ros.CAMERA_INFO),
+    *_POSE_TYPES,
+)
 _MOST_NAME: Final = 100
 _NS: Final = 1_000_000_000
 
@@ -45,6 +51,7 @@ class BagOptions:
     covariance: str | None = None
     embeddings: str | None = None
     camera: str | None = None
+    classes: tuple[str, ...] = ()
     grid: str | None = None
     map_frame: str | None = None
     base_frame: str | None = None
@@ -77,11 +84,14 @@ class Choice:
 
 def sampled(type_name: str, number: int) -> bool:
     """Whether `Chooser` needs the message of a type with this number on its topic. Of transforms it
-    needs later ones too: a localiser publishes the map frame only once it is localised."""
+    needs later ones too: a localiser publishes the map frame only once it is localised. All nodes
+    announce their parameters on one topic, before they do anything else."""
     if type_name == ros.TF:
         few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
         return few or number < _FIRST_TRANSFORMS
-    return number == 0 and type_name in (ros.DETECTIONS, ros.LABELS, ros.CAMERA_INFO, *_POSE_TYPES)
+    if type_name == ros.PARAMETERS:
+        return number < _FIRST_PARAMETERS
+    return number == 0 and type_name in _FIRST_WANTED
 
 
 class Chooser:
@@ -136,13 +146,12 @@ class Chooser:
         covariance = self._covariance(topic, map_frame) if by_transforms else None
         embeddings = self._embeddings(topic)
         camera = self._camera(topic, camera_frame)
-        label_info = self._nearest(topic, self._of_type(ros.LABELS), "names of classes")
-        found_labels = next(iter(self._samples(label_info, ros.labels_of)), {})
+        told = self._class_names(topic)
         topics = tf, tf_static, None if by_transforms else pose, covariance, embeddings, camera
         made.streams.append(
             Stream(
                 *(topic, run_id, *topics, map_frame, base_frame),
-                labels={**found_labels, **options.labels},
+                labels={**told, **options.labels},
                 embedding_model=options.embedding_model,
                 heights=options.heights,
                 max_gap_ns=options.max_gap_ns,
@@ -173,10 +182,9 @@ class Chooser:
         made.use(covariance, "errors of poses")
         made.use(embeddings, "embeddings")
         made.use(camera, "camera")
-        made.use(label_info, "names of classes")
         if embeddings is None and options.embeddings != NONE:
             made.notes.append(
-                f"{topic}: no topic has embeddings, so there will be no Objects; "
+                f"{topic}: no topic has embeddings, so Objects go by class and box alone; "
                 "docs/ros.md says how to publish them"
             )
 
@@ -213,9 +221,9 @@ class Chooser:
             return TF_POSE
         poses = [each for each in self._of_type(ros.POSE) if _last(each) != "initialpose"]
         for candidates in (poses, self._of_type(ros.ODOMETRY)):
-            nearest = self._nearest(topic, candidates, "poses", "--pose")
-            if nearest is not None:
-                return nearest
+            found = self._nearest(topic, candidates, "poses", "--pose")
+            if found is not None:
+                return found
         return TF_POSE if self._transforms(static=False) else None
 
     def _covariance(self, topic: str, map_frame: str) -> str | None:
@@ -227,9 +235,9 @@ class Chooser:
                 for each in self._of_type(kind)
                 if self._frames.get(each) == map_frame and _last(each) != "initialpose"
             ]
-            nearest = self._nearest(topic, there, "errors of poses", "--covariance")
-            if nearest is not None:
-                return nearest
+            found = self._nearest(topic, there, "errors of poses", "--covariance")
+            if found is not None:
+                return found
         return None
 
     def _embeddings(self, topic: str) -> str | None:
@@ -244,6 +252,34 @@ class Chooser:
         there = self._of_type(ros.CAMERA_INFO)
         same = [each for each in there if frame and self._frames.get(each) == frame]
         return self._nearest(topic, same or there, "cameras", "--camera")
+
+    def _class_names(self, topic: str) -> Mapping[str, str]:
+        """The names of classes that messages tell, by id."""
+        given = self._options.classes
+        for each in given:
+            if each != NONE:
+                self._check("--classes", each, *CLASS_TYPES)
+        names = ClassNames()
+        by_type: dict[str, str] = {}
+        for kind in CLASS_TYPES:
+            there = [each for each in self._of_type(kind) if not given or each in given]
+            chosen = self._nearest(topic, there, "names of classes", "--classes")
+            if chosen is None:
+                continue
+            by_type[kind] = chosen
+            for message in self._samples(chosen, lambda message: message):
+                try:
+                    names.add(kind, message)
+                except BadMessage as error:
+                    self._made.notes.append(f"{chosen}: {error}")
+        named = names.of(topic)
+        if named.labels and named.by:
+            self._made.use(by_type[ros.PARAMETERS], f"names of classes by {named.by}")
+        elif named.labels:
+            self._made.use(by_type[ros.LABELS], "names of classes")
+        elif named.doubt:
+            self._made.notes.append(f"{topic}: {named.doubt}; --labels FILE names its classes")
+        return named.labels
 
     def _map_and_base(self, tree: TransformBuffer, camera: str) -> tuple[str, str]:
         """The frames of the map and of the robot's base."""
@@ -297,22 +333,12 @@ class Chooser:
         the fewest parts; None, with a note, if that leaves several."""
         if not candidates:
             return None
-        parts = topic.strip("/").split("/")
-
-        def distance(candidate: str) -> tuple[int, int]:
-            others = candidate.strip("/").split("/")
-            shared = 0
-            while shared < min(len(parts), len(others)) and parts[shared] == others[shared]:
-                shared += 1
-            return -shared, len(others)
-
-        best = min(map(distance, candidates))
-        nearest = [each for each in candidates if distance(each) == best]
-        if len(nearest) > 1:
+        near = nearest(topic, candidates)
+        if len(near) > 1:
             how = "none is used" if option is None else f"{option} chooses one; none is used"
-            self._made.notes.append(f"{topic}: several topics have {what}: {_some(nearest)}; {how}")
+            self._made.notes.append(f"{topic}: several topics have {what}: {_some(near)}; {how}")
             return None
-        return nearest[0]
+        return near[0]
 
     def _check(self, option: str, topic: str, *type_names: str) -> None:
         known = self._contents.topics.get(topic)

@@ -38,6 +38,9 @@ def _document(path: Path) -> Any:
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     try:
         content = read_file(path, MAX_LABEL_BYTES)
+    except FileFault as fault:
+        raise MisuseError(f"{place}: {fault}; give a file with the names of classes") from None
+    try:
         if is_yaml:
             return parse_yaml(content)
         if not content.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):

@@ -1,23 +1,16 @@
 """Import files into a log, with the same validation as recording.
 
-An import only appends. A file that is imported twice is in the log twice; the fold ignores
-duplicate keyframes, so the map is the same.
+An import only appends, and passes over what is in the log already (`known_log`), so that an import
+that was interrupted can be run again.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
-from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.envelope.commands import (
-    Command,
-    InvalidCommand,
-    UseSettings,
-    encode_command,
-    parse_command,
-)
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import encode_command
 from eventsrc.envelope.forms import BARE_LIST_VERSION
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
@@ -32,9 +25,16 @@ from eventsrc.envelope.system_events import (
     ROS_KEY,
 )
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
-from eventsrc.record.append import NewMap, check_payloads, checked_event, rejected_event
+from eventsrc.record.append import (
+    Checked,
+    NewMap,
+    check_payloads,
+    checked_event,
+    rejected_event,
+)
 
 from .bag_streams import BagOptions
+from .known_log import IS_KNOWN, KnownCommands, KnownEvents, Refused, SourceCommands
 from .opening import open_source
 from .ros_bags import BagReport, RosBag
 from .sources import (
@@ -56,25 +56,12 @@ ALL_TOPICS = TopicChoice()
 _PROGRESS_EVERY = 64
 _DEFAULT_BAGS = BagOptions()
 
-SETTINGS_KNOWN = "settings that the log has already"
-SETTINGS_CHOSEN = "other settings than were chosen for the new log"
-
 Progress = Callable[[Source], None]
 OnReject = Callable[[str, str], None]
 """Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
 
 
-class StatedSettings(NamedTuple):
-    """The settings that a log says: ``begins`` is the command that a new log begins with, None for
-    one that says nothing yet; ``known`` is the document of settings in force. ``check`` raises
-    MapfoldError for a command that no fold can use."""
-
-    begins: UseSettings | None = None
-    known: Mapping[str, object] | None = None
-    check: Callable[[Command], None] = lambda _: None
-
-
-_NO_SETTINGS = StatedSettings()
+_NO_COMMANDS = KnownCommands()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,18 +84,26 @@ class ImportReport:
     """Messages that were passed over, by topic and what they are, in the order of the first."""
 
     @property
+    def known(self) -> int:
+        """How many messages were passed over because the log has them already."""
+        return sum(each.count for each in self.passed_over if each.what == IS_KNOWN)
+
+    @property
     def imported_nothing(self) -> bool:
-        """Whether there were messages, all of them rejected or passed over."""
-        imported = self.accepted + self.system + self.maps + self.verbatim
+        """Whether there were messages, all of them rejected or passed over, and none of them in the
+        log already."""
+        imported = self.accepted + self.system + self.maps + self.verbatim + self.known
         return not imported and bool(self.rejected or self.skipped)
 
     bags: tuple[BagReport, ...] = ()
     """The reports of the ROS 2 bags."""
     repeated: int | None = None
-    """How many accepted envelopes are of keyframes that the log had already and the fold ignores;
-    None if no ledger was given."""
+    """How many accepted envelopes are of keyframes that the log had already, with other bytes, and
+    the fold ignores; None if no ledger was given."""
     began_as_source: bool = False
     """Whether a new log began with the settings that its first source begins with."""
+    numbered_classes: bool = False
+    """Whether all classes of accepted envelopes are numbers, and no command names any."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -130,30 +125,32 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
-    settings: StatedSettings = _NO_SETTINGS,
+    commands: KnownCommands = _NO_COMMANDS,
     topics: TopicChoice = ALL_TOPICS,
     bags: BagOptions = _DEFAULT_BAGS,
     ledger: GapLedger[RunId] | None = None,
 ) -> ImportReport:
-    """Append what ``settings`` begins with and ``given_map``, if there are such, then every message
-    of ``names`` in order. Messages without a key get ``key``. Without a time of receipt the log
-    time of an envelope is its stamp (`LogTimes`), that of anything else the log time of the message
-    before it.
+    """Append what ``commands`` begin with and ``given_map``, if there are such, then every message
+    of ``names`` in order, but for what the log has already. Messages without a key get ``key``.
+    Without a time of receipt the log time of an envelope is its stamp (`LogTimes`), that of
+    anything else the log time of the message before it.
 
     Messages of topics that are not among ``topics`` are passed over. So are the messages of an MCAP
     file that no importer reads and, unless ``topics`` chooses them, those that do not look like
     envelopes. ``bags`` has the choices for bags of ROS 2. Settings and map are appended when the
-    first message was read. A new log to which ``settings`` gives none begins with those that its
-    first source begins with. ``ledger`` is the gap ledger of the log, to which new keyframes are
-    added.
+    first message was read. A new log that begins with none begins with those that its first source
+    begins with. ``ledger`` is the gap ledger of the log, to which new keyframes are added; without
+    one nothing counts as in the log already.
 
     ``step`` is entered for each message; one that defers Ctrl-C makes `ImportInterrupted` exact.
     Raises MisuseError and MapfoldError for files that cannot be read.
     """
     refused = on_reject or (lambda _place, _reason: None)
-    given = [] if settings.begins is None else [(COMMAND_KEY, encode_command(settings.begins))]
+    given = [] if commands.begins is None else [(COMMAND_KEY, encode_command(commands.begins))]
     given += [] if given_map is None else [(MAP_KEY, given_map.encode())]
-    run = _Import(writer, key, refused, topics, ledger, settings, given)
+    known = KnownEvents(writer.path, writer.next_offset, ledger)
+    of_source = SourceCommands(writer.path, commands)
+    run = _Import(writer, key, refused, topics, ledger, known, of_source, given)
     try:
         with ExitStack() as files:
             for name in names:
@@ -187,7 +184,8 @@ class _Import:
     on_reject: OnReject
     topics: TopicChoice
     ledger: GapLedger[RunId] | None
-    settings: StatedSettings
+    known: KnownEvents
+    commands: SourceCommands
     given: list[tuple[str, bytes]]
     """Keys and payloads that are appended before the first message."""
     begins: bool = False
@@ -199,7 +197,8 @@ class _Import:
     skipped: int = 0
     maps: int = 0
     verbatim: int = 0
-    began_as_source: bool = False
+    classes: set[bool] = field(default_factory=set)
+    """Whether the classes of an accepted envelope are numbers, of all that have classes."""
     bags: list[BagReport] = field(default_factory=list)
     passed_over: Counter[tuple[str, str]] = field(default_factory=Counter)
     times: LogTimes = field(default_factory=LogTimes)
@@ -223,14 +222,16 @@ class _Import:
             self._append_refused(source, message, message.refused)
         elif message.unread is not None:
             self.passed_over[topic, message.unread] += 1
+        elif self._has(topic, message):
+            self.passed_over[topic, IS_KNOWN] += 1
         elif message.form is not None:
             self._append_verbatim(message, message.form)
         elif message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY, EMBEDDINGS_KEY):
             self._append_system_event(message.key or "", message)
         elif message.key == MAP_KEY:
             self._append_map_event(source, message)
-        elif message.key == COMMAND_KEY and (command := self._settings_of(message)) is not None:
-            self._append_settings(source, message, command)
+        elif message.key == COMMAND_KEY:
+            self._append_command(source, message)
         else:
             self._append_envelope(source, message)
         self.last = source, source.at
@@ -274,31 +275,25 @@ class _Import:
             self._append_system_event(MAP_KEY, message)
             self.maps += 1
 
-    def _settings_of(self, message: ImportedMessage) -> UseSettings | None:
-        """The ``use-settings`` in an event of another log; None for other commands, which name
-        things of their own log, and for settings that no fold can use."""
-        try:
-            command = parse_command(message.payload)
-            self.settings.check(command)
-        except (InvalidCommand, MapfoldError):
-            return None
-        return command if isinstance(command, UseSettings) else None
+    def _has(self, topic: str, message: ImportedMessage) -> bool:
+        """Whether the log has a verbatim message, or an event of mapfold's own, already. Commands
+        are known by their ids."""
+        is_own = message.key in (REJECTED_KEY, LOSS_KEY, ROS_KEY, EMBEDDINGS_KEY, MAP_KEY)
+        if not (is_own or message.form is not None):
+            return False
+        return self.known.has(topic, message.payload, message.logged_ns)
 
-    def _append_settings(
-        self, source: Source, message: ImportedMessage, command: UseSettings
-    ) -> None:
-        """Begin a new log with the settings of another one, unless some were chosen for it. Reject
-        others than a log has."""
-        if self.writer.next_offset == 0 and self.settings.begins is None:
-            self._append_system_event(COMMAND_KEY, message)
-            self.settings = self.settings._replace(known=command.settings)
-            self.began_as_source = True
-        elif command.settings == self.settings.known:
-            self.passed_over[COMMAND_KEY, SETTINGS_KNOWN] += 1
-        elif self.settings.begins is not None:
-            self.passed_over[COMMAND_KEY, SETTINGS_CHOSEN] += 1
+    def _append_command(self, source: Source, message: ImportedMessage) -> None:
+        """Append a command of another log, its rejection, or nothing."""
+        try:
+            known = self.commands.take(message.payload, is_first=self.writer.next_offset == 0)
+        except Refused as refused:
+            self._reject(source, message, str(refused))
+            return
+        if known:
+            self.passed_over[COMMAND_KEY, known] += 1
         else:
-            self._append_envelope(source, message)  # which rejects a key of mapfold's own
+            self._append_system_event(COMMAND_KEY, message)
 
     def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
         if self._is_for_others(message):
@@ -345,6 +340,9 @@ class _Import:
         if isinstance(result, Rejected) and self._is_for_others(message):
             self.passed_over[key, NO_ENVELOPES] += 1
             return
+        if self._has_checked(key, message, checked):
+            self.passed_over[key, IS_KNOWN] += 1
+            return
         keyframe = None
         if isinstance(result, CheckedEnvelope) and stamp_ns is not None:
             keyframe = result.run_id, stamp_ns
@@ -356,8 +354,21 @@ class _Import:
             self.maps += 1
         else:
             self.accepted += 1
+            if result.numbered is not None:
+                self.classes.add(result.numbered)
             if self.ledger is not None and has_keyframe_id(checked.version):
                 self.ledger.record(result.run_id, result.keyframe_id, 0)
+
+    def _has_checked(self, key: str, message: ImportedMessage, checked: Checked) -> bool:
+        """Whether the log has what is to be appended for an accepted payload already."""
+        result = checked.result
+        if isinstance(result, Rejected):
+            return False
+        if isinstance(result, NewMap):
+            return self.known.has(MAP_KEY, result.event, message.logged_ns)
+        if has_keyframe_id(checked.version):
+            return self.known.has_envelope(result, message.payload)
+        return self.known.has(key, message.payload, message.logged_ns)
 
     def _is_for_others(self, message: ImportedMessage) -> bool:
         """Whether to pass over a message that is no envelope and does not look like one."""
@@ -384,5 +395,6 @@ class _Import:
             tuple(PassedOver(*what, count) for what, count in self.passed_over.items()),
             tuple(self.bags),
             None if self.ledger is None else self.ledger.duplicates - self.repeated_before,
-            self.began_as_source,
+            self.commands.began,
+            self.classes == {True} and not self.commands.names_labels,
         )

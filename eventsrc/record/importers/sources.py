@@ -107,7 +107,7 @@ class TopicChoice:
 @dataclass(frozen=True, slots=True)
 class PassedOver:
     """The number of messages of one topic that were not imported. ``what`` is their encoding and
-    schema, `NO_ENVELOPES` or `NOT_CHOSEN`."""
+    schema, or a reason such as `NOT_CHOSEN`."""
 
     topic: str
     what: str

@@ -109,6 +109,14 @@ class BagChoice:
             "Topic of sensor_msgs/CameraInfo; or none. Default: that of the detections' frame.",
         ),
     ] = None
+    classes: Annotated[
+        list[str] | None,
+        _topic(
+            "--classes",
+            "Topic that names classes, of LabelInfo, ParameterEvent or VisionInfo; may be"
+            " repeated; or none. Default: the nearest of each.",
+        ),
+    ] = None
     grid: Annotated[
         str | None,
         _topic("--grid", "Topic of nav_msgs/OccupancyGrid; or none. Default: topics called map."),
@@ -140,6 +148,7 @@ class BagChoice:
             self.covariance,
             self.embeddings,
             self.camera,
+            tuple(self.classes or ()),
             self.grid,
             self.map_frame,
             self.base_frame,
@@ -216,6 +225,8 @@ def _keyframes(counts: Counts) -> str:
     parts = [f"{number:,} {what}" for number, what in lacks if number]
     seen = counted(counts.detections, "detection")
     parts.append(f"{seen}, {counts.with_embedding:,} with an embedding")
+    if counts.numbered:
+        parts.append(f"{counts.numbered:,} with a number as the class")
     if counts.unclassified:
         parts.append(f"{counts.unclassified:,} without a class")
     return "; ".join([counted(counts.keyframes, "keyframe"), *parts])

@@ -92,6 +92,15 @@ class BridgeChoice:
         _option("--embeddings", "TOPIC", "Topic of the detections' embeddings; see docs/ros.md."),
     ] = None
     camera: Annotated[str | None, _option("--camera", "TOPIC", "Topic of CameraInfo.")] = None
+    classes: Annotated[
+        list[str] | None,
+        _option(
+            "--classes",
+            "TOPIC",
+            "Topic that names classes, of LabelInfo, ParameterEvent (/parameter_events) or"
+            " VisionInfo; may be repeated.",
+        ),
+    ] = None
     grid: Annotated[
         str, _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none.")
     ] = _GRID
@@ -180,6 +189,7 @@ def recording_of(
                 choice.heights,
                 max_gap_ns=gap_ns,
                 first_keyframe=0 if highest is None else highest + 1,
+                classes=tuple(full(t, "--classes") for t in choice.classes or () if t != NONE),
             )
         )
     grid = given(choice.grid, "--grid")
@@ -195,7 +205,8 @@ def used_topics(recording: RosRecording) -> list[str]:
     found: dict[str, None] = {}
     for stream in recording.streams:
         pose = [stream.pose, stream.covariance, stream.tf, stream.tf_static]
-        for topic in (stream.detections, *pose, stream.embeddings, stream.camera):
+        others = stream.embeddings, stream.camera, *stream.classes
+        for topic in (stream.detections, *pose, *others):
             if topic is not None:
                 found[topic] = None
     return [*found, *recording.grids]

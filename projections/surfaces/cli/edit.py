@@ -243,13 +243,16 @@ def _relabel(
 ) -> None:
     """Give classes names, where a detector recorded numbers or words of its own.
 
-    A label is what the log has, whatever it was called since. A reason is not needed.
+    A label is what the log has, whatever it was called since; of those in FILE it need not have
+    all. Types of rooms that change by it are printed. A reason is not needed.
     """
-    labels = {} if file is None else read_labels(file)
-    labels |= make.labels_of(named or ())
-    if not labels:
+    listed = {} if file is None else read_labels(file)
+    given = make.labels_of(named or ())
+    if not (listed or given):
         raise MisuseError("give LABEL=NAME or --labels FILE")
-    options.record(lambda current, stamp: make.relabel(current, stamp, labels), needs_reason=False)
+    options.record(
+        lambda current, stamp: make.relabel(current, stamp, given, listed), needs_reason=False
+    )
 
 
 @edit.command("use-settings")

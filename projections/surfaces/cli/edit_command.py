@@ -94,7 +94,7 @@ def _show(made: Made, *, as_json: bool, most: int | None) -> None:
     """Print what a command would change."""
     difference = made.outcome.change.difference()
     effect = made.outcome.effect or made.outcome.change.effect()
-    _say_void(made)
+    _say_side_effects(made)
     if as_json:
         emit(
             {
@@ -118,7 +118,7 @@ def keep_effect(made: Made) -> None:
     outcome = made.outcome
     if outcome.effect is not None and made.offset == made.current.end:
         cache_effect(made.current, made.command, outcome.effect)
-    _say_void(made)
+    _say_side_effects(made)
 
 
 def recorded_document(made: Made) -> dict[str, Any]:
@@ -149,7 +149,9 @@ def recorded_text(made: Made) -> str:
     return f"{made.command.kind} {when} at offset {made.offset}, command {command_id}; {changes}"
 
 
-def _say_void(made: Made) -> None:
-    """Report commands that have no effect any more."""
+def _say_side_effects(made: Made) -> None:
+    """Report commands that have no effect any more, and places of another type."""
     for recorded, why in made.outcome.void:
         say(void_text(recorded, why))
+    for line in made.outcome.rooms:
+        say(line)

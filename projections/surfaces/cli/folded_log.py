@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import advised
+from eventsrc.base.text import advised, command_line, visible
 from eventsrc.base.user_files import FileFault
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
@@ -233,3 +233,9 @@ class CachedLog(LogSettings):
     """A log whose history is kept beside it."""
 
     no_cache: NoCacheOption = False
+
+
+def classes_advice(log: Path) -> str:
+    """One line for a log whose classes are all numbers."""
+    named = command_line("edit", log, "relabel", "--labels", "FILE")
+    return f"all classes are numbers: `{visible(named)}` names them"

@@ -27,6 +27,7 @@ from eventsrc.record.importers.sources import NOT_CHOSEN, Source, TopicChoice
 from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines
+from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
@@ -79,7 +80,8 @@ def import_(
     choice: BagChoice,
     json_: JsonOption = False,
 ) -> None:
-    """Append recorded envelopes and occupancy maps to a log, in the order of the files.
+    """Append recorded envelopes and occupancy maps to a log, in the order of the files, but for
+    what is in it already.
 
     From a bag of ROS 2 (a folder, or its .db3 or .mcap file) detections become envelopes with their
     poses, and occupancy grids become maps; needs the extra mapfold[ros]. Which topics are used
@@ -119,7 +121,7 @@ def import_(
                     on_reject=rejects.say,
                     step=step,
                     given_map=given_map,
-                    settings=start.for_import(),
+                    commands=start.for_import(),
                     topics=topics,
                     bags=bags,
                     ledger=ledger,
@@ -159,9 +161,9 @@ def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
 
 
 def _as_json(report: ImportReport) -> dict[str, Any]:
-    """The report as JSON; ``bags`` and ``began_as_source`` only where there is something to say."""
+    """The report as JSON; ``bags`` and such only where there is something to say."""
     document = asdict(report)
-    for name in ("bags", "began_as_source"):
+    for name in ("bags", "began_as_source", "numbered_classes"):
         if not document[name]:
             del document[name]
     return document
@@ -190,7 +192,7 @@ def _kept(log: Path, interrupted: ImportInterrupted) -> str:
     kept = counted(report.next_offset - report.first_offset, "event")
     return (
         f"{log}: kept {kept}, offsets {report.first_offset} to {report.next_offset - 1}, up to "
-        f"{interrupted.place}; import only what comes after that, or the log holds the rest twice"
+        f"{interrupted.place}; import it again to go on: what is in the log is passed over"
     )
 
 
@@ -231,14 +233,19 @@ def _passed_over(log: Path, report: ImportReport) -> Iterator[str]:
             "nothing was imported: no message is an envelope (docs/recording.md); --topic GLOB "
             "imports a topic of JSON nevertheless and reports what is wrong with each message"
         )
-    if report.accepted and report.accepted == report.repeated:
+    if report.numbered_classes:
+        yield classes_advice(log)
+    is_unchanged = report.first_offset == report.next_offset
+    if is_unchanged and not (report.skipped or report.bags):
+        yield "what was given has no messages"
+    if (is_unchanged and report.known) or (report.accepted and report.accepted == report.repeated):
         labels, settings = (
             advised("edit", log, *words)
             for words in (("relabel", "--labels", "FILE"), ("use-settings", "--preset", "NAME"))
         )
         yield visible(
-            "nothing is new: the first recording of a keyframe counts; "
-            f"`{labels}` names its classes, `{settings}` changes the rules of the map"
+            "nothing is new: the first recording of a keyframe counts, so only other keyframes add"
+            f" to it; `{labels}` names its classes, `{settings}` changes the rules of the map"
         )
 
 

@@ -22,7 +22,7 @@ from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache
 
-from .folded_log import CachedLog, FoldToOption, KnownAtOption, LogSettings
+from .folded_log import CachedLog, FoldToOption, KnownAtOption, LogSettings, classes_advice
 from .options import JsonOption, check_picture
 from .terminal import display, emit, say
 
@@ -68,7 +68,10 @@ def state(
         return
     counts = view.counts()
     of_camera = camera_advice(counts, settings, source.log)
-    for advice in (places_advice(counts, settings), space_advice(view), of_camera):
+    seen = view.observations
+    is_numbered = bool(seen) and all(each.class_name.isdecimal() for each in seen)
+    of_classes = classes_advice(source.log) if is_numbered else None
+    for advice in (places_advice(counts, settings), space_advice(view), of_camera, of_classes):
         if advice is not None:
             say(advice)
 

@@ -5,7 +5,7 @@ the error names the `edit` that changes them.
 """
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +18,12 @@ from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.commands import UseSettings, encode_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.record.importers.run import StatedSettings
-from projections.fold.corrections import check_settings
+from eventsrc.record.importers.known_log import KnownCommands
+from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings
-from projections.map.own_events import read_corrections
+from projections.map.own_events import read_commands
 
 from .folded_log import NamedSettings, complete_preset
 from .options import user_at_host
@@ -103,7 +103,8 @@ class LogStart:
     """What an opened log begins with, and what to tell people of it.
 
     ``is_new`` if it has no events; ``command`` is then the one that it begins with, None if it says
-    nothing. ``known`` are the settings that a log with events says, None if it says none.
+    nothing. ``commands`` are those of a log with events, and ``known`` the settings that they say,
+    None if they say none.
     """
 
     log: Path
@@ -112,6 +113,7 @@ class LogStart:
     is_ros: bool
     known: Settings | None = None
     command: UseSettings | None = None
+    commands: tuple[RecordedCommand, ...] = ()
 
     @classmethod
     def of(
@@ -120,20 +122,40 @@ class LogStart:
         """The start of the log that ``writer`` has opened; ``is_ros`` if it gets input of ROS.
         Raises MisuseError if settings are chosen and the log has others."""
         if writer.next_offset > 0:
-            known = _known_settings(log, is_needed=bool(options.assignments))
+            commands = _known_commands(log, is_needed=bool(options.assignments))
+            known = compile_corrections(commands).settings
             _check_same(log, known or Settings(), options)
-            return cls(log, options, is_new=False, is_ros=is_ros, known=known)
+            return cls(
+                log, options, is_new=False, is_ros=is_ros, known=known, commands=tuple(commands)
+            )
         command = options.command()
         if command is None and is_ros:
             command = _command([f"preset={ROS_PRESET}"], _ROS_REASON)
         return cls(log, options, is_new=True, is_ros=is_ros, command=command)
 
-    def for_import(self) -> StatedSettings:
+    def for_import(self) -> KnownCommands:
         """The same for an importer."""
         document = None if self.known is None else self.known.model_dump(mode="json")
         if self.command is not None:
             document = self.command.settings
-        return StatedSettings(self.command, document, check_settings)
+        labels = compile_corrections(self.commands).labels
+        given = [recorded.command for recorded in self.commands]
+        return KnownCommands(self.command, document, labels, given, self._differs)
+
+    def _differs(self, here: Mapping[str, object] | None, there: Mapping[str, object]) -> str:
+        """Why the settings of a source are not those of the log; empty if they are the same."""
+        known = Settings() if here is None else Settings.from_document(here)
+        source = Settings.from_document(there)
+        changed = source.changed_from(known)
+        if not changed:
+            return ""
+        differing = ", ".join(f"{name}={_shown(value)}" for name, value in changed.items())
+        preset = next((p for p in PRESETS if known.with_assignments([f"preset={p}"]) == source), "")
+        words = ["--preset", preset] if preset else []
+        for name, value in () if preset else changed.items():
+            words += ["--set", f"{name}={'' if value is None else value}"]
+        edit = command_line("edit", self.log, *_change(words))
+        return f"the source has {differing:.300}, this log has not; to change it: `{edit}`"
 
     def record(self, writer: LogWriter) -> None:
         """Append the command; it is durable when this returns."""
@@ -178,16 +200,15 @@ def _change(options: Sequence[str]) -> list[str]:
     return ["use-settings", *options, "--reason", "WHY"]
 
 
-def _known_settings(log: Path, *, is_needed: bool) -> Settings | None:
-    """The settings that the log says; None if it says none or, unless they are needed, cannot be
-    read."""
+def _known_commands(log: Path, *, is_needed: bool) -> list[RecordedCommand]:
+    """The commands of the log; none if, unless they are needed, they cannot be read."""
     try:
         with LogReader(log) as reader:
-            return read_corrections(reader).settings
+            return read_commands(reader)
     except (LogDamaged, FoldError):
         if is_needed:
             raise
-        return None
+        return []
 
 
 def _check_same(log: Path, known: Settings, options: NewLogOptions) -> None:

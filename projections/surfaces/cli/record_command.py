@@ -33,6 +33,7 @@ from .bridge_options import (
     say_topics,
     warn_of_silence,
 )
+from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
@@ -163,8 +164,11 @@ def record(
             if accept_edits:
                 say(f"taking commands of `mapfold edit` on {edit_key(writer.log_id)}")
             recorder.run(stop, every_s=EVERY_S, watch=watch)
-            for line in stream_lines({} if bridge is None else bridge.derivation.counts):
+            streams = {} if bridge is None else bridge.derivation.counts
+            for line in stream_lines(streams):
                 say(line)
+            if streams and all(0 < each.numbered == each.detections for each in streams.values()):
+                say(classes_advice(log))
     summary.finish()
 
 

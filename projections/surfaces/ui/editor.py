@@ -198,6 +198,7 @@ class Editor:
         if effect is None and asked.dry_run:
             effect = outcome.change.effect()
         notes += [void_text(recorded, why) for recorded, why in outcome.void]
+        notes += outcome.rooms
         found = {
             "through": through,
             "recorded": not asked.dry_run,

@@ -1,0 +1,172 @@
+"""What a log has before an import: what of a source is in it already, and which of the source's
+commands it takes over.
+
+An envelope is in it already if it has the same bytes and its keyframe is recorded; another event of
+mapfold's own, or a verbatim message, if it has the same bytes, key and log time. Rejections are
+appended again. An envelope of a known keyframe with other bytes is appended, too: the fold counts
+it as a duplicate or reports it as a conflict.
+
+Commands name things of their own log, so most are refused. Settings begin a new log. Names of
+labels hold for any log that does not name these labels otherwise, and are taken over, with their
+undos.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from eventsrc.base.errors import LogDamaged, MapfoldError
+from eventsrc.base.text import command_line
+from eventsrc.envelope.commands import (
+    Command,
+    InvalidCommand,
+    Relabel,
+    Undo,
+    UseSettings,
+    parse_command,
+)
+from eventsrc.envelope.gaps import GapLedger
+from eventsrc.envelope.ingest import CheckedEnvelope
+from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
+from eventsrc.log import LogReader
+
+IS_KNOWN: Final = "in the log already"
+SETTINGS_CHOSEN: Final = "other settings than were chosen for the new log"
+
+
+class Refused(ValueError):
+    """A command that a log does not take over; the text says why and what to do."""
+
+
+class KnownCommands(NamedTuple):
+    """The commands of a log. ``begins`` is the one that a new log begins with, None for one that
+    says nothing yet; ``settings`` the document in force, None without any; ``labels`` names of
+    classes in force by label; ``all`` all commands. ``differs`` tells, of the settings in force and
+    those of a source, why they are not the same; empty if they are. It raises MapfoldError for
+    settings that no fold can use."""
+
+    begins: UseSettings | None = None
+    settings: Mapping[str, object] | None = None
+    labels: Mapping[str, str] = {}
+    all: Sequence[Command] = ()
+    differs: Callable[[Mapping[str, object] | None, Mapping[str, object]], str] = (
+        lambda here, there: "" if here == there else "the settings are others"
+    )
+
+
+class SourceCommands:
+    """Decides which commands of a source are appended to a log."""
+
+    def __init__(self, log: Path, known: KnownCommands) -> None:
+        self._log = log
+        self._known = known
+        self._settings = known.settings
+        self._ids = {each.command_id for each in known.all}
+        self.began = False
+        """Whether a new log began with the settings of a source."""
+        self.names_labels = bool(known.labels)
+        """Whether a command, of the log or taken over, names labels."""
+
+    def take(self, payload: bytes, *, is_first: bool) -> str:
+        """Decide on the command in ``payload``: the reason to pass over it, empty to append it.
+        ``is_first`` in a log without events. Raises Refused."""
+        try:
+            command = parse_command(payload)
+        except InvalidCommand as error:
+            raise Refused(f"no command: {error}") from None
+        if isinstance(command, UseSettings):
+            return self._take_settings(command, is_first=is_first)
+        if command.command_id in self._ids:
+            return IS_KNOWN
+        if isinstance(command, Relabel):
+            self._check_labels(command)
+            self.names_labels = True
+        elif not (isinstance(command, Undo) and command.undone in self._ids):
+            edit = command_line("edit", self._log, command.kind)
+            raise Refused(f"{command.kind} is about things of its own log; `{edit}` gives it here")
+        self._ids.add(command.command_id)
+        return ""
+
+    def _take_settings(self, command: UseSettings, *, is_first: bool) -> str:
+        try:
+            differs = self._known.differs(self._settings, command.settings)
+        except MapfoldError as error:
+            raise Refused(f"settings that no map can have: {error}") from None
+        if is_first and self._known.begins is None:
+            self._settings = command.settings
+            self._ids.add(command.command_id)
+            self.began = True
+            return ""
+        if not differs:
+            return IS_KNOWN
+        if self._known.begins is not None:
+            return SETTINGS_CHOSEN
+        raise Refused(differs)
+
+    def _check_labels(self, command: Relabel) -> None:
+        for label, name in command.labels:
+            here = self._known.labels.get(label, name)
+            if here != name:
+                edit = command_line("edit", self._log, "relabel", f"{label}={name}")
+                raise Refused(
+                    f"it calls label {label!r} {name!r}, which is {here!r} in this log; "
+                    f"`{edit}` changes that"
+                )
+
+
+@dataclass(slots=True)
+class KnownEvents:
+    """The events of a log before ``end``. ``ledger`` has its keyframes; without one, as of a
+    damaged log, nothing counts as known."""
+
+    log: Path
+    end: Offset
+    ledger: GapLedger[RunId] | None
+    _by_key: dict[str | None, frozenset[bytes]] = field(default_factory=dict)
+
+    def has_envelope(self, checked: CheckedEnvelope, payload: bytes) -> bool:
+        """Whether the log has a keyframe with these bytes."""
+        ledger = self.ledger
+        if ledger is None or not ledger.has(checked.run_id, checked.keyframe_id):
+            return False
+        return _digest(payload, None) in self._of(None)
+
+    def has(self, key: str, payload: bytes, logged_ns: int | None) -> bool:
+        """Whether the log has this event under ``key``."""
+        if logged_ns is None or self.ledger is None:
+            return False
+        return _digest(payload, logged_ns) in self._of(key)
+
+    def _of(self, key: str | None) -> frozenset[bytes]:
+        """The digests of the events of a key, of all envelopes for None; read once."""
+        found = self._by_key.get(key)
+        if found is None:
+            found = self._by_key[key] = self._read(key)
+        return found
+
+    def _read(self, key: str | None) -> frozenset[bytes]:
+        if self.end == FIRST_OFFSET:
+            return frozenset()
+        try:
+            with LogReader(self.log) as reader:
+                events = reader.read(FIRST_OFFSET, self.end, keys=None if key is None else {key})
+                return frozenset(
+                    _digest(event.payload, None if key is None else event.logged_ns)
+                    for event in events
+                    if key is not None or event.is_envelope
+                )
+        except LogDamaged as error:
+            raise MapfoldError(
+                f"{error}; it cannot be told what of the source is in the log already: run "
+                f"`{command_line('log', 'recover', self.log)}` first"
+            ) from None
+
+
+def _digest(payload: bytes, logged_ns: int | None) -> bytes:
+    """A digest of an event; 16 bytes, so that those of a million events take 80 MB."""
+    digest = hashlib.blake2b(payload, digest_size=16)
+    if logged_ns is not None:
+        digest.update(b" %d" % logged_ns)
+    return digest.digest()
