@@ -7,7 +7,6 @@ encoding and a schema, so that readers of MCAP show them. No fold reads them.
 
 import hashlib
 import json
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import msgspec
@@ -16,8 +15,7 @@ from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import is_system_key
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(msgspec.Struct, frozen=True, gc=False):
     """A recorded message.
 
     ``offset`` is its index in the log, which alone orders events. ``logged_ns`` is when it was
@@ -62,11 +60,10 @@ class MessageFormat(NamedTuple):
     schema_text: bytes = b""
 
 
-@dataclass(frozen=True, slots=True)
-class VerbatimEvent(Event):
+class VerbatimEvent(Event, frozen=True, kw_only=True, gc=False):
     """A verbatim message; ``key`` is its topic."""
 
-    format: MessageFormat = field(kw_only=True)
+    format: MessageFormat
 
     @property
     def is_envelope(self) -> bool:

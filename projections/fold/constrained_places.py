@@ -177,7 +177,7 @@ class ConstrainedPlaces(Places):
         touched = {place for part in parts for place in part.touched}
         sides = [inside for place in touched if (inside := self._anchors.inside(place))]
         sides += [self._own(p) for p in fresh if self._is_new_anchor(p)]
-        return any(self._anchors.apart(one, other) for one, other in combinations(sides, 2))
+        return any(self._anchors.are_apart(one, other) for one, other in combinations(sides, 2))
 
     def _split(self, fresh: list[int]) -> Iterator[Part]:
         """The parts that the cells of fresh core points make with what they touch (rule 9)."""
@@ -274,7 +274,7 @@ class ConstrainedPlaces(Places):
             if cell is None or index.core_in_reach(cell, point) is not None
         }
         own, anchors = self._own(point), self._anchors
-        free = (p for p in places if anchors.apart(own, anchors.inside(p)) is None)
+        free = (p for p in places if not anchors.are_apart(own, anchors.inside(p)))
         return min(free, default=None)
 
     def _obey_joins(

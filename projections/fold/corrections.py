@@ -28,19 +28,8 @@ from eventsrc.envelope.commands import (
     Anchor,
     Command,
     CorrectPoses,
-    DifferentObjects,
-    DropDetection,
-    DropObject,
-    ForgetKeyframes,
-    ForgetRun,
-    Join,
-    KeepApart,
     NamePlace,
     Reembed,
-    Relabel,
-    SameObject,
-    Undo,
-    UndoMerge,
     UseSettings,
 )
 from eventsrc.envelope.ingest import Accepted
@@ -254,12 +243,11 @@ def commands_in_force(commands: Iterable[RecordedCommand]) -> list[RecordedComma
     by_id: dict[str, RecordedCommand] = {}
     for recorded in commands:
         by_id.setdefault(recorded.command.command_id, recorded)
-    for recorded in reversed(by_id.values()):
-        command = recorded.command
-        if command.command_id in undone:
+    for command_id, recorded in reversed(by_id.items()):
+        if command_id in undone:
             continue
-        if isinstance(command, Undo):
-            undone.add(command.undone)
+        if recorded.command.kind == "undo":
+            undone.add(recorded.command.undone)
         else:
             kept.append(recorded)
     return kept[::-1]
@@ -280,31 +268,31 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     reembedded: list[Reembed] = []
     labels: dict[str, str] = {}
     for offset, command in in_force:
-        match command:
-            case NamePlace():
+        match command.kind:  # the classes of pydantic are slow to match
+            case "name-place":
                 names.append(PlaceName(_keyframe(command.place), command.name, offset))
-            case KeepApart() | UndoMerge():
+            case "keep-apart" | "undo-merge":
                 places.append((_keyframes(command.places), False))
-            case Join() if len(joined_places := _keyframes(command.places)) > 1:
+            case "join" if len(joined_places := _keyframes(command.places)) > 1:
                 places.append((joined_places, True))
-            case SameObject() | DifferentObjects():
+            case "same-object" | "different-objects":
                 first, second = sorted(command.det_ids)
-                objects.append(((first, second), isinstance(command, SameObject)))
-            case DropObject() | DropDetection():
+                objects.append(((first, second), command.kind == "same-object"))
+            case "drop-object" | "drop-detection":
                 dropped.update(command.det_ids)
-            case ForgetRun():
+            case "forget-run":
                 runs.add(command.run_id)
-            case ForgetKeyframes():
+            case "forget-keyframes":
                 ranges.setdefault(command.run_id, []).append((command.first, command.last))
-            case CorrectPoses():
+            case "correct-poses":
                 poses.setdefault(command.run_id, []).append(PoseCorrection.of(command))
-            case Relabel():
+            case "relabel":
                 labels.update(command.labels)
-            case UseSettings():
+            case "use-settings":
                 document = command.settings
-            case Reembed():
+            case "reembed":
                 reembedded.append(command)
-            case Join() | Undo():
+            case "join" | "undo":
                 pass
     joined, apart = without_contradictions(places)
     same, different = without_contradictions(objects)

@@ -266,7 +266,7 @@ class Matching:
             return False
         own = object_of.get(group)
         inside = {group} if own is None else self._index.thing(own).groups
-        return thing.groups is not inside and bool(groups.conflicts(inside, thing.groups))
+        return thing.groups is not inside and groups.are_apart(inside, thing.groups)
 
 
 class _Second:

@@ -86,7 +86,7 @@ class Merging:
             both = thing.met.get(partner, 0)
             if both * _SHARE_OF_PICTURES > min(thing.count, other.count):
                 continue
-            if self._groups is not None and self._groups.conflicts(thing.groups, other.groups):
+            if self._groups is not None and self._groups.are_apart(thing.groups, other.groups):
                 continue
             geometry, far2 = _geometry(thing, other)
             if geometry > _LEAST_GEOMETRY:

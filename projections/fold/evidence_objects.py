@@ -209,7 +209,7 @@ class EvidenceObjects:
         groups = self._groups
         may_be = [
             bool(thing.marks and other.marks)
-            and not (groups and groups.conflicts(thing.groups, other.groups))
+            and not (groups and groups.are_apart(thing.groups, other.groups))
             for other in things
         ]
         alike = [other for other, may in zip(things, may_be, strict=True) if may]
@@ -267,7 +267,7 @@ class EvidenceObjects:
             return own
         inside = {group} if own is None else self._index.thing(own).groups
         others = self._index.thing(wanted).groups
-        return own if wanted != own and self._groups.conflicts(inside, others) else wanted
+        return own if wanted != own and self._groups.are_apart(inside, others) else wanted
 
     def _found(
         self, offset: Offset, sighting: Sighting, pose: Pose, timestamp: float

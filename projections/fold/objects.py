@@ -55,7 +55,7 @@ from .deltas import (
     ObservationOrdinal,
 )
 from .exact import MAX_IN_A_SUM, MAX_IN_ONE_DOT, Q40, dot_of_sums, long_dot, metres_to_um
-from .pair_groups import PairGroups
+from .pair_groups import NO_GROUPS, PairGroups
 
 NO_VECTOR: Final = np.zeros(0)
 """The vector of an observation without an embedding, which only fusion by evidence fuses."""
@@ -303,7 +303,7 @@ class ConstrainedObjects(Objects):
             candidate
             for candidate in self.candidates_at(class_name, x_um, y_um)
             if candidate == own
-            or not self._groups.conflicts(inside, self._inside.get(candidate, ()))
+            or not self._groups.are_apart(inside, self._inside.get(candidate, NO_GROUPS))
         ]
         fused = self.fold(offset, seen, timestamp, x_um, y_um, free, own)
         deltas: list[ObjectFound | ObjectSeen | ObjectsMerged] = [*fused]

@@ -5,7 +5,7 @@ What commands say is transitive: if a and b are one and b and c are one, so are 
 kept apart from a is kept apart from all of them.
 """
 
-from collections.abc import Collection, Hashable, Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator, Set
 from itertools import chain
 from typing import Generic, TypeVar
 
@@ -65,17 +65,23 @@ class ApartPairs(Generic[_Thing]):
     Iterated, it gives the pairs, the smaller thing first, ascending.
     """
 
-    def __init__(self, divided: Iterable[Iterable[Iterable[_Thing]]] = ()) -> None:
-        sets = [[list(part) for part in parts] for parts in divided]
-        sets = [parts for parts in sets if len(parts) > 1]
-        self.things = sorted({thing for parts in sets for part in parts for thing in part})
-        """All of them, ascending."""
-        self._rank = {thing: number for number, thing in enumerate(self.things)}
+    def __init__(self, divided: Iterable[Collection[Collection[_Thing]]] = ()) -> None:
+        sets = [parts for parts in divided if len(parts) > 1]
         self.sets: list[list[_Thing]] = [list(chain.from_iterable(parts)) for parts in sets]
+        self.things = sorted(set(chain.from_iterable(self.sets)))
+        """All of them, ascending."""
+        rank = self._rank = {thing: number for number, thing in enumerate(self.things)}
+        self._single: list[set[int]] = [set() for _ in self.things]
+        """What a thing is kept apart from by sets of two, by rank."""
         self._inside: list[list[tuple[frozenset[int], frozenset[int]]]] = [[] for _ in self.things]
-        """The sets that a thing is in, and its part of each, by rank."""
-        for parts in sets:
-            ranked = [frozenset(map(self._rank.__getitem__, part)) for part in parts]
+        """The larger sets that a thing is in, and its part of each, by rank."""
+        for parts, things in zip(sets, self.sets, strict=True):
+            if len(things) == 2:
+                a, b = rank[things[0]], rank[things[1]]
+                self._single[a].add(b)
+                self._single[b].add(a)
+                continue
+            ranked = [frozenset(map(rank.__getitem__, part)) for part in parts]
             every = frozenset[int]().union(*ranked)
             for part in ranked:
                 for number in part:
@@ -91,7 +97,7 @@ class ApartPairs(Generic[_Thing]):
 
     def __contains__(self, pair: tuple[_Thing, _Thing]) -> bool:
         a, b = (self._rank.get(thing, -1) for thing in pair)
-        return a >= 0 and any(b in every and b not in part for every, part in self._inside[a])
+        return a >= 0 and b in self.against(a)
 
     def __iter__(self) -> Iterator[tuple[_Thing, _Thing]]:
         for number, greater in self.greater():
@@ -111,7 +117,8 @@ class ApartPairs(Generic[_Thing]):
 
     def against(self, number: int) -> set[int]:
         """The indices in `things` of those that one is kept apart from."""
-        return set[int]().union(*(every - part for every, part in self._inside[number]))
+        inside = self._inside[number]
+        return self._single[number].union(*(every - part for every, part in inside))
 
     def greater(self) -> Iterator[tuple[int, list[int]]]:
         """The index in `things` of each that is the smaller one of a pair, and those of the greater
@@ -132,23 +139,6 @@ class ApartPairs(Generic[_Thing]):
         }
         return [(self.things[a], self.things[b]) for a, b in sorted(pairs)]
 
-    def in_order_of_pairs(self) -> list[_Thing]:
-        """`things` in the order in which the pairs name them first."""
-        met: dict[int, None] = {}
-        unmet: dict[int, Collection[int]] = {}
-        for number, inside in enumerate(self._inside):
-            if number not in met:
-                found = sorted(each for each in self.against(number) if each > number)
-                met |= dict.fromkeys([number, *found] if found else [])
-                continue
-            rest = set[int]()
-            for every, part in inside:
-                left = {each for each in unmet.get(id(every), every) if each not in met}
-                unmet[id(every)] = left
-                rest |= {each for each in left if each > number} - part
-            met |= dict.fromkeys(sorted(rest))
-        return [self.things[number] for number in met]
-
 
 class PairGroups(Generic[_Thing]):
     """Groups of the things named in pairs that are one and in pairs that are kept apart, numbered
@@ -166,37 +156,47 @@ class PairGroups(Generic[_Thing]):
             if one != other:
                 roots.merge(one, (other,))
         numbers: dict[_Thing, int] = {}
-        self.group_of: dict[_Thing, int] = {}
-        for thing in dict.fromkeys(chain(*same, apart.in_order_of_pairs())):
-            root = roots.find(thing)
-            self.group_of[thing] = numbers.setdefault(root, len(numbers))
-        sets = [frozenset(map(self.group_of.__getitem__, each)) for each in apart.sets]
+        self.group_of: dict[_Thing, int] = {
+            thing: numbers.setdefault(roots.find(thing), len(numbers))
+            for thing in dict.fromkeys(chain(*same, apart.things))
+        }
+        self._against: dict[int, Set[int]] = {}
+        """The groups that a group is kept apart from; its own may be among them."""
+        pairs: dict[int, set[int]] = {}
         sets_of: dict[int, set[frozenset[int]]] = {}
-        for each in sets:
-            for group in each:
-                sets_of.setdefault(group, set()).add(each)
+        for things in apart.sets:
+            groups = [self.group_of[thing] for thing in things]
+            if len(groups) == 2:
+                a_group, b_group = groups
+                pairs.setdefault(a_group, set()).add(b_group)
+                pairs.setdefault(b_group, set()).add(a_group)
+                continue
+            every = frozenset(groups)
+            for group in every:
+                sets_of.setdefault(group, set()).add(every)
         # Groups of the same sets share one value.
         joined: dict[frozenset[frozenset[int]], frozenset[int]] = {}
-        self._against: dict[int, frozenset[int]] = {}
-        """The groups of all sets that a group is in, its own too."""
+        self._against |= pairs
         for group, own in sets_of.items():
             key = frozenset(own)
             if key not in joined:
-                joined[key] = _NONE.union(*own)
-            self._against[group] = joined[key]
+                joined[key] = NO_GROUPS.union(*own)
+            self._against[group] = joined[key] | pairs[group] if group in pairs else joined[key]
 
-    def conflicts(self, groups: Collection[int], others: Collection[int]) -> list[tuple[int, int]]:
-        """The pairs of a group of ``groups`` and one of ``others`` that are kept apart."""
-        if len(groups) > len(others):
-            return [(group, other) for other, group in self.conflicts(others, groups)]
-        found = list[tuple[int, int]]()
+    def conflicts(self, groups: Iterable[int], others: Set[int]) -> Iterator[tuple[int, Set[int]]]:
+        """Each group of ``groups`` that is kept apart from some of ``others``, and these."""
         for group in groups:
             if against := self._against.get(group):
-                less, more = (against, others) if len(against) < len(others) else (others, against)
-                for other in less:
-                    if other in more and other != group:
-                        found.append((group, other))
-        return found
+                found = others & against
+                if group in found:
+                    found = found - {group}
+                if found:
+                    yield group, found
+
+    def are_apart(self, groups: Set[int], others: Set[int]) -> bool:
+        """Whether any group of ``groups`` and any of ``others`` are kept apart."""
+        less, more = (groups, others) if len(groups) < len(others) else (others, groups)
+        return bool(self._against) and any(self.conflicts(less, more))
 
 
 def without_contradictions(
@@ -226,7 +226,7 @@ def without_contradictions(
             continue
         first, second = things
         a, b = roots.find(first), roots.find(second)
-        if a == b or sets_of.get(a, _NONE).isdisjoint(sets_of.get(b, _NONE)):
+        if a == b or sets_of.get(a, NO_GROUPS).isdisjoint(sets_of.get(b, NO_GROUPS)):
             same.add((first, second))
             if a != b:
                 roots.merge(a, (b,))
@@ -236,4 +236,4 @@ def without_contradictions(
     return sorted(same), ApartPairs(parts_of.values())
 
 
-_NONE: frozenset[int] = frozenset()
+NO_GROUPS: frozenset[int] = frozenset()

@@ -193,8 +193,17 @@ class PlaceAnchors:
 
     def apart(self, inside: Inside, other: Inside) -> Apart | None:
         """The earliest anchors of two sides that are kept apart, None if there are none."""
-        pairs = self._groups.conflicts(inside, other)
-        return min(((inside[a], other[b]) for a, b in pairs), default=None)
+        swapped = len(inside) > len(other)
+        less, more = (other, inside) if swapped else (inside, other)
+        pairs = (
+            (less[group], min(map(more.__getitem__, against)))
+            for group, against in self._groups.conflicts(less, more.keys())
+        )
+        return min(((b, a) for a, b in pairs) if swapped else pairs, default=None)
+
+    def are_apart(self, inside: Inside, other: Inside) -> bool:
+        """Whether any anchors of two sides are kept apart."""
+        return self._groups.are_apart(inside.keys(), other.keys())
 
     def to_join(self, keyframe: KeyframeOrdinal) -> Iterator[tuple[PlaceOrdinal, KeyframeOrdinal]]:
         """The places with an anchor of this one's group, in founding order, and that anchor."""

@@ -151,7 +151,7 @@ class Rooms(PlaceMembers):
     def _may_enter(self, anchor: KeyframeOrdinal, cell: int) -> bool:
         """Whether nothing in the cell's place is kept apart from the anchor."""
         inside = self._anchors.inside(self._place_of_cell(cell))
-        return self._anchors.apart(self._anchors.own(anchor), inside) is None
+        return not self._anchors.are_apart(self._anchors.own(anchor), inside)
 
     def _place_of_cell(self, cell: int) -> PlaceOrdinal:
         return self.survivors.find(self._cell_places[cell])
@@ -218,7 +218,7 @@ class Rooms(PlaceMembers):
             closeness, cells = sums[place], len(self._own_cells[place])
             if closeness < self._drive_um * cells or closeness * pairs <= most * cells:
                 continue
-            if own and self._anchors.apart(own, self._anchors.inside(place)) is not None:
+            if own and self._anchors.are_apart(own, self._anchors.inside(place)):
                 continue
             best, most, pairs = place, closeness, cells
         return best

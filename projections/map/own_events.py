@@ -22,7 +22,6 @@ from eventsrc.envelope.commands import (
     InvalidCommand,
     Reembed,
     UnknownKind,
-    UseSettings,
     parse_command,
 )
 from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
@@ -45,7 +44,7 @@ def read_command(event: Event) -> RecordedCommand:
     """The command of an event on ``mapfold/command``. Raises FoldError."""
     try:
         command = parse_command(event.payload)
-        if isinstance(command, UseSettings):
+        if command.kind == "use-settings":
             Settings.from_document(command.settings)
     except UnknownKind as error:
         raise FoldError(

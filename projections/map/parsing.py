@@ -37,6 +37,8 @@ class ParsedEvent(NamedTuple):
 def parse_events(events: Sequence[Event]) -> list[ParsedEvent]:
     """Validate events; for sixteen or so together this is quicker than one by one."""
     enveloped = [event for event in events if event.is_envelope]
+    if not enveloped:
+        return [ParsedEvent(e.offset, e.logged_ns, _parse_own(e), []) for e in events]
     # No size limit: it applied when the event was recorded.
     outcomes = read_envelopes(enveloped, max_bytes=sys.maxsize)
     units = iter(unit_vectors([v for a in outcomes if isinstance(a, Accepted) for v in a.vectors]))

@@ -6,6 +6,7 @@ larger one and leaves keyframes with the place they joined; `KeyframeRecord.plac
 survivor up, so a merge costs little however many keyframes move.
 """
 
+from bisect import insort
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
@@ -260,12 +261,15 @@ class MapView:
         survivor = self.all_objects[delta.survivor]
         absorbed = self.objects.pop(delta.absorbed, None)
         if absorbed is not None:
-            for observation in absorbed.observations:
+            moved = tuple(absorbed.observations)
+            for observation in moved:
                 self.observations[observation].object = delta.survivor
-            survivor.observations += absorbed.observations
-            survivor.observations.sort()
+            less, more = sorted((absorbed.observations, survivor.observations), key=len)
+            for observation in less:  # to sort all would take long where an Object absorbs many
+                insort(more, observation)
+            survivor.observations = more
             survivor.confirmed |= absorbed.confirmed
-            confirm(survivor, absorbed.observations, self.observations, self.keyframes)
+            confirm(survivor, moved, self.observations, self.keyframes)
             relocations = survivor.relocations + absorbed.relocations
             survivor.relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
             absorbed.observations, absorbed.relocations, absorbed.place = [], [], None

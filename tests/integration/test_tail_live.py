@@ -4,11 +4,11 @@ import re
 import sys
 import threading
 import urllib.request
-from dataclasses import replace
 from pathlib import Path
 
 import psycopg
 import pytest
+from msgspec.structs import replace
 
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.log import ALWAYS, Event, LogWriter
