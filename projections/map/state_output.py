@@ -337,20 +337,21 @@ def space_advice(view: MapView) -> str | None:
     )
 
 
-def camera_advice(counts: Mapping[str, int], settings: Settings, log: Path) -> str | None:
-    """One line where positions depend on a camera that nothing states: how to state it in ``log``.
-    ``counts`` are those of `MapView.counts`."""
-    unstated = counts.get("without_camera", 0)
-    if not unstated:
-        return None
+def camera_advice(where: str, settings: Settings, log: Path) -> str:
+    """One line on a camera that is not stated ``where`` ("for 12 keyframes"), and what to do."""
     camera = settings.camera.constants
     return (
-        f"no camera is stated for {counted(unstated, 'keyframe')}, so boxes are read as if of"
-        f" {camera.hfov_deg:g}° and {camera.width_px:g} × {camera.height_px:g} pixels:"
-        f" `{visible(advised('calibrate', '--write'))}` estimates it, and"
-        f" `{visible(command_line('edit', log, 'use-settings'))} --set camera.hfov_deg=…"
-        " --set camera.width_px=… --set camera.height_px=… --reason …` states it"
+        f"no camera is stated {where}, so boxes are read as if of {camera.hfov_deg:g}° and"
+        f" {camera.width_px:g} × {camera.height_px:g} pixels:"
+        f" `{visible(state_camera(log))}` states it;"
+        f" `{visible(advised('calibrate', log))}` says whether the map's revisits can estimate it"
     )
+
+
+def state_camera(log: Path) -> str:
+    """The command that states the camera of a log's pictures."""
+    given = [f"--set camera.{name}=…" for name in ("hfov_deg", "width_px", "height_px")]
+    return " ".join([command_line("edit", log, "use-settings"), *given, "--reason WHY"])
 
 
 def places_advice(counts: Mapping[str, int], settings: Settings) -> str | None:

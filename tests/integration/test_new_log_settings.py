@@ -16,7 +16,7 @@ from projections.fold.settings import Settings
 from projections.map.own_events import read_corrections
 from projections.surfaces.cli.new_log import LogStart, NewLogOptions
 from tests.support.commands import PROGRAM, Commands
-from tests.support.envelopes import envelope, payload
+from tests.support.envelopes import detection, envelope, payload
 from tests.support.fixtures_log import KEY, read_log
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
 from tests.support.logs import write_log
@@ -46,6 +46,36 @@ def said_by(log: Path) -> Settings | None:
         [] if settings is None else [(0, "use-settings")]
     )
     return settings
+
+
+UNSTATED = "no camera is stated by the keyframe at offset "
+
+
+def test_a_camera_that_nothing_states_is_named_once_by_what_records_it(run: Commands) -> None:
+    """And by `log info`; neither for a classic log, nor where the settings or envelopes say it."""
+    seen = [detection("cup")]
+    stated = {"hfov_deg": 60.0, "width_px": 640.0, "height_px": 480.0}
+    for name, more in (("silent", {}), ("more", {}), ("stated", {"camera": stated})):
+        lines = [envelope(n, run_id=name, detections=seen, **more) for n in (1, 2)]
+        (run.folder / name).write_bytes(b"\n".join(map(payload, lines)))
+    full = ("--preset", "full")
+    for log, source, options, is_named in (
+        ("log", "silent", full, True),
+        ("log", "more", (), False),
+        ("other", "stated", full, False),
+        ("classic", "silent", (), False),
+        ("said", "silent", (*full, "--set", "camera.hfov_deg=60"), False),
+    ):
+        assert (UNSTATED in run("import", log, source, *options).err) is is_named
+    line = next(e for e in run("log", "info", "log").err.splitlines() if e.startswith(UNSTATED))
+    assert line.startswith(f"{UNSTATED}1, so boxes are read as if of 69.4° and 640 × 400 pixels: ")
+    assert "; `mapfold calibrate log` says whether the map's revisits can estimate it" in line
+    told = line[line.index("`mapfold ") + 1 :].split("`")[0]
+    for name, value in (("hfov_deg", "60"), ("width_px", "640"), ("height_px", "480")):
+        told = told.replace(f"{name}=…", f"{name}={value}")
+    run(*told.split()[1:])
+    for command in ("state", "log info"):
+        assert UNSTATED not in run(*command.split(), "log").err
 
 
 @pytest.mark.parametrize(
@@ -226,8 +256,9 @@ def test_a_recorder_says_them_before_its_first_message(
         words = ("--connect", endpoint, "--preset", "full", "--max-events", "1")
         recorder = start("record", str(log), *words)
         assert f"to {log} from offset {offset}" in recorder.wait_for("recording")
-        publish(KEY, payload(envelope(offset)).decode())
+        publish(KEY, payload(envelope(offset, detections=[detection("cup")])).decode())
         assert recorder.wait() == 0
+        assert len([each for each in recorder.lines if UNSTATED in each]) == 2 - offset
         told = [line for line in recorder.lines if "a new log" in line]
         assert told == [f"{log}: a new log with --preset full, said at offset 0"][: 2 - offset]
     assert said_by(log) == FULL

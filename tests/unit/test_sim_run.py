@@ -18,7 +18,7 @@ from eventsrc.envelope.ingest import Accepted, ingest
 from tests.support.logs import simulated
 from tests.support.thorough import stride
 
-WITNESS_SHA256 = "f82a71e2193354310bd068bc8511907b6972614add60546300a3515dc79960f6"
+WITNESS_SHA256 = "18dcb69627ea4b825aeeb605d019fea0b9e27f75a73a4b8415640b76f72758a1"
 """Of run a of house 7, its payloads joined by line ends. It moves only when the simulator does."""
 
 

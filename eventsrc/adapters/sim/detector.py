@@ -34,7 +34,8 @@ from .house import MODELS, House, SimulatedThing
 from .random_streams import Vector, bernoulli, direction, normal, normals, stream, uniform, unit
 
 WIDTH_PX, HEIGHT_PX = 640, 400
-HFOV_RAD = math.radians(69.4)
+HFOV_DEG = 69.4
+HFOV_RAD = math.radians(HFOV_DEG)
 FOCAL_PX = WIDTH_PX / 2 / math.tan(HFOV_RAD / 2)
 CAMERA_HEIGHT_M = 0.75
 RANGE_M = (0.5, 5.0)

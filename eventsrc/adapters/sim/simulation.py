@@ -29,7 +29,7 @@ from eventsrc.envelope.model import KeyframeId, RunId, default_det_id, stamp_ns
 from eventsrc.record.importers.json_lines import command_record
 from eventsrc.record.transport.session import Publisher, Session
 
-from .detector import detect, visible_objects
+from .detector import HEIGHT_PX, HFOV_DEG, WIDTH_PX, detect, visible_objects
 from .drive import Stop, TruePose, drive, keyframes, nearest_by_route
 from .floorplan import HALL, OPENING_M, Point, Room, wrap
 from .house import House, build_house
@@ -163,6 +163,7 @@ def _keyframe(
         "keyframe_id": number,
         "timestamp": round(start_s + pose.time_s, 3),
         **noisy_pose(pose, rng),
+        "camera": {"hfov_deg": HFOV_DEG, "width_px": WIDTH_PX, "height_px": HEIGHT_PX},
         "detections": [
             {"det_id": default_det_id(run_id, KeyframeId(number), index), **detection.fields}
             for index, detection in enumerate(detections)

@@ -3,11 +3,13 @@ questions."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
-from eventsrc.base.text import counted, table, visible
+from eventsrc.base.text import command_line, counted, table, visible
 from projections.localize.evaluate.own_questions import own_scores
 from projections.localize.relocalize import UNKNOWN_BELOW
+from projections.map.state_output import state_camera
 
 from .field_of_view import LEAST_OBSERVATIONS, LEAST_THINGS, FieldOfView
 from .likenesses import FEWEST_DIFFERENT
@@ -38,7 +40,7 @@ def readings(calibration: Calibration) -> list[Reading]:
     return [*calibration.last.readings, *calibration.last.sizes]
 
 
-def document(calibration: Calibration) -> dict[str, Any]:
+def document(calibration: Calibration, log: Path) -> dict[str, Any]:
     """JSON. ``name`` is what ``--set`` takes."""
     last = calibration.last
     return {
@@ -61,11 +63,11 @@ def document(calibration: Calibration) -> dict[str, Any]:
         ],
         "camera": _camera_document(calibration.field),
         "localiser": localiser_document(calibration.own),
-        "hints": list(hints(calibration)),
+        "hints": list(hints(calibration, log)),
     }
 
 
-def text(calibration: Calibration, *, all_: bool = False) -> str:
+def text(calibration: Calibration, log: Path, *, all_: bool = False) -> str:
     """A line on what it rests on, a table of the constants, and the hints."""
     last = calibration.last
     rests_on = (
@@ -89,7 +91,7 @@ def text(calibration: Calibration, *, all_: bool = False) -> str:
         lines.append(f"… and the sizes of {len(sizes) - len(shown):,} more (--all shows them)")
     lines += _camera_lines(calibration)
     lines += localiser_text(calibration.own).splitlines()
-    return "".join(f"{line}\n" for line in [*lines, *hints(calibration)])
+    return "".join(f"{line}\n" for line in [*lines, *hints(calibration, log)])
 
 
 def _camera_lines(calibration: Calibration) -> list[str]:
@@ -146,8 +148,8 @@ def _number(value: float | str | None) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def hints(calibration: Calibration) -> Iterator[str]:
-    """Obstacles to a better calibration, with the next step where there is one."""
+def hints(calibration: Calibration, log: Path) -> Iterator[str]:
+    """Obstacles to a better calibration of a log, with the next step where there is one."""
     last, camera = calibration.last, calibration.calibrated.camera.constants
     if not calibration.observations:
         yield "no observation with a pose is of an object: all constants are priors"
@@ -182,15 +184,16 @@ def hints(calibration: Calibration) -> Iterator[str]:
         yield (
             f"no camera is stated for {counted(calibration.unstated, 'keyframe')}, and fewer than"
             f" {LEAST_THINGS} things were seen {LEAST_OBSERVATIONS} times whole, too few to"
-            f" estimate its field of view: give it, --set camera.hfov_deg=… (now"
-            f" {camera.hfov_deg:g})"
+            f" estimate its field of view, now taken for {camera.hfov_deg:g}°:"
+            f" `{visible(state_camera(log))}` states it"
         )
     for fault in last.camera:
         yield _camera_hint(fault, camera.hfov_deg)
     if calibration.settings.fusion != "evidence":
+        full = command_line("edit", log, "use-settings", "--preset", "full", "--reason", "WHY")
         yield (
             "the map is folded with fusion=page, so its objects do not depend on these, only"
-            " re-localisation does; --set fusion=evidence --write switches the log to fusion by"
+            f" re-localisation does; `{visible(full)}` makes places rooms and fuses objects by"
             " evidence"
         )
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import advised, counted
 from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
 from projections.edit import make
@@ -96,9 +96,11 @@ def calibrate_command(
     if not write:
         found = _calibrated(log, chosen)
         if json_:
-            emit(document(found) | {"recorded": None})
+            emit(document(found, log) | {"recorded": None})
         else:
-            display(text(found, all_=all_))
+            display(text(found, log, all_=all_))
+        if found.field is not None:
+            say(f"`{advised('calibrate', log, '--write')}` records the camera and the constants")
         return
     stamp = Stamp(uuid.uuid4().hex, user_at_host() if issued_by is None else issued_by, reason)
     with Bar() as bar:
@@ -119,14 +121,14 @@ def calibrate_command(
         keep_effect(made)
     if json_:
         recorded = None if made is None else recorded_document(made)
-        emit(document(found) | {"recorded": recorded})
+        emit(document(found, log) | {"recorded": recorded})
     else:
         last = (
             "the log has these constants already; nothing is recorded"
             if made is None
             else recorded_text(made)
         )
-        display(text(found, all_=all_) + last)
+        display(text(found, log, all_=all_) + last)
 
 
 def _calibrated(log: Path, chosen: Callable[[Corrections], Settings]) -> Calibration:

@@ -28,7 +28,7 @@ from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines
 from .folded_log import classes_advice
-from .new_log import LogStart, NewLogOptions
+from .new_log import LogStart, NewLogOptions, say_camera
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -130,6 +130,7 @@ def import_(
         rejects.say_rest()
         say(_kept(log, interrupted))
         start.say_recorded(writer, as_source=interrupted.report.began_as_source)
+        say_camera(log, interrupted.report.first_offset)
         raise
     rejects.say_rest()
     if json_:
@@ -143,6 +144,7 @@ def import_(
             " used"
         )
     start.say(as_source=report.began_as_source)
+    say_camera(log, report.first_offset)
     say(_summary(log, report))
     for line in _passed_over(log, report):
         say(line)

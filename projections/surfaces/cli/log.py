@@ -30,6 +30,7 @@ from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 
 from .event_text import event_document, event_line, iso_time
 from .folded_log import LogArgument
+from .new_log import say_camera
 from .options import JsonOption
 from .terminal import Bar, display, emit, emit_lines, finish, say
 
@@ -103,6 +104,7 @@ def info(log: LogArgument, json_: JsonOption = False) -> None:
         emit(info_document(report))
     else:
         display(_info_text(report))
+    say_camera(log)
 
 
 def info_document(report: LogInfo) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from eventsrc.base.text import counted, visible
 from projections.map.confirmed import objects_text
 from projections.map.digest import map_digest
 from projections.map.state_output import (
-    camera_advice,
     places_advice,
     space_advice,
     state_document,
@@ -67,11 +66,10 @@ def state(
     if digest:
         return
     counts = view.counts()
-    of_camera = camera_advice(counts, settings, source.log)
     seen = view.observations
     is_numbered = bool(seen) and all(each.class_name.isdecimal() for each in seen)
     of_classes = classes_advice(source.log) if is_numbered else None
-    for advice in (places_advice(counts, settings), space_advice(view), of_camera, of_classes):
+    for advice in (places_advice(counts, settings), space_advice(view), of_classes):
         if advice is not None:
             say(advice)
 

@@ -4,6 +4,7 @@ A log is new as long as it has no events. A command with other settings than a l
 the error names the `edit` that changes them.
 """
 
+import sys
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ import typer
 from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError
 from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.commands import UseSettings, encode_command
+from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.importers.known_log import KnownCommands
@@ -24,6 +27,7 @@ from projections.fold.map_errors import FoldError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings
 from projections.map.own_events import read_commands
+from projections.map.state_output import camera_advice
 
 from .folded_log import NamedSettings, complete_preset
 from .options import user_at_host
@@ -194,6 +198,22 @@ class LogStart:
                 f" rooms and objects have positions: `{change}`"
             )
             say(visible(line))
+
+
+def say_camera(log: Path, start: Offset = FIRST_OFFSET) -> None:
+    """Print a line where the positions of things depend on the camera and the log's first keyframe
+    that shows something states none. Only if that is at ``start`` or later: the command that
+    records it says so once. Damage is passed over."""
+    settings = compile_corrections(_known_commands(log, is_needed=False)).settings
+    if settings is None or not settings.wants_camera:
+        return
+    with LogReader(log) as reader:
+        for event in reader.read(on_gap=lambda _: None):
+            found = ingest(event.payload, max_bytes=sys.maxsize) if event.is_envelope else None
+            if isinstance(found, Accepted) and found.envelope.detections:
+                if event.offset >= start and found.envelope.camera is None:
+                    say(camera_advice(f"by the keyframe at offset {event.offset}", settings, log))
+                return
 
 
 def _change(options: Sequence[str]) -> list[str]:

@@ -34,7 +34,7 @@ from .bridge_options import (
     warn_of_silence,
 )
 from .folded_log import classes_advice
-from .new_log import LogStart, NewLogOptions
+from .new_log import LogStart, NewLogOptions, say_camera
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
@@ -138,6 +138,7 @@ def record(
         LogWriter(log, fsync=policy, sealing_process=True) as writer,
     ):
         say_restart(log, writer)
+        start = writer.next_offset
         LogStart.of(log, writer, new_log, is_ros=ros2dds).record(writer)
         ledger = _gap_history(log)
         bridge = open_bridge(choice, writer, ledger) if ros2dds else None
@@ -169,6 +170,7 @@ def record(
                 say(line)
             if streams and all(0 < each.numbered == each.detections for each in streams.values()):
                 say(classes_advice(log))
+    say_camera(log, start)
     summary.finish()
 
 

@@ -117,8 +117,10 @@ def relocalize(
                 )
             search = ExactIndex(view).search
             say_defaults(settings)
-            if (advice := camera_advice(view.counts(), settings, log)) is not None:
-                say(advice)
+            unstated = view.without_camera() if settings.wants_camera else 0
+            if unstated and (camera or (None if track else question.camera)) is not None:
+                where = f"for {counted(unstated, 'keyframe')} of the map, as it is for the question"
+                say(camera_advice(where, settings, log))
         if track:
             print_tracked(lines, search, top=top, camera=camera)
         else:

@@ -19,7 +19,7 @@ from eventsrc.log import LogReader
 from eventsrc.record.transport.config import parse_address
 from projections.fold.settings import Settings
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
-from projections.map.state_output import camera_advice, places_advice
+from projections.map.state_output import places_advice
 from projections.postgres import (
     ForeignEmbedding,
     RebuildReport,
@@ -211,7 +211,6 @@ def _print_rebuilt(
     for line in (
         left_out(log, settings, report, logged),
         places_advice(counts, settings),
-        camera_advice(counts, settings, log),
     ):
         if line is not None:
             say(line)

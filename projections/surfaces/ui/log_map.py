@@ -213,9 +213,9 @@ class LogMap:
                 f"none of the {counted(len(history.keyframes), 'keyframe')} has a pose, so there"
                 " are no places and there is nothing to draw"
             )
-        counts, settings = {"without_camera": self._without_camera()}, self.timeline.settings
-        if (advice := camera_advice(counts, settings, self.opened.log)) is not None:
-            found.append(advice)
+        if unstated := self._without_camera():
+            where = f"for {counted(unstated, 'keyframe')}"
+            found.append(camera_advice(where, self.timeline.settings, self.opened.log))
         return found
 
     def _without_camera(self) -> int:
