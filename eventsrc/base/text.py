@@ -10,11 +10,16 @@ Messages advise command lines, made by `advised` so that they can be pasted into
 that raises an error does not have the options of the running command. So the program sets one
 function that adds them (`complete_by`). In programs other than ``mapfold`` nothing is added, and
 LOG stands for the log.
+
+Texts name things by whole ids. What prints them sets the function that shortens these ids
+(`shorten_by`, `shortening`): tables apply it to their cells, `shortened` to other text.
 """
 
+import contextlib
 import re
 import shlex
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import Final
 
 
@@ -27,7 +32,7 @@ def table(
     header: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()
 ) -> str:
     """Rows under the header in columns two spaces apart; ``right`` names those aligned right."""
-    cells = [list(header), *(list(row) for row in rows)]
+    cells = [list(header), *([shortened(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     to_right = [name in right for name in header]
     lines = (
@@ -38,6 +43,33 @@ def table(
         for row in cells
     )
     return "".join(f"{line}\n" for line in lines)
+
+
+Shorten = Callable[[str], str]
+"""Receives a text; returns it with shorter ids."""
+
+_shorten: ContextVar[Shorten | None] = ContextVar("shorten", default=None)
+
+
+def shorten_by(shorten: Shorten | None) -> None:
+    """Set the function that shortens ids in texts of this thread; None leaves them as they are."""
+    _shorten.set(shorten)
+
+
+@contextlib.contextmanager
+def shortening(shorten: Shorten) -> Iterator[None]:
+    """Shorten ids by this function inside."""
+    before = _shorten.set(shorten)
+    try:
+        yield
+    finally:
+        _shorten.reset(before)
+
+
+def shortened(text: str) -> str:
+    """``text`` with ids as short as the function of `shorten_by` makes them."""
+    shorten = _shorten.get()
+    return text if shorten is None else shorten(text)
 
 
 _UNSAFE: Final = re.compile(

@@ -13,7 +13,7 @@ from projections.fold.corrections import Corrections, Keyframe, RecordedCommand,
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
-from projections.map.naming import NoSuchThing, Thing, thing_called, things_of
+from projections.map.naming import NoSuchThing, ShortIds, Thing, thing_called, things_of
 from projections.map.own_events import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
@@ -104,6 +104,14 @@ class MapToEdit:
     def things(self) -> list[Thing]:
         """The places and objects of the map, by what they may be called."""
         return things_of(self.view)
+
+    @cached_property
+    def _short_ids(self) -> ShortIds:
+        return ShortIds.of(self.things)
+
+    def shortened(self, text: str) -> str:
+        """A text with short ids, once the map is folded."""
+        return text if self._view is None else self._short_ids.text(text)
 
     def run(self, run_id: str) -> list[KeyframeRecord]:
         """The keyframes of a run. Raises NoSuchThing with the runs there are."""

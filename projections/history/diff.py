@@ -23,6 +23,7 @@ from projections.ask.object_changes import (
 )
 from projections.fold.corrections import RecordedCommand
 from projections.map.digest import map_digest
+from projections.map.naming import ShortIds, things_of
 from projections.map.phrases import command_document
 from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
@@ -162,8 +163,8 @@ class Difference:
     """The difference of the map after ``start`` events and that after ``end``.
 
     ``absorbed`` gives, by id of an absorbed place, the surviving place and the cause; it is empty
-    when ``end`` < ``start``. ``became`` is about the changed objects. ``commands`` are those that
-    one of the maps knows and the other not.
+    when ``end`` < ``start``. ``became`` is about the changed objects. ``short_ids`` are of both
+    maps together. ``commands`` are those that one of the maps knows and the other not.
     """
 
     start: Offset
@@ -176,6 +177,7 @@ class Difference:
     edges: Changes[tuple[str, str], EdgeRow]
     absorbed: dict[str, tuple[str, Cause]]
     became: ObjectChanges
+    short_ids: ShortIds
     commands: tuple[RecordedCommand, ...] = ()
 
     @property
@@ -252,6 +254,7 @@ def difference_of(
         edges=changes(before.edges, after.edges),
         absorbed=absorbed,
         became=became(first, second, before.objects, after.objects),
+        short_ids=ShortIds.of([*things_of(first), *things_of(second)]),
         commands=tuple(commands),
     )
 

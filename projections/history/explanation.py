@@ -15,6 +15,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal, Pose
 from projections.fold.exact import mean_m
+from projections.map.confirmed import objects_text
 from projections.store.history import NEVER, History
 from projections.store.history_records import Cause, Merge, PlaceHistory, count_before
 
@@ -191,18 +192,21 @@ def _standing_place_summary(history: History, record: PlaceHistory, end: Offset)
 
 
 def _objects_text(history: History, place: PlaceOrdinal, end: Offset) -> str:
-    classes = Counter(
-        each.class_name
+    inside = [
+        each
         for each, record in zip(history.objects_at(end), history.objects, strict=False)
         if each.place == place and record.stands(end)
-    )
-    if not classes:
+    ]
+    if not inside:
         return "no objects"
+    classes = Counter(each.class_name for each in inside if each.confirmed)
+    if not classes:
+        return objects_text(inside)
     most = sorted(classes.items(), key=lambda item: (-item[1], item[0]))
     named = ", ".join(name if count == 1 else f"{name} ×{count}" for name, count in most[:8])
     others = len(most) - 8
     more = f" and {others} more {'class' if others == 1 else 'classes'}" if others > 0 else ""
-    return f"{counted(classes.total(), 'object')}: {named}{more}"
+    return f"{objects_text(inside)}: {named}{more}"
 
 
 def _neighbours_text(history: History, place: PlaceOrdinal, end: Offset) -> str:

@@ -17,7 +17,15 @@ from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError, LogPointError
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent, fold_events, new_map
-from projections.map.naming import Kind, NoSuchThing, SeveralThings, Thing, thing_called
+from projections.map.naming import (
+    Kind,
+    NoSuchThing,
+    SeveralThings,
+    ShortIds,
+    Thing,
+    thing_called,
+    things_of,
+)
 from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 from projections.store.history import History
@@ -178,6 +186,10 @@ class KnownHistory:
         """What may be called by a name after ``end`` events; see `things_at`."""
         history = self.covering(end)
         return things_at(history, self._recorder.at(end))
+
+    def short_ids(self, end: Offset) -> ShortIds:
+        """The short ids of the map after ``end`` events."""
+        return ShortIds.of(things_of(self.at(end)))
 
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which

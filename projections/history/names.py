@@ -1,9 +1,11 @@
 """Names of keyframes and places in a history, and what in it may be called by a name."""
 
+from dataclasses import replace
+
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from projections.fold.corrections import Keyframe
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
-from projections.map.naming import NoSuchThing, Thing, things_of
+from projections.map.naming import NoSuchThing, Standing, Thing, things_of
 from projections.map.view import MapView
 from projections.store.history import History
 
@@ -60,12 +62,25 @@ def find_keyframe(history: History, text: str) -> KeyframeOrdinal:
 def things_at(history: History, view: MapView) -> list[Thing]:
     """The Places and Objects of a map of this history; then those that only come later, which have
     their ids alone."""
-    later: list[Thing] = [
-        Thing("place", place.formed.place, place.place_id, stands=False)
-        for place in history.places[len(view.all_places) :]
-    ]
-    later += [
-        Thing("object", each.found.object, each.object_id, stands=False)
-        for each in history.objects[len(view.all_objects) :]
-    ]
-    return [*things_of(view), *later]
+    found = [_with_event(history, each) for each in things_of(view)]
+    for place in history.places[len(view.all_places) :]:
+        fate = f"founded later, at offset {place.formed.offset:,}"
+        found.append(
+            Thing("place", place.formed.place, place.place_id, standing=Standing.LATER, fate=fate)
+        )
+    for each in history.objects[len(view.all_objects) :]:
+        fate = f"found later, at offset {each.found.offset:,}"
+        found.append(
+            Thing("object", each.found.object, each.object_id, standing=Standing.LATER, fate=fate)
+        )
+    return found
+
+
+def _with_event(history: History, thing: Thing) -> Thing:
+    """A thing of a map; one that was merged with the event that did it."""
+    if thing.stands:
+        return thing
+    records = history.places if thing.kind == "place" else history.objects
+    merge = records[thing.ordinal].absorbed_by
+    at = "" if merge is None else f" at offset {merge.cause.offset:,}"
+    return replace(thing, fate=f"{thing.fate}{at}")

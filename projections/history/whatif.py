@@ -12,7 +12,7 @@ from eventsrc.envelope.model import DetId, Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
-from projections.map.naming import NoSuchThing
+from projections.map.naming import NoSuchThing, ShortIds
 from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.map.phrases import command_document, command_name
 from projections.store.history import NEVER
@@ -124,6 +124,13 @@ class WhatIf:
     def all(self) -> tuple[Alternative, ...]:
         """The base and its alternatives."""
         return (self.base, *self.alternatives)
+
+    def short_ids(self) -> ShortIds:
+        """The short ids of the places of all these maps together."""
+        results = [each.result for each in self.all]
+        places = [{*result.places, *result.names} - {None} for result in results]
+        names = [name for result in results for name in result.names.values()]
+        return ShortIds(sorted({place for each in places for place in each if place}), (), names)
 
     def document(self) -> dict[str, Any]:
         """JSON: settings in full for the base, changed ones for each alternative."""

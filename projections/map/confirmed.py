@@ -48,9 +48,17 @@ def confirm(
 
 def objects_text(objects: Collection[ObjectRecord]) -> str:
     """``142 objects + 695 seen once``: those that are confirmed, and the others."""
-    confirmed = sum(found.confirmed for found in objects)
-    once = len(objects) - confirmed
-    return counted(confirmed, "object") + (f" + {once:,} seen once" if once else "")
+    return counts_text(len(objects), seen_once(objects))
+
+
+def seen_once(objects: Iterable[ObjectRecord]) -> int:
+    """The number of those that are not confirmed."""
+    return sum(not found.confirmed for found in objects)
+
+
+def counts_text(objects: int, once: int) -> str:
+    """`objects_text` for this many Objects, ``once`` of them seen once."""
+    return counted(objects - once, "object") + (f" + {once:,} seen once" if once else "")
 
 
 def _is_apart(first: KeyframeRecord, later: KeyframeRecord) -> bool:

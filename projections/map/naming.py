@@ -11,7 +11,8 @@
 
 So no name hides an id. Letter case matters in ids only; where a name, type or class is written
 exactly as asked, others that differ in case do not count. Things that were merged into others have
-their ids only, and a short id means one of them only if it means none that stands.
+their ids only, and a short id means one of them only if it means none that stands; one that only
+comes later, only if it means none of these.
 """
 
 import difflib
@@ -37,6 +38,15 @@ LEAST_DIGITS: Final = 6
 """Hexadecimal digits of the shortest short id of an Object."""
 
 _PLACE_NUMBER = re.compile(r".*_(p[0-9]+)", re.DOTALL)
+_IDS_IN_TEXT = re.compile(
+    r"""
+    "[^"\n]*"  # a name, which stays as it is
+    | (?<![\w/.:-]) obj-[0-9a-f]+ (?![\w/-])
+    | _ (p[0-9]+) (?! [\w/-] | :[0-9] | \.\w )  # no run, keyframe, detection or file
+    """,
+    re.VERBOSE,
+)
+_INSIDE_A_WORD = re.compile(r"[\w/.:-]")
 _DIGITS = re.compile(rf"(?:obj-)?([0-9a-f]{{{LEAST_DIGITS},}})")
 
 Kind = Literal["place", "object"]
@@ -52,21 +62,35 @@ class Rule(IntEnum):
     CLASS = 5
 
 
+class Standing(IntEnum):
+    """Whether a thing stands in a map, was merged into another, or comes later."""
+
+    STANDS = 0
+    MERGED = 1
+    LATER = 2
+
+
 @dataclass(frozen=True, slots=True)
 class Thing:
     """A Place or an Object by what it may be called. ``word`` is its type or class, ``name`` what a
-    command called it, ``stands`` false for one that was merged into another or comes later.
-    ``count`` are its keyframes or sightings; ``spot`` is in metres; ``place`` an Object's."""
+    command called it, ``fate`` what became of one that does not stand. ``count`` are its keyframes
+    or sightings; ``spot`` is in metres; ``place`` an Object's."""
 
     kind: Kind
     ordinal: int
     id: str
     word: str | None = None
     name: str | None = None
-    stands: bool = True
+    standing: Standing = Standing.STANDS
     count: int = 0
     spot: tuple[float, float] | None = None
     place: str | None = None
+    fate: str | None = None
+
+    @property
+    def stands(self) -> bool:
+        """Whether it is in the map."""
+        return self.standing is Standing.STANDS
 
     def __str__(self) -> str:
         """The id and what tells it apart: ``run_p3 (kitchen, 12 keyframes at (1.20, 3.40))``."""
@@ -78,7 +102,7 @@ class Thing:
             seen = counted(self.count, "keyframe" if of_place else "time")
             at = f"at ({self.spot[0]:.2f}, {self.spot[1]:.2f})"
             parts.append(f"{seen} {at}" if of_place else f"seen {seen} {at}")
-        parts += [] if self.stands else ["merged, or not there yet"]
+        parts += [] if self.fate is None else [visible(self.fate)]
         return f"{visible(self.id)} ({', '.join(parts)})" if parts else visible(self.id)
 
 
@@ -99,39 +123,40 @@ class NoSuchThing(MisuseError):
 
 
 class SeveralThings(MisuseError):
-    """A text means several Places or Objects; the message lists them."""
+    """A text means several Places or Objects; the message lists them, one a line."""
 
     def __init__(self, text: str, found: Sequence[Thing]) -> None:
-        listed = "; ".join(map(str, found[:MOST_LISTED]))
+        listed = "".join(f"\n  {thing}" for thing in found[:MOST_LISTED])
         more = len(found) - MOST_LISTED
-        rest = f" and {more:,} more" if more > 0 else ""
+        rest = f"\n  and {more:,} more" if more > 0 else ""
         kinds = {thing.kind for thing in found}
         what = counted(len(found), kinds.pop() if len(kinds) == 1 else "thing")
-        super().__init__(f"{text!r} means {what}: {listed}{rest}; give an id")
+        super().__init__(f"{text!r} means {what}; give the id of one:{listed}{rest}")
 
 
 def matches(text: str, things: Iterable[Thing]) -> tuple[Rule | None, list[Thing]]:
     """The things that a text means, in their order, and the rule by which; None for none."""
-    found: dict[tuple[Rule, bool, bool], list[Thing]] = {}
+    found: dict[tuple[Rule, bool, Standing], list[Thing]] = {}
     folded = text.casefold()
     room = NAMES.get(folded)
     digits = _DIGITS.fullmatch(text)
     start = "" if digits is None else f"obj-{digits[1]}"
 
-    def rank(thing: Thing) -> tuple[Rule, bool, bool] | None:
+    def rank(thing: Thing) -> tuple[Rule, bool, Standing] | None:
         """The rule, then what comes later among what it finds: the other case, the merged."""
         name, word, is_place = thing.name, thing.word, thing.kind == "place"
         if thing.id == text:
-            return Rule.ID, False, False
+            return Rule.ID, False, Standing.STANDS
         if name is not None and thing.stands and name.casefold() == folded:
-            return Rule.NAME, name != text, False
+            return Rule.NAME, name != text, thing.standing
         if _place_number(thing.id) == text if is_place else start and thing.id.startswith(start):
-            return Rule.SHORT, False, not thing.stands
+            return Rule.SHORT, False, thing.standing
         if word is None or not thing.stands:
             return None
         if is_place:
-            return (Rule.TYPE, False, False) if word in (room, folded) else None
-        return (Rule.CLASS, word != text, False) if word.casefold() == folded else None
+            return (Rule.TYPE, False, thing.standing) if word in (room, folded) else None
+        same = word.casefold() == folded
+        return (Rule.CLASS, word != text, thing.standing) if same else None
 
     for thing in things:
         ranked = rank(thing)
@@ -180,26 +205,33 @@ def things_of(view: MapView) -> list[Thing]:
                 place.place_id,
                 None if kind is None else kind.type,
                 place.name,
-                stands,
+                Standing.STANDS if stands else Standing.MERGED,
                 place.keyframe_count,
                 (place.centroid_x, place.centroid_y) if place.keyframe_count else None,
+                fate=None if stands else _merged(view.place_id(view.survivors.find(place.ordinal))),
             )
         )
     for each in view.all_objects:
         stands = each.ordinal in view.objects
+        survivor = view.all_objects[view.object_survivors.find(each.ordinal)]
         found.append(
             Thing(
                 "object",
                 each.ordinal,
                 each.object_id,
                 each.class_name,
-                stands=stands,
+                standing=Standing.STANDS if stands else Standing.MERGED,
                 count=each.obs_count,
                 spot=each.spot if each.obs_count else None,
                 place=view.place_id(each.place),
+                fate=None if stands else _merged(survivor.object_id),
             )
         )
     return found
+
+
+def _merged(into: str | None) -> str:
+    return f"merged into {into}"
 
 
 class ShortIds:
@@ -213,6 +245,8 @@ class ShortIds:
         short = {place: n for place, n in numbers.items() if n is not None and used[n] == 1}
         short |= _beginnings(sorted(set(objects)))
         self._short = {whole: part for whole, part in short.items() if part not in given}
+        self._shown = {visible(whole): part for whole, part in self._short.items()}
+        self._numbered = {part: whole for whole, part in self._shown.items()}
 
     @classmethod
     def of(cls, things: Sequence[Thing]) -> "ShortIds":
@@ -226,6 +260,25 @@ class ShortIds:
     def __call__(self, whole: str) -> str:
         """The short form of an id; other texts as they are."""
         return self._short.get(whole, whole)
+
+    def text(self, text: str) -> str:
+        """A text with the short form of each id in it, but not between double quotes. Ids that are
+        part of other words stay: of detections, keyframes, files."""
+        parts: list[str] = []
+        done = 0
+        for found in _IDS_IN_TEXT.finditer(text):
+            whole = found[0] if found[1] is None else self._numbered.get(found[1], "")
+            start = found.end() - len(whole)
+            if (
+                whole not in self._shown
+                or start < done
+                or not text.startswith(whole, start)
+                or _INSIDE_A_WORD.match(text[start - 1 : start])
+            ):
+                continue
+            parts += (text[done:start], self._shown[whole])
+            done = found.end()
+        return "".join([*parts, text[done:]])
 
 
 def _place_number(place_id: str) -> str | None:

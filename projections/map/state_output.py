@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from eventsrc.base.text import advised, command_line, counted, visible
+from eventsrc.base.text import advised, command_line, counted, table, visible
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import MapGiven, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
@@ -289,25 +289,21 @@ def _place_lines(view: MapView, *, everything: bool) -> list[str]:
         if record.place is not None and (everything or record.confirmed):
             objects[record.place] += 1
     shown = list(view.places.items())[:_MAX_PLACES]
-    width = max(len(place.place_id) for place in view.places.values())
-    name_width = max((len(place.name) for _, place in shown if place.name is not None), default=0)
-    named = f"  {'name':<{max(name_width, 4)}}" if name_width else ""
-    floors = {ordinal: _shown_floor(view.floor_of(ordinal)) for ordinal, _ in shown}
-    floor_width = max(5, *map(len, floors.values())) if view.floors else 0
-    named += f"  {'floor':<{floor_width}}" if floor_width else ""
-    types = {ordinal: _shown_type(view.type_of(ordinal)) for ordinal, _ in shown}
-    type_width = max(4, *map(len, types.values())) if any(types.values()) else 0
-    named += f"  {'type':<{type_width}}" if type_width else ""
-    lines = [f"{'place':<{width}}{named}  keyframes  objects  centroid (m)        next to"]
-    for ordinal, place in shown:
-        centroid = f"({place.centroid_x:.2f}, {place.centroid_y:.2f})"
-        name = f"  {place.name or '':<{max(name_width, 4)}}" if name_width else ""
-        name += f"  {floors[ordinal]:<{floor_width}}" if floor_width else ""
-        name += f"  {types[ordinal]:<{type_width}}" if type_width else ""
-        lines.append(
-            f"{place.place_id:<{width}}{name}  {place.keyframe_count:>9}  {objects[ordinal]:>7}  "
-            f"{centroid:<18}  {', '.join(neighbours[ordinal])}".rstrip()
-        )
+    columns: dict[str, list[str]] = {"place": [place.place_id for _, place in shown]}
+    if any(place.name is not None for _, place in shown):
+        columns["name"] = [place.name or "" for _, place in shown]
+    if view.floors:
+        columns["floor"] = [_shown_floor(view.floor_of(ordinal)) for ordinal, _ in shown]
+    if any(types := [_shown_type(view.type_of(ordinal)) for ordinal, _ in shown]):
+        columns["type"] = types
+    columns |= {
+        "keyframes": [str(place.keyframe_count) for _, place in shown],
+        "objects": [str(objects[ordinal]) for ordinal, _ in shown],
+        "centroid (m)": [f"({p.centroid_x:.2f}, {p.centroid_y:.2f})" for _, p in shown],
+        "next to": [", ".join(neighbours[ordinal]) for ordinal, _ in shown],
+    }
+    rows = zip(*columns.values(), strict=True)
+    lines = table([*columns], rows, right=("keyframes", "objects")).rstrip("\n").split("\n")
     if len(view.places) > _MAX_PLACES:
         lines.append(f"… and {len(view.places) - _MAX_PLACES} more places; --json lists all")
     return lines

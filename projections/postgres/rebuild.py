@@ -23,6 +23,7 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
+from projections.map.confirmed import seen_once
 from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
@@ -94,7 +95,7 @@ class RebuildReport:
 
     ``foreign`` is the first embedding that was left out because it is outside the map's space.
     ``workers`` is how many processes were started to parse the log, ``lost_workers`` how many of
-    them died: their part was parsed here.
+    them died: their part was parsed here. ``seen_once`` is the number of Objects seen once.
     """
 
     events: int
@@ -107,6 +108,7 @@ class RebuildReport:
     foreign: ForeignEmbedding | None = None
     workers: int = 0
     lost_workers: int = 0
+    seen_once: int = 0
 
 
 def rebuild(
@@ -175,6 +177,7 @@ def rebuild(
                 first_foreign_embedding(fold, reader),
                 parsed.started,
                 parsed.lost,
+                seen_once(fold.view.objects.values()),
             )
 
 

@@ -32,7 +32,8 @@ log, a line says how many events of later times a time takes in.
 A place or object may be called, first one that fits: by its id; by the name that `edit name-place`
 gave; shortly, `p3`, or six or more of the first characters of an object's id, with or without
 `obj-`; by a type of room, such as `kitchen`; by a class. Case matters in ids only. Where several
-fit, an error lists them with what tells them apart.
+fit, an error lists them with what tells them apart. Text names things by ids that are as short as
+the map allows; JSON has whole ids.
 
 This page is made from the commands themselves by `scripts/update_docs`.
 """

@@ -36,9 +36,9 @@ def test_state_says_which_floor_a_keyframe_and_a_place_is_on(mapfold: Commands, 
     header, *rows = text.splitlines()[-4:]
     assert header.split()[:2] == ["place", "floor"]
     assert [row.split()[:2] for row in rows] == [
-        ["run-a_p0", "ground"],
-        ["run-a_p1", "1"],
-        ["run-a_p2", "-"],
+        ["p0", "ground"],
+        ["p1", "1"],
+        ["p2", "-"],
     ]
 
 

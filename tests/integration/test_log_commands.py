@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,11 @@ def test_a_rotten_log(run: Commands) -> None:
     assert report["segments"][0]["kept_copy"] == "00000000000000000000.mcap.damaged"
     assert run("log", "info", "L", "--json").json["lost"] == 5
     run("import", "L", "-", stdin=PAYLOADS[0])
-    assert run("log", "cat", "L", "--json", "--from", "5").lines[0]["offset"] == 5
+    (event, *_) = run("log", "cat", "L", "--json", "--from", "5").lines
+    assert event["offset"] == 5
+    for name in ("logged", "stamp"):
+        since = datetime.fromisoformat(event[name]) - datetime(1970, 1, 1, tzinfo=UTC)
+        assert since // timedelta(microseconds=1) == event[f"{name}_ns"] // 1000
 
 
 def test_a_flip_that_touches_no_event_loses_none(run: Commands) -> None:

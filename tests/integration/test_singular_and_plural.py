@@ -21,18 +21,18 @@ _ONES = re.compile(
 def mapfold(tmp_path: Path) -> Commands:
     """Beside a log of three keyframes; the third makes two places of one keyframe one.
 
-    A cup is seen twice, then another cup and a thing of each of eight classes.
+    A cup is seen twice, then another cup and a thing of each of eight classes; all of these twice
+    in the log ``again``.
     """
     cup, *more = [detection("cup", [1.0, 0.0]), detection("cup", [0.0, 1.0])]
     more += [detection(f"thing {n}", [1.0, 0.0]) for n in range(8)]
-    write_log(
-        tmp_path / "log",
-        [
-            envelope(1, 0.0, detections=[cup]),
-            envelope(2, 1.0, detections=[cup]),
-            envelope(3, 0.5, detections=more),
-        ],
-    )
+    drive = [
+        envelope(1, 0.0, detections=[cup]),
+        envelope(2, 1.0, detections=[cup]),
+        envelope(3, 0.5, detections=more),
+    ]
+    write_log(tmp_path / "log", drive)
+    write_log(tmp_path / "again", [*drive, envelope(4, 1.0, detections=more)])
     (tmp_path / "flat.json").write_text(json.dumps([{"embedding": [1.0]}]))
     return Commands.in_folder(tmp_path)
 
@@ -44,11 +44,12 @@ def mapfold(tmp_path: Path) -> Commands:
         (("diff", "log", "2", "3", *_LONE), "(1 keyframe) into"),
         (("diff", "log", "3", "0", *_LONE), None),
         (("diff", "log", "2", "1", *_LONE), "seen 2 → 1 time\n"),
-        (("why", "log", "run-a_p0", *_LONE), "10 objects: cup ×2, thing 0, thing 1, "),
-        (("why", "log", "run-a_p0", *_LONE), "thing 6 and 1 more class; next to"),
+        (("why", "log", "p0", *_LONE), "1 object + 9 seen once: cup; next to"),
+        (("why", "again", "p0", *_LONE), "10 objects: cup ×2, thing 0, thing 1, "),
+        (("why", "again", "p0", *_LONE), "thing 6 and 1 more class; next to"),
         (("why", "log", "--same", "run-a:1", "run-a:2", "--set", "min_samples=2"), "1 event after"),
         (("draw", "log", "--out", "all.svg", "--all"), " seen once, "),
-        (("merges", "log", "--show", "1", *_LONE), "absorbed  run-a_p1, 1 keyframe"),
+        (("merges", "log", "--show", "1", *_LONE), "absorbed  p1, 1 keyframe"),
         (("state", "log", "--at", "1", *_LONE), "1 place"),
         (
             ("draw", "log", "--at", "1", "--out", "one.svg", *_LONE),

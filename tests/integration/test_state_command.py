@@ -140,9 +140,9 @@ def test_the_text_is_a_short_table(mapfold: Commands, log: Path) -> None:
         "1 keyframe in no place"
     )
     assert lines[1].startswith("settings default: eps_m=1.5, min_samples=3")
-    assert lines[4].split() == ["run-a_p0", "3", "0", "(0.10,", "0.00)", "run-a_p1", "×1"]
+    assert lines[4].split() == ["p0", "3", "0", "(0.10,", "0.00)", "p1", "×1"]
     lines = mapfold("state", log, "--all").out.splitlines()
-    assert lines[4].split() == ["run-a_p0", "3", "1", "(0.10,", "0.00)", "run-a_p1", "×1"]
+    assert lines[4].split() == ["p0", "3", "1", "(0.10,", "0.00)", "p1", "×1"]
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_in_a_process_of_its_own(tmp_path: Path) -> None:
 def test_merges(mapfold: InProcess) -> None:
     said = mapfold("merges", "log", *RULES)
     assert said.out.splitlines()[1].split() == [
-        *("1", "7", "2026-03-24T13:00:08.000Z", "run-a:8", "run-a_p0", "run-a_p1"),
+        *("1", "7", "2026-03-24T13:00:08.000Z", "run-a:8", "p0", "p1"),
         *("3", "+", "3", "1", "1"),
     ]
     (merge,) = mapfold("merges", "log", *RULES, "--json").json
@@ -101,7 +101,7 @@ def test_a_merge_is_drawn(mapfold: InProcess, suffix: str) -> None:
 
 def test_why(mapfold: InProcess) -> None:
     said = mapfold("why", "log", "run-a_p1", *RULES)
-    assert said.out.startswith("place run-a_p1: absorbed by run-a_p0 at offset 7 (2026-03-24T")
+    assert said.out.startswith("place p1: absorbed by p0 at offset 7 (2026-03-24T")
     story = mapfold("why", "log", "run-a_p1", *RULES, "--json").json
     assert story["stands"] is False
     assert [entry["what"] for entry in story["entries"]] == ["founded", "ended"]
@@ -117,7 +117,7 @@ def test_why_same(mapfold: InProcess) -> None:
 
 def test_diff(mapfold: InProcess) -> None:
     said = mapfold("diff", "log", "7", "8", *RULES)
-    assert "  - run-a_p1 (3 keyframes) into run-a_p0 at 7 (run-a:8)" in said.out.splitlines()
+    assert "  - p1 (3 keyframes) into p0 at 7 (run-a:8)" in said.out.splitlines()
     diff = mapfold("diff", "log", "run-a:7", "end", *RULES, "--json").json
     assert (diff["from"], diff["to"], diff["same"]) == (7, 8, False)
     assert diff["places"]["gone"][0]["into"] == "run-a_p0"
@@ -253,7 +253,7 @@ def test_a_wrong_picture_name_is_an_error_before_the_fold(
         (("merges", "log", *RULES, "--draw", "1", "--out", "m.gif"), "m.gif: a picture is .png"),
         (("why", "log"), "give a place, an object, or two"),
         (("why", "log", "run-a_p0", "--same", "a:1", "a:2"), "give a place, an object, or two"),
-        (("why", "log", "run-a_p7", *RULES), "near it: run-a_p1, run-a_p0"),
+        (("why", "log", "run-a_p7", *RULES), "near it: p1, p0; "),
         (("why", "log", "--same", "run-a:1", "run-a:99"), "near it: run-a:8, run-a:7"),
         (("diff", "log", "run-z:1", "end"), "run-z:1: log has no such keyframe"),
         (("bisect", "log", "merged('run-a_p9')", *RULES), "column 8: no place 'run-a_p9'"),

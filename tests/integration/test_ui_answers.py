@@ -115,7 +115,7 @@ class TestTexts:
         assert answer["steps"][-1]["offset"] == 348
         refs = answer["steps"][-1]["refs"]
         assert {"kind": "merge", "id": "348"} in refs
-        assert {"kind": "place", "id": "sim-7-a_p0"} in refs
+        assert {"kind": "place", "id": "sim-7-a_p0", "name": "p0"} in refs
         assert {"kind": "keyframe", "id": "sim-7-a/349"} in refs
         for ref in refs:  # each leads on
             assert server.api("why", what=f"{ref['kind']}:{ref['id']}", set=WIDE)["lines"]

@@ -68,16 +68,14 @@ def test_the_link_says_what_is_known_and_why_answers_so(
     corrected: Corrected, visit: Visit, mapfold: Commands
 ) -> None:
     page = visit(corrected[1], f"#at={MERGE + 1}&known=then&select=merge:{MERGE}&panel=why")
-    expect(page.locator(".summary")).to_have_text("sim-7-a_p0 absorbed sim-7-a_p7")
+    expect(page.locator(".summary")).to_have_text("p0 absorbed p7")
     assert page.get_by_role("radio", name="As known then").is_checked()
     line = page.locator("#panel .command code").inner_text()
     assert "--known-at" not in line  # it is what the command says by itself
     said = mapfold(*shlex.split(line)[1:]).out
     assert f"merge 2 at offset {MERGE}" in said
     choose(page, "now")
-    expect(page.locator(".summary")).to_have_text(
-        "sim-7-a_p0 and sim-7-a_p7 did not merge: refused"
-    )
+    expect(page.locator(".summary")).to_have_text("p0 and p7 did not merge: refused")
     said = mapfold(*shlex.split(page.locator("#panel .command code").inner_text())[1:]).out
     assert "a door" in said
     expect(page).not_to_have_url(re.compile("known="))

@@ -52,7 +52,7 @@ def test_why_draws_the_bridge_of_a_merge_before_and_after(
     page = visit(sample, "#at=349&panel=why")
     plain = pixels(page)
     page.get_by_role("button", name="p0 ← p7").click()
-    expect(page.locator(".summary")).to_have_text("sim-7-a_p0 absorbed sim-7-a_p7")
+    expect(page.locator(".summary")).to_have_text("p0 absorbed p7")
     minis = page.locator(".mini canvas")
     expect(minis).to_have_count(2)
     answered(page)

@@ -83,7 +83,9 @@ def test_a_merge_shows_from_the_next_offset_on(corridor: LogTimeline) -> None:
 def test_why_of_a_standing_place(corridor: LogTimeline) -> None:
     story = corridor.why("run-a_p0")
     assert [(e.cause.offset, e.what) for e in story.entries] == [(2, "founded"), (8, "absorbed")]
-    assert story.summary == "8 keyframes around (3.25, 0.00); 1 object: cup; next to no other place"
+    assert story.summary == (
+        "8 keyframes around (3.25, 0.00); 0 objects + 1 seen once; next to no other place"
+    )
     assert story.entries[0].text == (
         "founded: run-a:2 at (1.00, 0.00) became the first core point; "
         "members run-a:1, run-a:2, run-a:3"

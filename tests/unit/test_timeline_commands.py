@@ -241,7 +241,7 @@ def test_names_of_places(corridor: Open) -> None:
 
 def test_a_name_that_two_places_have_is_refused(corridor: Open) -> None:
     also = NamePlace(command_id="c7", place=THIRD, name="kitchen", **SAID)
-    with pytest.raises(MisuseError, match=r"means 2 places: run-a_p0 .*; run-a_p2 .*"):
+    with pytest.raises(MisuseError, match=r"means 2 places; .*:\n  run-a_p0 .*\n  run-a_p2 "):
         corridor(KITCHEN, also).why("kitchen")
 
 

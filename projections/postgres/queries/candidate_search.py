@@ -43,6 +43,7 @@ from projections.localize.relocalize.candidates import (
     objects_of_a_class,
     refuse_unknown_classes,
 )
+from projections.map.naming import ShortIds
 from projections.postgres.connection import (
     Connection,
     Targets,
@@ -66,7 +67,7 @@ from .candidate_rows import (
     assemble,
     bare_row,
 )
-from .graph_reads import map_errors
+from .graph_reads import map_errors, read_short_ids
 
 _NEAR: Final = 13
 """Number of columns of the statement ``near``."""
@@ -376,6 +377,10 @@ class CandidateReader:
     def try_question(self) -> None:
         """Ask one question. Raises DatabaseError when questions cannot be answered."""
         self._search().try_question()
+
+    def short_ids(self) -> ShortIds:
+        """The short ids of the map."""
+        return read_short_ids(self._graph)
 
     def _search(self) -> CandidateSearch:
         return CandidateSearch(self._targets, self._vectors, self._graph, self._memory)

@@ -15,7 +15,8 @@ import psycopg
 
 from eventsrc.base.text import advised
 from projections.fold.map_errors import ProjectionMissing
-from projections.map.naming import Thing, thing_called
+from projections.map.naming import ShortIds, Thing, thing_called
+from projections.map.phrases import seen_times
 from projections.map.view import MapView
 from projections.postgres.connection import Connection, database_errors, describe_target
 from projections.postgres.graph_rows import text
@@ -182,6 +183,16 @@ def _object_document(row: tuple[str, str | None]) -> dict[str, Any]:
     return document | ({"place_name": place["name"]} if "name" in place else {})
 
 
+def read_short_ids(connection: Connection) -> ShortIds:
+    """The short ids of all Places and Objects."""
+    places = [json.loads(properties) for _, properties in _rows(connection, "places")]
+    objects = [
+        json.loads(properties)["object_id"] for properties, _ in _rows(connection, "objects")
+    ]
+    names = [place["name"] for place in places if "name" in place]
+    return ShortIds([place["place_id"] for place in places], objects, names)
+
+
 def _ordinal(graphid: str) -> int:
     return number_of(int(graphid)) - 1
 
@@ -216,7 +227,7 @@ def objects_near(connection: Connection, x: float, y: float, radius: float) -> l
 
     The distance is to an Object's estimated position, or to its mean position if it has none.
     """
-    found = _read_square(connection, "objects", x, y, radius)
+    found = [_with_iso_times(each) for each in _read_square(connection, "objects", x, y, radius)]
     return _nearest(found, ("est_x", "mean_x"), ("est_y", "mean_y"), "object_id", (x, y), radius)
 
 
@@ -239,7 +250,11 @@ def objects_after(connection: Connection, after: int, most: int) -> Page:
     its ``place_id``."""
     values = {"after": str(graphid_base("Object") + after), "most": most + 1}
     rows = _rows(connection, "page_of_objects", **values)
-    return _page([(row[0], _object_document(row[1:])) for row in rows], most)
+    return _page([(row[0], _with_iso_times(_object_document(row[1:]))) for row in rows], most)
+
+
+def _with_iso_times(thing: dict[str, Any]) -> dict[str, Any]:
+    return thing | seen_times(thing["first_seen"], thing["last_seen"])
 
 
 def _page(found: list[tuple[str, dict[str, Any]]], most: int) -> Page:

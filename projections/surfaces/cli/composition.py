@@ -28,7 +28,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import ArgumentInfo
 
-from eventsrc.base.text import complete_by
+from eventsrc.base.text import complete_by, shorten_by
 
 from . import COMMANDS, SECTIONS
 
@@ -270,6 +270,7 @@ class AdvisingCommand(TyperCommand):
         """As typer does it."""
         _running.append(ctx)
         complete_by(_options_in_force)
+        shorten_by(None)  # until the command has a map; its errors are printed after it
         try:
             return super().invoke(ctx)
         finally:

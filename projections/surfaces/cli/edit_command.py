@@ -8,8 +8,10 @@ from typing import Annotated, Any
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import visible
+from eventsrc.base.text import shorten_by, visible
+from eventsrc.envelope.commands import Command
 from eventsrc.log import LogReader
+from projections.edit.current import MapToEdit
 from projections.edit.effect import cache_effect
 from projections.edit.make import Stamp
 from projections.edit.record import Made, MakeCommand, make_command, record_command, void_text
@@ -72,12 +74,17 @@ class NewCommand(ZenohClient, _Stamped):
             issued_by=user_at_host() if self.issued_by is None else self.issued_by,
             reason=self.reason,
         )
+
+        def make(current: MapToEdit, stamp: Stamp) -> Command:
+            shorten_by(current.shortened)
+            return make_(current, stamp)
+
         if self.dry_run:
             with LogReader(log) as reader:
-                made = make_command(reader, make_, stamp, self.settings, say)
+                made = make_command(reader, make, stamp, self.settings, say)
                 _show(made, as_json=self.json, most=None if self.all_ else _MOST_LINES)
             return
-        made = record_command(log, make_, stamp, self.settings, self.session, say)
+        made = record_command(log, make, stamp, self.settings, self.session, say)
         keep_effect(made)
         if self.json:
             emit(recorded_document(made))
@@ -105,6 +112,7 @@ def _show(made: Made, *, as_json: bool, most: int | None) -> None:
             }
         )
         return
+    shorten_by(difference.short_ids.text)
     text = difference_text(difference, most=most)
     before, after = (digest[:16] for digest in difference.digests)
     digests = f"the same map, digest {before}" if difference.same else f"digest {before} → {after}"

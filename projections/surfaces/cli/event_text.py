@@ -35,14 +35,16 @@ def iso_time(time_ns: int) -> str:
 
 
 def event_document(event: Event) -> dict[str, Any]:
-    """``{"offset", "logged_ns", "stamp_ns", "key", "payload"}``. The payload is its JSON value, or
-    its text when it is no JSON; bytes that are no text come as ``payload_base64`` beside null.
-    So does a verbatim message, with its ``encoding`` and ``schema``. An envelope of an older form
-    has its ``version``."""
+    """``{"offset", "logged_ns", "logged", "stamp_ns", "stamp", "key", "payload"}``; ``logged`` and
+    ``stamp`` are ISO 8601. The payload is its JSON value, or its text when it is no JSON; bytes
+    that are no text come as ``payload_base64`` beside null. So does a verbatim message, with its
+    ``encoding`` and ``schema``. An envelope of an older form has its ``version``."""
     document: dict[str, Any] = {
         "offset": event.offset,
         "logged_ns": event.logged_ns,
+        "logged": iso_time(event.logged_ns),
         "stamp_ns": event.stamp_ns,
+        "stamp": iso_time(event.stamp_ns),
         "key": event.key,
     }
     if event.is_envelope and event.version != ENVELOPE_VERSION:

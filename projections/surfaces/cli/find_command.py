@@ -4,10 +4,9 @@ from typing import Annotated
 
 import typer
 
-from eventsrc.base.text import table, visible
+from eventsrc.base.text import shorten_by, table, visible
 from projections.ask.find import FoundObject, FoundObjects, Wanted, find, robot_seconds
 from projections.map.naming import ShortIds, things_of
-from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 
 from .folded_log import CachedLog, FoldToOption, KnownAtOption
@@ -75,26 +74,26 @@ def find_things(
         view = map_after(
             reader, settings, end, corrections=corrections, note=say, cache=not source.no_cache
         )
+    shorten_by(ShortIds.of(things_of(view)).text)
     found = find(view, wanted)
     if json_:
         emit(found.document())
         return
-    display(_table(view, found) if found.answers else "nothing found\n")
+    display(_table(found) if found.answers else "nothing found\n")
     for line in _remarks(wanted, found):
         say(line)
 
 
-def _table(view: MapView, found: FoundObjects) -> str:
-    short = ShortIds.of(things_of(view))
+def _table(found: FoundObjects) -> str:
     header = ["object", "class", "place", "position (m)", "seen", "last seen"]
     if found.answers[0].distance_m is not None:
         header.insert(4, "away (m)")
     rows = []
     for each in found.answers:
         row = [
-            short(each.object_id),
+            each.object_id,
             visible(each.class_name),
-            _place(short, each),
+            _place(each),
             _position(each),
             f"{each.obs_count:,}×",
             _last(each),
@@ -105,11 +104,11 @@ def _table(view: MapView, found: FoundObjects) -> str:
     return table(header, rows, right=("seen", "away (m)"))
 
 
-def _place(short: ShortIds, each: FoundObject) -> str:
+def _place(each: FoundObject) -> str:
     if each.place_id is None:
         return "no place"
     word = each.place_name or each.place_type
-    place_id = visible(short(each.place_id))
+    place_id = visible(each.place_id)
     return place_id if word is None else f"{place_id} {visible(word)}"
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, cast, get_args
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import counted, shorten_by
 from eventsrc.base.user_files import FileFault, open_file
 from eventsrc.log import LogReader
 from projections.fold.map_errors import QuestionError
@@ -34,6 +34,7 @@ from projections.localize.relocalize import (
     read_question,
 )
 from projections.localize.relocalize.track import Track, movement_of
+from projections.map.naming import ShortIds, things_of
 from projections.map.own_events import read_corrections
 from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
@@ -106,15 +107,19 @@ def relocalize(
             from projections.postgres.queries.candidate_search import CandidateReader
 
             targets = stack.enter_context(databases.opened())
-            search: Search = stack.enter_context(CandidateReader(targets)).candidates
+            reader = stack.enter_context(CandidateReader(targets))
+            search: Search = reader.candidates
+            if not json_ and not track:
+                shorten_by(reader.short_ids().text)
         else:
-            with LogReader(log) as reader:
-                end = point(reader, as_of or "end")
-                corrections = read_corrections(reader, end)
+            with LogReader(log) as recorded:
+                end = point(recorded, as_of or "end")
+                corrections = read_corrections(recorded, end)
                 settings = chosen.of_past_map(log, corrections)
                 view = map_after(
-                    reader, settings, end, corrections=corrections, note=say, embeddings=True
+                    recorded, settings, end, corrections=corrections, note=say, embeddings=True
                 )
+            shorten_by(ShortIds.of(things_of(view)).text)
             search = ExactIndex(view).search
             say_defaults(settings)
             unstated = view.without_camera() if settings.wants_camera else 0

@@ -18,6 +18,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.record.transport.config import parse_address
 from projections.fold.settings import Settings
+from projections.map.confirmed import counts_text
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 from projections.map.state_output import places_advice
 from projections.postgres import (
@@ -199,8 +200,9 @@ def _print_rebuilt(
         f" in {report.total_s:.2f} s ({rate:,.0f} events/s); digest {report.digest[:16]}"
     )
     counts = report.counts
-    words = ("run", "keyframe", "observation", "object", "place")
-    say(", ".join(counted(counts[f"{word}s"], word) for word in words))
+    found = [counted(counts[f"{word}s"], word) for word in ("run", "keyframe", "observation")]
+    objects = counts_text(counts["objects"], report.seen_once)
+    say(", ".join([*found, objects, counted(counts["places"], "place")]))
     if report.lost_workers:
         say(
             f"{report.lost_workers} of the {report.workers} processes that parsed the log died,"

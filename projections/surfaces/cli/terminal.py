@@ -1,7 +1,8 @@
 """Output of commands: data on stdout, messages and progress bars on stderr, and the exit code 3.
 
 Everything printed goes through `eventsrc.base.text`, which escapes control characters: keys, names
-and reasons come from the network.
+and reasons come from the network. Ids in text are printed short where the command has said by which
+map (`shorten_by`); JSON keeps them whole.
 """
 
 import contextlib
@@ -17,7 +18,7 @@ import typer
 from rich.console import Console
 
 from eventsrc.base.progress import send_progress_to
-from eventsrc.base.text import visible, visible_json, visible_lines
+from eventsrc.base.text import shortened, visible, visible_json, visible_lines
 
 EXIT_FAILED = 1
 EXIT_FINDINGS = 3
@@ -55,12 +56,12 @@ def say(message: str) -> None:
     """
     with contextlib.suppress(BrokenPipeError, OutputLost):
         sys.stdout.flush()
-    people.print(visible_lines(message))
+    people.print(visible_lines(shortened(message)))
 
 
 def display(text: str) -> None:
     """Print text to stdout, with a newline at its end if it has none."""
-    sys.stdout.write(visible_lines(text))
+    sys.stdout.write(visible_lines(shortened(text)))
     if text and not text.endswith("\n"):
         sys.stdout.write("\n")
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import advised, counted
+from eventsrc.base.text import advised, counted, shorten_by
 from eventsrc.envelope.model import Offset
 from projections.ask.what_changed import changes_text
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
@@ -65,7 +65,9 @@ class PastLog(CachedLog):
         """Its history under the commands of ``--known-at``, and the offset that W means."""
         with self.timeline() as timeline:
             end = point(timeline.reader, at)
-            yield timeline.knowing(known_point(timeline.reader, known_at, end)), end
+            known = timeline.knowing(known_point(timeline.reader, known_at, end))
+            shorten_by(known.short_ids(end).text)
+            yield known, end
 
 
 def merges(
@@ -245,6 +247,7 @@ def diff(
     if json_:
         emit(found.document())
     else:
+        shorten_by(found.short_ids.text)
         display(difference_text(found, most=None if all_ else MOST_LINES))
 
 
@@ -311,6 +314,7 @@ def bisect(
         asked = Expression(expression)
         span = point(timeline.reader, start), point(timeline.reader, end)
         known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
+        shorten_by(known.short_ids(span[1]).text)
         found = known.bisect(asked, *span, scan=scan)
     if json_:
         emit(found.document())

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import counted, shorten_by
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
 from projections.fold.settings import Settings
@@ -150,6 +150,7 @@ def whatif(
     if json_:
         emit(found.document())
     else:
+        shorten_by(found.short_ids().text)
         display(whatif_text(found, most=None if all_ else MOST_LINES))
 
 

@@ -110,6 +110,8 @@ class MapObject(TypedDict):
     obs_count: Annotated[int, Field(ge=0)]
     first_seen: Annotated[float, Field(description="Seconds since 1970.")]
     last_seen: float
+    first_seen_iso: Annotated[str, Field(description="ISO 8601, UTC.")]
+    last_seen_iso: str
     confirmed: NotRequired[
         Annotated[bool, Field(description="Whether it was seen from two spots or at two times.")]
     ]

@@ -9,7 +9,6 @@ from typing import Any, Final
 from starlette.datastructures import QueryParams
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import visible_lines
 from eventsrc.envelope.model import Offset
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import compile_corrections
@@ -24,7 +23,7 @@ from projections.history.whatif_rendering import whatif_text
 from projections.map.own_events import read_commands
 
 from .log_map import LogMap, Opened, PrefixReader
-from .requests import AskedPoint, assignments_of, command_line, text_of
+from .requests import AskedPoint, assignments_of, command_line, lines_of, text_of
 
 MOST_LINES: Final = 200
 _FLAGS: Final = ("1", "true", "yes")
@@ -44,7 +43,7 @@ def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     return {
         **found.document(),
         "known_at": known_at,
-        "lines": visible_lines(difference_text(found, most=MOST_LINES)).splitlines(),
+        "lines": lines_of(difference_text(found, most=MOST_LINES), found.short_ids),
         "command": command_line(shown.opened, "diff", *words, *settings),
     }
 
@@ -62,7 +61,7 @@ def bisect_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     return {
         **found.document(),
         "known_at": asked.known_at,
-        "lines": visible_lines(search_text(found, most=MOST_LINES)).splitlines(),
+        "lines": lines_of(search_text(found, most=MOST_LINES), asked.short_ids),
         "command": asked.command("bisect", *words, asked_at=False),
     }
 
@@ -140,7 +139,7 @@ def whatif_answer(
         "known_at": known_at,
         **found.document(),
         "names": [each.name for each in found.all],
-        "lines": visible_lines(whatif_text(found, most=MOST_LINES)).splitlines(),
+        "lines": lines_of(whatif_text(found, most=MOST_LINES), found.short_ids()),
         "seconds": round(perf_counter() - started, 3),
         "command": command_line(opened, "whatif", *words),
     }

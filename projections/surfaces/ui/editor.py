@@ -35,7 +35,7 @@ from projections.history.diff_rendering import difference_text
 
 from .comparisons import MOST_LINES
 from .log_map import Opened, PrefixReader
-from .requests import command_line
+from .requests import command_line, lines_of
 
 MOST_BYTES: Final = 64 * 1024
 _MOST_ARGUMENTS: Final = 1000
@@ -188,7 +188,11 @@ class Editor:
                 raise LogError(
                     f"there is another log at {self._opened.log} now; start mapfold ui again"
                 )
-            return make_(current, stamp)
+            try:
+                return make_(current, stamp)
+            except MisuseError as error:
+                error.args = (current.shortened(str(error)),)  # as the command prints it
+                raise
 
         return checked
 
@@ -213,9 +217,8 @@ class Editor:
         if asked.dry_run:
             difference = outcome.change.difference()
             found["difference"] = difference.document()
-            found["lines"] = visible_lines(
-                difference_text(difference, most=MOST_LINES)
-            ).splitlines()
+            text = difference_text(difference, most=MOST_LINES)
+            found["lines"] = lines_of(text, difference.short_ids)
         return found
 
     def _command(self, asked: Edit) -> str:

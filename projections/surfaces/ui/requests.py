@@ -21,6 +21,7 @@ from eventsrc.base.text import visible_lines
 from eventsrc.envelope.model import Offset
 from projections.fold.map_errors import DatabaseError, LogPointError, QuestionError, SettingsError
 from projections.history import ExpressionError, KnownHistory, NoSuchThing
+from projections.map.naming import ShortIds
 from projections.store.columns import Array
 from projections.surfaces.serve.answering import TooMuchError
 
@@ -138,6 +139,11 @@ class AskedPoint:
         """The history under the commands before ``known_at``."""
         return self.shown.timeline.knowing(self.known_at)
 
+    @property
+    def short_ids(self) -> ShortIds:
+        """The short ids of this map, by which its texts name things."""
+        return self.known.short_ids(self.end)
+
     def document(self) -> dict[str, int]:
         """The fields that say which map an answer is about."""
         return {"at": self.end, "known_at": self.known_at}
@@ -152,6 +158,11 @@ class AskedPoint:
             words += ["--known-at", str(self.known_at)]
         settings = self.shown.opened.words(*assignments_of(self.query))
         return command_line(self.shown.opened, name, *words, *settings)
+
+
+def lines_of(text: str, short_ids: ShortIds) -> list[str]:
+    """The lines of a text, as the command prints them."""
+    return visible_lines(short_ids.text(text)).splitlines()
 
 
 def command_line(opened: Opened, name: str, *words: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from starlette.datastructures import QueryParams
 
-from eventsrc.base.text import visible, visible_lines
+from eventsrc.base.text import shortening, visible
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal
 from projections.fold.map_errors import QuestionError
@@ -30,11 +30,12 @@ from projections.history.rendering import (
     object_merges_text,
     refusals_text,
 )
+from projections.map.naming import ShortIds
 from projections.store.history import History
 from projections.store.history_records import Merge, ObjectMerge, RefusedMerge
 
 from .log_map import LogMap
-from .requests import AskedPoint, text_of
+from .requests import AskedPoint, lines_of, text_of
 
 _MOST_CORE: Final = 2000
 
@@ -53,22 +54,27 @@ def merge_answer(asked: AskedPoint, name: str) -> dict[str, Any]:
         every |= {r.cause.offset for r in known.refusals(asked.end)}
         every |= {m.offset for m in known.object_merges(asked.end)}
         raise NoSuchThing("merge at offset", name, map(str, sorted(every)))
-    texts = [merge_text(history, merge) for merge in merges]
-    texts += [refusals_text(history, refusals)] if refusals else []
-    texts += [object_merges_text(history, objects)] if objects else []
+    short = asked.short_ids
+    with shortening(short.text):  # tables are as wide as the ids
+        texts = [merge_text(history, merge) for merge in merges]
+        texts += [refusals_text(history, refusals)] if refusals else []
+        texts += [object_merges_text(history, objects)] if objects else []
+    summary = _summary(history, merges) or _other_summary(history, refusals, objects)
     return {
         **asked.document(),
         "kind": "merge",
         "subject": name,
-        "summary": visible(_summary(history, merges) or _other_summary(history, refusals, objects)),
-        "lines": [line for text in texts for line in visible_lines(text).splitlines()],
+        "summary": visible(short.text(summary)),
+        "lines": [line for text in texts for line in lines_of(text, short)],
         "steps": [
             {
                 "offset": offset,
                 "time": merge.cause.time,
                 "what": "merged",
-                "text": visible(f"{_summary(history, [merge])}; {merge_reason(history, merge)}"),
-                "refs": _merge_refs(history, merge),
+                "text": visible(
+                    short.text(f"{_summary(history, [merge])}; {merge_reason(history, merge)}")
+                ),
+                "refs": _with_short(_merge_refs(history, merge), short),
             }
             for merge in merges
         ],
@@ -211,8 +217,10 @@ def _keyframe_story(asked: AskedPoint, name: str) -> dict[str, Any]:
     return _document(asked, found, command) | {
         "kind": "keyframe",
         "subject": names[0],
-        "summary": visible(where),
-        "lines": [visible(f"{names[0]}: {where}"), *map(_line, found.entries)],
+        "summary": visible(asked.short_ids.text(where)),
+        "lines": lines_of(
+            "\n".join([f"{names[0]}: {where}", *map(_line, found.entries)]), asked.short_ids
+        ),
     }
 
 
@@ -223,30 +231,40 @@ def _keyframe_name(name: str) -> str:
 
 
 def _line(entry: Entry) -> str:
-    return visible(f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}")
+    return f"  {entry.cause.offset}  {entry.cause.when}  {entry.text}"
 
 
 def _document(asked: AskedPoint, found: Explanation, command: str) -> dict[str, Any]:
+    short = asked.short_ids
     return {
         **asked.document(),
         "kind": found.kind,
         "subject": found.subject,
-        "summary": visible(found.summary),
+        "summary": visible(short.text(found.summary)),
         "facts": found.facts,
-        "lines": visible_lines(explanation_text(found)).splitlines(),
-        "steps": [_step(asked.known.history, entry) for entry in found.entries],
+        "lines": lines_of(explanation_text(found), short),
+        "steps": [_step(asked.known.history, entry, short) for entry in found.entries],
         "command": command,
     }
 
 
-def _step(history: History, entry: Entry) -> dict[str, Any]:
+def _step(history: History, entry: Entry, short: ShortIds) -> dict[str, Any]:
     return {
         "offset": entry.cause.offset,
         "time": entry.cause.time,
         "what": entry.what,
-        "text": visible(entry.text),
-        "refs": list(_refs(history, entry))[:_MOST_REFS],
+        "text": visible(short.text(entry.text)),
+        "refs": _with_short(list(_refs(history, entry))[:_MOST_REFS], short),
     }
+
+
+def _with_short(refs: list[dict[str, str]], short: ShortIds) -> list[dict[str, str]]:
+    """Things to link, with the ``name`` by which the text has one where that is not its id."""
+    names = [short(ref["id"]) for ref in refs]
+    return [
+        ref if name == ref["id"] else ref | {"name": name}
+        for ref, name in zip(refs, names, strict=True)
+    ]
 
 
 def _refs(history: History, entry: Entry) -> Iterable[dict[str, str]]:

@@ -26,6 +26,8 @@ export interface LogInfo {
 export interface Ref {
   kind: "place" | "object" | "keyframe" | "merge" | string;
   id: string;
+  /** As the text beside it has it, where that is not the id. */
+  name?: string;
 }
 
 export interface Step {

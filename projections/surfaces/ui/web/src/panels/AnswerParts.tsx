@@ -76,10 +76,11 @@ export function Steps({ steps }: { steps: readonly Step[] }) {
 /** A sentence in which the things it names can be clicked. */
 export function Linked({ text, refs }: { text: string; refs: readonly Ref[] }) {
   const names = new Map<string, store.Thing>();
-  for (const { kind, id } of refs) {
+  for (const { kind, id, name } of refs) {
     if (!KINDS.includes(kind) || kind === "merge" || id === "") continue;
     const thing = { kind, id } as store.Thing;
     names.set(id, thing);
+    if (name !== undefined) names.set(name, thing);
     if (kind === "keyframe") names.set(id.replace(/\/(?=[^/]*$)/, ":"), thing);
   }
   const parts: ComponentChildren[] = [];
@@ -102,7 +103,7 @@ function firstName(text: string, names: ReadonlyMap<string, store.Thing>) {
   let found: { at: number; name: string; thing: store.Thing } | null = null;
   for (const [name, thing] of names) {
     let at = text.indexOf(name);
-    while (at >= 0 && /[\w]/.test(text[at + name.length] ?? "")) at = text.indexOf(name, at + 1);
+    while (at >= 0 && /\w/.test(`${text[at - 1] ?? ""}${text[at + name.length] ?? ""}`)) at = text.indexOf(name, at + 1);
     if (at < 0) continue;
     if (found === null || at < found.at || (at === found.at && name.length > found.name.length)) found = { at, name, thing };
   }
