@@ -88,6 +88,7 @@ class KnownHistory:
         self._recorder = HistoryRecorder(reader, settings, corrections, kept, progress)
         self._latest: StoredView | None = None
         self._index: tuple[History, CountIndex] | None = None
+        self._short: tuple[Offset, ShortIds] | None = None
         self._entries = EntryMaker(reader)
 
     @property
@@ -189,7 +190,14 @@ class KnownHistory:
 
     def short_ids(self, end: Offset) -> ShortIds:
         """The short ids of the map after ``end`` events."""
-        return ShortIds.of(things_of(self.at(end)))
+        kept = self._short
+        if kept is None or kept[0] != end:
+            self._short = kept = end, ShortIds.of(things_of(self.at(end)))
+        return kept[1]
+
+    def shortened(self, text: str, end: Offset) -> str:
+        """``text`` with the short ids of the map after ``end`` events, once that is folded."""
+        return text if self._recorder.end < end else self.short_ids(end).text(text)
 
     def why_same(self, first: str, second: str, end: Offset | None = None) -> Explanation:
         """Since when, and by which merges, two keyframes (``run:keyframe``) are in one place; which

@@ -302,7 +302,7 @@ class TestCommand:
 
     def test_plain_and_text(self, mapfold: Commands, log: Path, question: Path) -> None:
         said = mapfold("relocalize", question, "--log", log, "--as-of", "end", "--method", "plain")
-        assert said.startswith("p").out
+        assert said.out.startswith("p")
 
     @pytest.mark.parametrize(
         ("arguments", "said"),

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import indent
 from typing import Annotated
@@ -66,7 +67,7 @@ class PastLog(CachedLog):
         with self.timeline() as timeline:
             end = point(timeline.reader, at)
             known = timeline.knowing(known_point(timeline.reader, known_at, end))
-            shorten_by(known.short_ids(end).text)
+            shorten_by(partial(known.shortened, end=end))
             yield known, end
 
 
@@ -314,7 +315,7 @@ def bisect(
         asked = Expression(expression)
         span = point(timeline.reader, start), point(timeline.reader, end)
         known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
-        shorten_by(known.short_ids(span[1]).text)
+        shorten_by(partial(known.shortened, end=span[1]))
         found = known.bisect(asked, *span, scan=scan)
     if json_:
         emit(found.document())
