@@ -15,7 +15,6 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 
-from .class_names import ClassNames
 from .messages import (
     CAMERA_INFO,
     DETECTIONS,
@@ -32,6 +31,7 @@ from .messages import (
     lens_of,
     read,
 )
+from .named_classes import ClassNames
 from .stream import Counts, PicturePose, PoseSource, Stream
 from .transforms import TransformBuffer
 

@@ -37,7 +37,7 @@ class Stream:
     map's; None for the transforms from ``map_frame`` down to ``base_frame`` and the camera.
     ``covariance`` is the topic whose latest covariance, of a pose in ``map_frame``, goes with poses
     of transforms. ``embeddings`` and ``camera`` are topics, None without any. ``classes`` are the
-    topics of `eventsrc.ros.class_names`; ``labels`` names classes by id itself, and counts before
+    topics of `eventsrc.ros.named_classes`; ``labels`` names classes by id itself, and counts before
     what they say. ``heights`` says whether ``map_z`` is stated. ``wait_ns`` and ``max_waiting``
     bound how long detections wait for the rest, ``max_gap_ns`` between which two samples a pose is
     interpolated.

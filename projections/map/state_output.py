@@ -315,9 +315,14 @@ _MOSTLY: Final = 0.8
 
 
 def space_advice(view: MapView) -> str | None:
-    """One line where nothing is fused: the settings name a space of which the map has no vector, or
-    detections have none and the rule needs them."""
+    """One line where detections are not fused: they have no vector and the rule needs one, or the
+    settings name a space of which the map has none."""
     model = view.settings.embedding_model
+    if view.all_objects and view.settings.fusion != "evidence":
+        bare = sum(each.embedding_crc is None for each in view.observations)
+        of = f"{bare:,} of {counted(len(view.observations), 'detection')}"
+        told = f"{of} have no embedding and are of no Object; --preset full needs none"
+        return told if bare else None
     if not view.observations or view.all_objects:
         return None
     if model is None:

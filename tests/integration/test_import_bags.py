@@ -303,6 +303,23 @@ def test_the_command_says_what_it_took_for_what(mapfold: Commands) -> None:
     assert document["accepted"] == 3
 
 
+def test_a_bag_that_is_imported_again_adds_nothing_and_a_longer_one_what_is_new(
+    mapfold: Commands,
+) -> None:
+    grid = ("/map", START + 1, ros.grid(START, [0, 100], 2, 1))
+    write_bag(mapfold.folder / "drive", [grid, *Drive(3).messages()])
+    mapfold("import", "log", "drive")
+    events = read_log(mapfold.folder / "log")
+    said = mapfold("import", "log", "drive").err
+    assert "imported 0 envelopes into log, 4 messages passed over, 0 rejected" in said
+    assert "passed over: map: 1 message, in the log already" in said
+    assert read_log(mapfold.folder / "log") == events
+    longer = write_bag(mapfold.folder / "longer", [grid, *Drive(5).messages()])
+    said = mapfold("import", "log", longer, "--run-id", RUN).err
+    assert "imported 2 envelopes into log, offsets 5 to 6, 4 messages passed over" in said
+    assert "nothing is new" not in said
+
+
 def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(mapfold: Commands) -> None:
     write_bag(mapfold.folder / "empty", [])
     said = mapfold("import", "log", "empty", code=3)

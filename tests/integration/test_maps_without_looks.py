@@ -2,6 +2,7 @@
 commands."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from tests.integration.test_projections import parsed
 from tests.support.commands import Commands
 from tests.support.envelopes import detection
 from tests.support.evidence_drives import DIM, EVIDENCE, Without, drive, without_embeddings
+from tests.support.ros_messages import base64_of
 from tests.support.rows import all_rows, expected_graph
 from tests.support.scenes import assert_equal
 from tests.support.thorough import mostly_slow
@@ -234,3 +236,76 @@ class TestCommands:
         ).json
         assert said["relocalization"]["1"]["questions"] > 20
         assert said["relocalization"]["2"]["pose_error_m"]["p50"] < 1.0
+
+
+def _changed(log: Path, documents: list[dict[str, Any]], **fields: Any) -> Path:
+    """A file of JSON lines, with the first detection of the first picture changed."""
+    (first, *others) = documents
+    one, *rest = first["detections"]
+    changed = {**one, "embedding_dim": DIM, **fields}
+    lines = [{**first, "detections": [changed, *rest]}, *others]
+    log.write_text("\n".join(map(json.dumps, lines)))
+    return log
+
+
+BAD_VECTORS: list[tuple[dict[str, Any], str]] = [
+    ({"embedding": base64_of([0.0] * DIM)}, "is the zero vector"),
+    ({"embedding": base64_of([math.nan] * DIM)}, "holds NaN or infinity"),
+    ({"embedding": base64_of([1.0] * DIM), "embedding_dim": DIM + 3}, "bytes do not match"),
+    ({"embedding": ""}, "0 bytes do not match embedding_dim"),
+    ({"embedding": "!!!"}, "not base64"),
+]
+
+
+@pytest.mark.parametrize("which", LEFT_OUT)
+def test_a_bad_vector_among_detections_without_is_kept_as_rejected(
+    mapfold: Commands, which: Without
+) -> None:
+    documents = drive(5, 30, things=9)
+    kept = without_embeddings(documents[1:], which)
+    for number, (fields, reason) in enumerate(BAD_VECTORS):
+        file = _changed(mapfold.folder / f"{number}.jsonl", [documents[0], *kept], **fields)
+        said = mapfold("import", f"log{number}", file, "--preset", "full", code=3).err
+        assert f"{file.name}: line 1: rejected: detections.0.embedding" in said
+        assert reason in said
+        counts = mapfold("state", f"log{number}", "--json").json["counts"]
+        write_log(mapfold.folder / f"good{number}", kept)
+        good = mapfold("state", f"good{number}", "--json", "--preset", "full").json["counts"]
+        assert counts == good | {"events": good["events"] + 2}
+        assert mapfold("find", f"log{number}", kept[0]["detections"][0]["class"]).out
+
+
+def test_a_bad_vector_in_a_question_is_refused_whatever_the_map_has(
+    mapfold: Commands, tmp_path: Path
+) -> None:
+    (asked, *_) = _questions()
+    for which in ("none", "half"):
+        write_log(tmp_path / which, _documents(which))
+        for values, dim, reason in (
+            ([0.0] * DIM, DIM, "crops.0.embedding: holds NaN or infinity, or only zeros"),
+            ([math.nan] * DIM, DIM, "crops.0.embedding: holds NaN or infinity, or only zeros"),
+            ([1.0] * DIM, DIM + 3, f"holds {DIM} numbers, embedding_dim says {DIM + 3}"),
+        ):
+            first, *others = asked["crops"]
+            looked = {**first, "embedding": base64_of(values), "embedding_dim": dim}
+            file = tmp_path / "question.json"
+            file.write_text(json.dumps({"crops": [looked, *others]}))
+            words = ("relocalize", file, "--log", which, *BY_EVIDENCE)
+            assert reason in mapfold(*words, code=2).err
+    looked |= {"embedding": base64_of([1.0] * 7), "embedding_dim": 7}
+    file.write_text(json.dumps({"crops": [looked, *others]}))
+    said = mapfold("relocalize", file, "--log", "half", *BY_EVIDENCE, code=2).err
+    assert f"the question's embeddings have 7 dimensions, the map's {DIM}" in said
+    said = mapfold("relocalize", file, "--log", "none", *BY_EVIDENCE)
+    assert "the map has no embeddings, so those of 1 crop say nothing: asked by class" in said.err
+    file.write_text(json.dumps(asked))
+    plain = mapfold("relocalize", file, "--log", "none", *BY_EVIDENCE)
+    assert plain.out == said.out
+    assert "the map has no embeddings" not in plain.err
+
+
+def test_state_counts_what_one_rule_leaves_out(mapfold: Commands, tmp_path: Path) -> None:
+    write_log(tmp_path / "half", _documents("half"))
+    said = mapfold("state", "half").err
+    assert "detections have no embedding and are of no Object; --preset full needs none" in said
+    assert "no Object" not in mapfold("state", "half", "--preset", "full").err

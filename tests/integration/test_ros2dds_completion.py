@@ -142,6 +142,9 @@ def test_an_import_of_the_log_takes_all_over(
         (type(e), e.key, e.payload) for e in events
     ]
     check_derived(tmp_path / "copy")
+    with LogWriter(tmp_path / "copy") as writer, LogReader(log_path) as reader:
+        again = import_files(writer, [str(log_path)], ledger=ledger_of(reader))
+    assert (again.known, again.next_offset) == (len(events), len(events))
     with LogWriter(tmp_path / "copy") as writer:
         writer.append(ROS_KEY, b'{"key": 3}')
     (finding,) = verify_log(tmp_path / "copy").findings

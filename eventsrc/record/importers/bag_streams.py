@@ -13,9 +13,9 @@ from typing import Any, Final, TypeVar
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.ros import messages as ros
-from eventsrc.ros.class_names import CLASS_TYPES, ClassNames, nearest
 from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
 from eventsrc.ros.messages import BadMessage
+from eventsrc.ros.named_classes import CLASS_TYPES, ClassNames, nearest
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.transforms import TransformBuffer
 

@@ -36,11 +36,11 @@ IS_KNOWN: Final = "in the log already"
 SETTINGS_CHOSEN: Final = "other settings than were chosen for the new log"
 
 
-class Refused(ValueError):
+class NotTakenOver(ValueError):
     """A command that a log does not take over; the text says why and what to do."""
 
 
-class KnownCommands(NamedTuple):
+class LogCommands(NamedTuple):
     """The commands of a log. ``begins`` is the one that a new log begins with, None for one that
     says nothing yet; ``settings`` the document in force, None without any; ``labels`` names of
     classes in force by label; ``all`` all commands. ``differs`` tells, of the settings in force and
@@ -59,7 +59,7 @@ class KnownCommands(NamedTuple):
 class SourceCommands:
     """Decides which commands of a source are appended to a log."""
 
-    def __init__(self, log: Path, known: KnownCommands) -> None:
+    def __init__(self, log: Path, known: LogCommands) -> None:
         self._log = log
         self._known = known
         self._settings = known.settings
@@ -71,11 +71,11 @@ class SourceCommands:
 
     def take(self, payload: bytes, *, is_first: bool) -> str:
         """Decide on the command in ``payload``: the reason to pass over it, empty to append it.
-        ``is_first`` in a log without events. Raises Refused."""
+        ``is_first`` in a log without events. Raises NotTakenOver."""
         try:
             command = parse_command(payload)
         except InvalidCommand as error:
-            raise Refused(f"no command: {error}") from None
+            raise NotTakenOver(f"no command: {error}") from None
         if isinstance(command, UseSettings):
             return self._take_settings(command, is_first=is_first)
         if command.command_id in self._ids:
@@ -85,7 +85,9 @@ class SourceCommands:
             self.names_labels = True
         elif not (isinstance(command, Undo) and command.undone in self._ids):
             edit = command_line("edit", self._log, command.kind)
-            raise Refused(f"{command.kind} is about things of its own log; `{edit}` gives it here")
+            raise NotTakenOver(
+                f"{command.kind} is about things of its own log; `{edit}` gives it here"
+            )
         self._ids.add(command.command_id)
         return ""
 
@@ -93,7 +95,7 @@ class SourceCommands:
         try:
             differs = self._known.differs(self._settings, command.settings)
         except MapfoldError as error:
-            raise Refused(f"settings that no map can have: {error}") from None
+            raise NotTakenOver(f"settings that no map can have: {error}") from None
         if is_first and self._known.begins is None:
             self._settings = command.settings
             self._ids.add(command.command_id)
@@ -103,14 +105,14 @@ class SourceCommands:
             return IS_KNOWN
         if self._known.begins is not None:
             return SETTINGS_CHOSEN
-        raise Refused(differs)
+        raise NotTakenOver(differs)
 
     def _check_labels(self, command: Relabel) -> None:
         for label, name in command.labels:
             here = self._known.labels.get(label, name)
             if here != name:
                 edit = command_line("edit", self._log, "relabel", f"{label}={name}")
-                raise Refused(
+                raise NotTakenOver(
                     f"it calls label {label!r} {name!r}, which is {here!r} in this log; "
                     f"`{edit}` changes that"
                 )

@@ -34,7 +34,7 @@ from eventsrc.record.append import (
 )
 
 from .bag_streams import BagOptions
-from .known_log import IS_KNOWN, KnownCommands, KnownEvents, Refused, SourceCommands
+from .known_log import IS_KNOWN, KnownEvents, LogCommands, NotTakenOver, SourceCommands
 from .opening import open_source
 from .ros_bags import BagReport, RosBag
 from .sources import (
@@ -61,7 +61,7 @@ OnReject = Callable[[str, str], None]
 """Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
 
 
-_NO_COMMANDS = KnownCommands()
+_NO_COMMANDS = LogCommands()
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ def import_files(
     on_reject: OnReject | None = None,
     step: AbstractContextManager[object] | None = None,
     given_map: OccupancyMap | None = None,
-    commands: KnownCommands = _NO_COMMANDS,
+    commands: LogCommands = _NO_COMMANDS,
     topics: TopicChoice = ALL_TOPICS,
     bags: BagOptions = _DEFAULT_BAGS,
     ledger: GapLedger[RunId] | None = None,
@@ -287,7 +287,7 @@ class _Import:
         """Append a command of another log, its rejection, or nothing."""
         try:
             known = self.commands.take(message.payload, is_first=self.writer.next_offset == 0)
-        except Refused as refused:
+        except NotTakenOver as refused:
             self._reject(source, message, str(refused))
             return
         if known:

@@ -107,7 +107,8 @@ class Answer:
 
     ``hypotheses`` are the poses from which the answer was chosen; None where there is no pose, and
     with the plain method. ``thin`` names what the map has too little of (`certainty.thinness`),
-    None where it has enough.
+    None where it has enough. ``unlooked`` is the number of crops whose embeddings say nothing,
+    since the map has none.
     """
 
     places: tuple[RankedPlace, ...]
@@ -116,6 +117,7 @@ class Answer:
     known: float = 0.0
     hypotheses: Hypotheses | None = field(default=None, compare=False, repr=False)
     thin: str | None = None
+    unlooked: int = 0
 
     @property
     def unknown(self) -> bool:
@@ -147,20 +149,26 @@ def rank(
     to the crops. The camera is that of the question, else ``camera``, else the one that took most
     of the observations found."""
     asked = question if isinstance(question, Question) else Question.of(question)
+    unlooked = 0
     if candidates.by_class:
+        given = [crop for view in asked.views for crop in view.crops]
         asked = asked.by_class()
+        kept = [crop for view in asked.views for crop in view.crops]
+        unlooked = sum(a.vector is not b.vector for a, b in zip(given, kept, strict=True))
     views, candidates = _in_order(asked, candidates)
     crops = [crop for view in views for crop in view.crops]
     known = known_probability(crops, candidates.matches, candidates.constants)
     thin = thinness(crops, candidates.matches)
     if method == "plain":
-        return replace(_rank_plain(candidates, crops, top), known=known, thin=thin)
-    floors = Layout.of(candidates)
-    candidates = floors.laid_out(candidates)
-    camera = asked.camera or camera or _camera_of_most(candidates)
-    scene = Scene(candidates.constants, camera, model, floors.walls(candidates.walls))
-    posterior = locate(views, candidates.matches, scene)
-    return replace(_answer(candidates, crops, posterior, top, floors), known=known, thin=thin)
+        answer = _rank_plain(candidates, crops, top)
+    else:
+        floors = Layout.of(candidates)
+        candidates = floors.laid_out(candidates)
+        camera = asked.camera or camera or _camera_of_most(candidates)
+        scene = Scene(candidates.constants, camera, model, floors.walls(candidates.walls))
+        posterior = locate(views, candidates.matches, scene)
+        answer = _answer(candidates, crops, posterior, top, floors)
+    return replace(answer, known=known, thin=thin, unlooked=unlooked)
 
 
 def _camera_of_most(candidates: MapCandidates) -> CameraConstants:

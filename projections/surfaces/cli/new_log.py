@@ -21,7 +21,7 @@ from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.record.importers.known_log import KnownCommands
+from eventsrc.record.importers.known_log import LogCommands
 from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.presets import PRESETS
@@ -137,14 +137,14 @@ class LogStart:
             command = _command([f"preset={ROS_PRESET}"], _ROS_REASON)
         return cls(log, options, is_new=True, is_ros=is_ros, command=command)
 
-    def for_import(self) -> KnownCommands:
+    def for_import(self) -> LogCommands:
         """The same for an importer."""
         document = None if self.known is None else self.known.model_dump(mode="json")
         if self.command is not None:
             document = self.command.settings
         labels = compile_corrections(self.commands).labels
         given = [recorded.command for recorded in self.commands]
-        return KnownCommands(self.command, document, labels, given, self._differs)
+        return LogCommands(self.command, document, labels, given, self._differs)
 
     def _differs(self, here: Mapping[str, object] | None, there: Mapping[str, object]) -> str:
         """Why the settings of a source are not those of the log; empty if they are the same."""

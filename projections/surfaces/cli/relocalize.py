@@ -160,6 +160,9 @@ def method_from(text: str) -> Method:
 def _print_answer(answer: Answer, as_json: bool) -> None:
     if answer.thin is not None:
         say(f"the map is thin, {answer.thin}: do not trust the answer until it has seen more")
+    if answer.unlooked:
+        crops = counted(answer.unlooked, "crop")
+        say(f"the map has no embeddings, so those of {crops} say nothing: asked by class and box")
     if not as_json:
         display(answer_text(answer))
         return

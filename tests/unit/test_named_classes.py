@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from eventsrc.ros.class_names import ClassNames, Named, nearest
 from eventsrc.ros.messages import DETECTIONS, LABELS, PARAMETERS, VISION_INFO, BadMessage
+from eventsrc.ros.named_classes import ClassNames, Named, nearest
 from tests.support import ros_messages as ros
 from tests.support.ros_messages import START
 
@@ -112,7 +112,7 @@ def test_what_is_no_such_message_is_refused() -> None:
 
 
 def test_parameters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("eventsrc.ros.class_names._MOST_KEPT", 2)
+    monkeypatch.setattr("eventsrc.ros.named_classes._MOST_KEPT", 2)
     names = ClassNames()
     names.add(PARAMETERS, parameters(labels=["a"], others=["b"]))
     with pytest.raises(BadMessage, match="more than 2 parameters"):
