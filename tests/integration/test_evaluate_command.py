@@ -126,8 +126,8 @@ def test_without_truth_no_perfect_scores_are_printed(mapfold: Commands, runs: li
     said = mapfold("evaluate", *runs[:2])
     assert said.err.startswith("no truth for any keyframe of ")
     places, objects, *_ = said.out.splitlines()
-    assert re.fullmatch(r"places: number \d+, not scored", places)
-    assert re.fullmatch(r"objects: number \d+, not scored", objects)
+    assert re.fullmatch(r"places: number \d+, no room truth", places)
+    assert re.fullmatch(r"objects: number \d+, no instance truth", objects)
 
 
 def test_a_picture_that_cannot_be_written_does_not_cost_the_scores(

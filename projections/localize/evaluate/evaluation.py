@@ -1,7 +1,8 @@
 """The evaluation: fold the map's log, ask questions from the query logs, score everything.
 
 Accuracy and errors are over *known* questions (some true instance of theirs is in the map), errors
-over those that have a pose. ``auroc`` is that of `known` between known and unknown questions.
+over those that have a pose; one on another floor than the question's is wrong, and its error has no
+bound. ``auroc`` is that of `known` between known and unknown questions.
 Calibration counts all questions: an answer is right when the question is known and the pose is
 within 1.5 m of the truth. ``plain`` and ``best_cosine`` are simple baselines (`trials`).
 """
@@ -92,17 +93,19 @@ def evaluate(
         if not isinstance(settings, Settings):
             settings = settings(corrections)
         _, view = fold_log(reader, settings, end, corrections=corrections)
-    keyframes = list(read_keyframes(query_logs, settings))
+    keyframes, height_m = list(read_keyframes(query_logs, settings)), settings.floor_height_m
     if query_logs:
         check_truth(keyframes, truth)
     # Damage before `end` has been raised by the fold.
     mapped = list(read_keyframes([map_log], on_gap=lambda _: None, corrections=corrections))
-    rooms = RoomIndex(mapped, keyframes, truth)
+    rooms = RoomIndex(mapped, keyframes, truth, height_m)
     runner = TrialRunner(view, truth, camera=camera, method=method, room_index=rooms)
     if workers is None:
         workers = default_workers()
-    asked = [make_questions(keyframes, truth, n, seed) for n in CROPS]
-    asked += [spread(make_view_questions(keyframes, truth, n, seed), MOST_VIEWS) for n in VIEWS]
+    asked = [make_questions(keyframes, truth, n, seed, height_m) for n in CROPS]
+    asked += [
+        spread(make_view_questions(keyframes, truth, n, seed, height_m), MOST_VIEWS) for n in VIEWS
+    ]
     answered = iter(runner.run(chain.from_iterable(asked), workers, note))
     each = [list(islice(answered, len(questions))) for questions in asked]
     trials = dict(zip(CROPS, each, strict=False))
@@ -149,6 +152,7 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "yaw_error_rad": percentiles(t.yaw_error_rad for t in known),
         "centroid_error_m": percentiles(t.centroid_error_m for t in known),
         "within_1_5_m": share(t.correct for t in known),
+        "wrong_floor": share(t.wrong_floor for t in known if t.wrong_floor is not None),
         "known_called_unknown": share(t.answer.unknown for t in known),
         "unknown_called_unknown": share(t.answer.unknown for t in unknown),
         "auroc": auroc([t.answer.known for t in known], [t.answer.known for t in unknown]),
@@ -164,7 +168,23 @@ def _summarise(trials: Sequence[Trial]) -> dict[str, Any]:
         "best_cosine": {
             "auroc": auroc([t.best_cosine for t in known], [t.best_cosine for t in unknown])
         },
+        "floors": {floor: _of_floor(known, floor) for floor in _floors(known)},
         "latency_ms": _latency(trials),
+    }
+
+
+def _floors(trials: Sequence[Trial]) -> list[str]:
+    return sorted({t.question.floor for t in trials if t.question.floor is not None})
+
+
+def _of_floor(known: Sequence[Trial], floor: str) -> dict[str, Any]:
+    """Scores of the known questions from one floor."""
+    here = [t for t in known if t.question.floor == floor]
+    return {
+        "known": len(here),
+        "within_1_5_m": share(t.correct for t in here),
+        "wrong_floor": share(t.wrong_floor for t in here if t.wrong_floor is not None),
+        "pose_error_m": percentiles(t.pose_error_m for t in here),
     }
 
 

@@ -37,7 +37,7 @@ from .scores import (
     reliability,
     share,
 )
-from .trials import RIGHT_WITHIN_M, best_cosine, plain_position
+from .trials import RIGHT_WITHIN_M, best_cosine, is_elsewhere, plain_position
 
 VISIT = 20
 """Keyframes of a run are of one visit if their keyframe_ids differ by no more than this."""
@@ -54,7 +54,8 @@ class OwnAnswer:
     """The answer to one of the map's own questions with this number of ``crops``.
 
     ``known`` is whether something shown was observed outside the visit too, ``taken_out`` whether
-    the things shown were taken out of the map. Errors are in metres, None without a pose.
+    the things shown were taken out of the map. Errors are in metres, None without a pose, infinite
+    on another floor.
     """
 
     crops: int
@@ -108,12 +109,13 @@ class OwnQuestions:
             rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
             answer = rank(asked, replace(found, matches=rows), top=1, camera=camera)
             pose = None if answer.pose is None else (answer.pose.x, answer.pose.y)
+            floor = None if answer.pose is None else answer.pose.floor
             return OwnAnswer(
                 self._crops,
                 taken_out,
                 not taken_out and bool(shown - visit),
                 replace(answer, hypotheses=None),
-                _error(keyframe, pose),
+                math.inf if is_elsewhere(floor, keyframe.floor) else _error(keyframe, pose),
                 _error(keyframe, plain_position(rows)),
                 best_cosine(rows),
             )

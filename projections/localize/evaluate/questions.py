@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.ingest import Accepted, ingest
@@ -23,7 +23,8 @@ from eventsrc.log import LogReader
 from eventsrc.log.reader import OnGap
 from projections.fold.corrections import Corrections
 from projections.fold.edited_events import Reembedded, relabelled
-from projections.fold.exact import quantise, to_float32
+from projections.fold.exact import metres_to_um, quantise, to_float32
+from projections.fold.floors import floor_name
 from projections.fold.settings import CameraSettings, Settings
 from projections.fold.sights import camera_of
 from projections.localize import relocalize
@@ -33,6 +34,7 @@ from projections.map.own_events import read_corrections, vectors_of
 from .truth import Key, Truth
 
 DEFAULT_SEED = 20260321
+FLOOR_HEIGHT_M: Final = Settings().floor_height_m
 
 
 T = TypeVar("T")
@@ -44,8 +46,8 @@ _NEAR_BY = 4
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuestion:
-    """A question with its true pose, room and instances; pose, room and key are those of the last
-    view."""
+    """A question with its true pose, room, instances and floor; pose, room, floor and key are those
+    of the last view. ``floor`` is None where its keyframe states none."""
 
     key: Key
     asked: relocalize.Question
@@ -54,6 +56,7 @@ class ScoredQuestion:
     yaw: float
     room: str | None
     instances: tuple[str | None, ...]
+    floor: str | None = None
 
     @property
     def crops(self) -> tuple[QuestionCrop, ...]:
@@ -104,21 +107,30 @@ def _in_space(keyframe: Accepted, model: str, later: Reembedded | None) -> Accep
 
 
 def make_questions(
-    keyframes: Sequence[Accepted], truth: Truth, crops: int, seed: int = DEFAULT_SEED
+    keyframes: Sequence[Accepted],
+    truth: Truth,
+    crops: int,
+    seed: int = DEFAULT_SEED,
+    floor_height_m: float = FLOOR_HEIGHT_M,
 ) -> list[ScoredQuestion]:
     """One question of ``crops`` crops from each keyframe that has truth and as many embeddings; as
-    many detections where no keyframe has an embedding."""
+    many detections where no keyframe has an embedding. ``floor_height_m`` is that of the map's
+    settings."""
     found = []
     bare = _are_bare(keyframes)
     for keyframe in keyframes:
         drawn = _draw(keyframe, crops, seed, bare)
         if _key(keyframe) in truth.keyframes and len(drawn) == crops:
-            found.append(_question([(keyframe, drawn)], truth))
+            found.append(_question([(keyframe, drawn)], truth, floor_height_m))
     return found
 
 
 def make_view_questions(
-    keyframes: Sequence[Accepted], truth: Truth, views: int, seed: int = DEFAULT_SEED
+    keyframes: Sequence[Accepted],
+    truth: Truth,
+    views: int,
+    seed: int = DEFAULT_SEED,
+    floor_height_m: float = FLOOR_HEIGHT_M,
 ) -> list[ScoredQuestion]:
     """One question from each keyframe that has truth and an embedding: it and the keyframes before
     it that have embeddings, ``views`` in all, of up to `VIEW_CROPS` crops each, by one camera.
@@ -137,7 +149,8 @@ def make_view_questions(
             continue
         recent.append((number, keyframe, drawn))
         if len(recent) == views and number - recent[0][0] < _NEAR_BY * views:
-            found.append(_question([(each, crops) for _, each, crops in recent], truth))
+            shown = [(each, crops) for _, each, crops in recent]
+            found.append(_question(shown, truth, floor_height_m))
     return found
 
 
@@ -190,7 +203,14 @@ def draw_key(seed: int, det_id: str) -> bytes:
     return hashlib.sha256(f"{seed}:{det_id}".encode()).digest()
 
 
-def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> ScoredQuestion:
+def floor_of(keyframe: Accepted, floor_height_m: float) -> str | None:
+    """The floor that a keyframe states, as the fold names it; None if it states none."""
+    return floor_name(keyframe.envelope, metres_to_um(floor_height_m))
+
+
+def _question(
+    drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth, floor_height_m: float
+) -> ScoredQuestion:
     views = []
     before = drawn[0][0]
     for keyframe, indices in drawn:
@@ -205,6 +225,7 @@ def _question(drawn: Sequence[tuple[Accepted, Sequence[int]]], truth: Truth) -> 
         *_pose(before),
         truth.room(key),
         tuple(truth.instance(_key(k), index) for k, indices in drawn for index in indices),
+        floor_of(before, floor_height_m),
     )
 
 

@@ -51,6 +51,14 @@ def agreement(classes: Sequence[Hashable], clusters: Sequence[Hashable]) -> Clus
     )
 
 
+def _agreement(
+    classes: Sequence[Hashable], clusters: Sequence[Hashable]
+) -> dict[str, float | None]:
+    """As JSON; all None for no things at all, of which nothing is known."""
+    scores = asdict(agreement(classes, clusters))
+    return scores if classes else dict.fromkeys(scores)
+
+
 def _entropy(counts: Counter[Hashable] | Counter[tuple[Hashable, Hashable]], total: int) -> float:
     return -math.fsum(n / total * math.log(n / total) for n in counts.values())
 
@@ -69,11 +77,11 @@ def _adjusted_rand(
 
 
 def place_scores(view: MapView, truth: Truth) -> dict[str, Any]:
-    """Places against rooms, over placed keyframes whose room is known."""
+    """Places against rooms, over placed keyframes whose room is known; None for scores of none."""
     known = [(k, truth.room((k.run_id, k.keyframe_id))) for k in view.keyframes]
     labelled = [(room, k.place) for k, room in known if room is not None]
     placed = [(room, place) for room, place in labelled if place is not None]
-    scores = agreement([room for room, _ in placed], [place for _, place in placed])
+    scores = _agreement([room for room, _ in placed], [place for _, place in placed])
     posed = [k for k in view.keyframes if k.pose is not None]
     noise = sum(k.place is None for k in posed)
     spanning = sum(_spans(Counter(r for r, p in placed if p == place)) for place in view.places)
@@ -81,7 +89,7 @@ def place_scores(view: MapView, truth: Truth) -> dict[str, Any]:
         "number": len(view.places),
         "rooms": len({room for room, _ in labelled}),
         "keyframes": len(placed),
-        **asdict(scores),
+        **scores,
         "noise_share": noise / len(posed) if posed else 0.0,
         "spanning_share": spanning / len(view.places) if view.places else 0.0,
     }
@@ -96,12 +104,13 @@ def object_scores(view: MapView, truth: Truth) -> dict[str, Any]:
     """Objects against instances, over fused observations whose instance is known.
 
     ``duplicates`` are Objects beyond the first of their instance, ``wrong_fusions`` Objects with
-    observations of more than one instance, ``phantoms`` Objects of false positives alone.
+    observations of more than one instance, ``phantoms`` Objects of false positives alone. Scores of
+    no observation are None.
     """
     seen = instances_of(view, truth)
     fused = [(i, view.observations[o].object) for o, i in seen if i is not None]
     pairs = [(instance, thing) for instance, thing in fused if thing is not None]
-    scores = agreement([instance for instance, _ in pairs], [thing for _, thing in pairs])
+    scores = _agreement([instance for instance, _ in pairs], [thing for _, thing in pairs])
     of_thing: dict[int, Counter[str]] = {}
     for instance, thing in pairs:
         of_thing.setdefault(thing, Counter())[instance] += 1
@@ -110,10 +119,7 @@ def object_scores(view: MapView, truth: Truth) -> dict[str, Any]:
         "number": len(view.objects),
         "instances": len({instance for instance, _ in pairs}),
         "observations": len(pairs),
-        "homogeneity": scores.homogeneity,
-        "completeness": scores.completeness,
-        "v_measure": scores.v_measure,
-        "adjusted_rand": scores.adjusted_rand,
+        **scores,
         "duplicates": sum(n - 1 for n in owners.values()),
         "wrong_fusions": sum(len(c) > 1 for c in of_thing.values()),
         "phantoms": len(view.objects) - len(of_thing),
@@ -195,13 +201,16 @@ def auroc(positive: Sequence[float], negative: Sequence[float]) -> float | None:
 
 
 def percentile(values: Sequence[float], share: float) -> float | None:
-    """The ``share`` quantile (0 … 1) by linear interpolation; None for no values."""
+    """The ``share`` quantile (0 … 1) by linear interpolation; None for no values, and where it is
+    infinite."""
     if not values:
         return None
     ordered = sorted(values)
     at = share * (len(ordered) - 1)
     low = int(at)
-    high = min(low + 1, len(ordered) - 1)
+    high = min(low + 1, len(ordered) - 1) if at > low else low
+    if math.isinf(ordered[high]):
+        return None
     return ordered[low] + (at - low) * (ordered[high] - ordered[low])
 
 

@@ -23,7 +23,7 @@ from projections.localize.relocalize import Answer, ExactIndex, MapCandidates, M
 from projections.map.view import MapView
 
 from .parallel import call_all
-from .questions import ScoredQuestion
+from .questions import FLOOR_HEIGHT_M, ScoredQuestion, floor_of
 from .scores import instances_of
 from .truth import Key, Truth
 
@@ -56,7 +56,11 @@ class RoomIndex:
     """
 
     def __init__(
-        self, mapped: Sequence[Accepted], asking: Sequence[Accepted], truth: Truth
+        self,
+        mapped: Sequence[Accepted],
+        asking: Sequence[Accepted],
+        truth: Truth,
+        floor_height_m: float = FLOOR_HEIGHT_M,
     ) -> None:
         in_map = _instances(mapped, truth)
         runs = {_key(k)[0] for k in asking if in_map & _instances([k], truth)}
@@ -65,13 +69,31 @@ class RoomIndex:
         self._keys = list(known)
         self._rooms = [truth.room(key) for key in self._keys]
         poses = [(k.envelope.map_x or 0.0, k.envelope.map_y or 0.0) for k in known.values()]
-        self._positions = np.array(poses, dtype=np.float64).reshape(-1, 2)
+        self._at = _Positions(poses, [floor_of(k, floor_height_m) for k in known.values()])
 
-    def room(self, x: float, y: float, asking: Key) -> str | None:
-        """The room at a position in metres, without the keyframe ``asking``; None if unknown."""
-        squared = ((self._positions - (x, y)) ** 2).sum(1)
-        nearest = np.argsort(squared, kind="stable")[:2]
+    def room(self, x: float, y: float, asking: Key, floor: str | None = None) -> str | None:
+        """The room at a position in metres, on a floor unless that has no name, without the
+        keyframe ``asking``; None if unknown."""
+        nearest = self._at.nearest(x, y, floor)[:2]
         return next((self._rooms[i] for i in nearest if self._keys[i] != asking), None)
+
+
+class _Positions:
+    """Positions in metres on floors."""
+
+    def __init__(self, xy: Sequence[tuple[float, float]], floors: Sequence[str | None]) -> None:
+        self._xy = np.array(xy, dtype=np.float64).reshape(-1, 2)
+        self._floors = np.array(floors, dtype=np.object_)
+        self._has_floors = any(floor is not None for floor in floors)
+
+    def nearest(self, x: float, y: float, floor: str | None) -> list[int]:
+        """The positions on a floor by distance, ties by number; all of them for None, or if none is
+        on a floor with a name."""
+        squared = ((self._xy - (x, y)) ** 2).sum(1)
+        order = np.argsort(squared, kind="stable")
+        if floor is not None and self._has_floors:
+            order = order[self._floors[order] == floor]
+        return [int(each) for each in order]
 
 
 def _key(keyframe: Accepted) -> Key:
@@ -86,6 +108,9 @@ def _instances(keyframes: Sequence[Accepted], truth: Truth) -> set[str]:
 @dataclass(frozen=True, slots=True)
 class Trial:
     """One question's outcome. Lengths in metres; None where truth or answer lacks the value.
+
+    Errors of an answer on another floor than the question's are infinite; ``wrong_floor`` is None
+    unless both name a floor.
 
     ``known`` is whether at least one of the crops' true instances is in the map. A place *is* a
     room when most of its keyframes are in it, and *contains* it when any is. ``room_has_place`` is
@@ -111,20 +136,23 @@ class Trial:
     plain_place_error_m: float | None
     best_cosine: float
     seconds: float
+    wrong_floor: bool | None = None
 
     @property
     def correct(self) -> bool:
-        """Whether the question is known and its pose within 1.5 m of the truth."""
+        """Whether the question is known and its pose within 1.5 m of the truth, on its floor."""
         return self.known and self.pose_error_m is not None and self.pose_error_m <= RIGHT_WITHIN_M
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The answer of a map, without the truth: see `Trial`. Positions are in metres."""
+    """The answer of a map, without the truth: see `Trial`. Positions are in metres, those of the
+    plain method on ``plain_floor``."""
 
     answer: Answer
     plain_at: tuple[float, float] | None
     plain_place_at: tuple[float, float] | None
+    plain_floor: str | None
     best_cosine: float
     seconds: float
 
@@ -152,6 +180,7 @@ class Asker:
             replace(answer, hypotheses=None),
             plain_position(candidates.matches),
             None if plain is None else (plain.x, plain.y),
+            None if plain is None else plain.floor,
             best_cosine(candidates.matches),
             seconds,
         )
@@ -174,7 +203,7 @@ class TrialRunner:
         self._instances = {i for _, i in instances_of(view, truth) if i is not None}
         self._rooms: dict[str, Counter[str]] = {p.place_id: Counter() for p in view.places.values()}
         self._keyframes: list[tuple[str | None, str | None]] = []
-        positions = []
+        positions, floors = [], []
         for keyframe in view.keyframes:
             if keyframe.pose is None:
                 continue
@@ -184,7 +213,8 @@ class TrialRunner:
                 self._rooms[place_id][room] += 1
             self._keyframes.append((room, place_id))
             positions.append((keyframe.pose.x_um / 1e6, keyframe.pose.y_um / 1e6))
-        self._positions = np.array(positions, dtype=np.float64).reshape(-1, 2)
+            floors.append(keyframe.floor)
+        self._at = _Positions(positions, floors)
         self._rooms_in_map = {room for rooms in self._rooms.values() for room in rooms}
 
     def run(
@@ -202,43 +232,59 @@ class TrialRunner:
         answer = asked.answer
         pose, places = answer.pose, answer.places
         known = any(i in self._instances for i in question.instances if i is not None)
-        true_place = self._nearest(question.x, question.y)[1]
+        true_place = self._nearest(question.x, question.y, question.floor)[1]
+        floor = None if pose is None else pose.floor
+        place_floor = places[0].floor if places else None
         return Trial(
             question,
             answer,
             known,
-            _distance(None if pose is None else (pose.x, pose.y), question),
+            _distance(None if pose is None else (pose.x, pose.y), question, floor),
             None if pose is None or pose.yaw is None else _angle_size(pose.yaw - question.yaw),
-            _distance((places[0].centroid_x, places[0].centroid_y) if places else None, question),
-            None if pose is None else self._nearest(pose.x, pose.y)[0],
+            _distance(
+                (places[0].centroid_x, places[0].centroid_y) if places else None,
+                question,
+                place_floor,
+            ),
+            None if pose is None else self._nearest(pose.x, pose.y, floor)[0],
             None
             if pose is None or self._room_index is None
-            else self._room_index.room(pose.x, pose.y, question.key),
+            else self._room_index.room(pose.x, pose.y, question.key, floor),
             question.room in self._rooms_in_map,
             tuple(self._room_of(place.place_id) for place in places),
             tuple((question.room or "") in self._rooms[place.place_id] for place in places),
             None if true_place is None or not places else places[0].place_id == true_place,
-            _distance(asked.plain_at, question),
-            _distance(asked.plain_place_at, question),
+            _distance(asked.plain_at, question, asked.plain_floor),
+            _distance(asked.plain_place_at, question, asked.plain_floor),
             asked.best_cosine,
             asked.seconds,
+            is_elsewhere(floor, question.floor),
         )
 
-    def _nearest(self, x: float, y: float) -> tuple[str | None, str | None]:
-        """Room and place of the map keyframe nearest to a position; ties go to the earlier one."""
-        if not self._keyframes:
-            return None, None
-        return self._keyframes[int(((self._positions - (x, y)) ** 2).sum(1).argmin())]
+    def _nearest(self, x: float, y: float, floor: str | None) -> tuple[str | None, str | None]:
+        """Room and place of the map keyframe nearest to a position on a floor; ties go to the
+        earlier one."""
+        nearest = self._at.nearest(x, y, floor)
+        return self._keyframes[nearest[0]] if nearest else (None, None)
 
     def _room_of(self, place_id: str) -> str | None:
         rooms = self._rooms[place_id]
         return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
 
 
-def _distance(position: tuple[float, float] | None, question: ScoredQuestion) -> float | None:
-    """The distance in metres from the question's true position."""
+def is_elsewhere(floor: str | None, true_floor: str | None) -> bool | None:
+    """Whether two floors differ; None unless both have a name."""
+    return None if floor is None or true_floor is None else floor != true_floor
+
+
+def _distance(
+    position: tuple[float, float] | None, question: ScoredQuestion, floor: str | None
+) -> float | None:
+    """The distance in metres from the question's true position; infinite on another floor."""
     if position is None:
         return None
+    if is_elsewhere(floor, question.floor):
+        return math.inf
     return math.hypot(position[0] - question.x, position[1] - question.y)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import counted, visible
 from projections.localize.evaluate.evaluation import draw_failures
 from projections.localize.evaluate.evaluation import evaluate as score
 from projections.localize.evaluate.questions import DEFAULT_SEED
@@ -66,6 +66,12 @@ _OWN_ROWS = (
     ("known_ece_floor", "… expected if calibrated"),
     ("ece", "calib. error of confidence"),
     ("ece_floor", "… expected if calibrated"),
+)
+_FLOOR_ROWS = (
+    ("known", "questions of known things"),
+    ("pose_error_m.p50", "pose error p50, m"),
+    ("within_1_5_m", "pose within 1.5 m"),
+    ("wrong_floor", "on another floor"),
 )
 _LABEL = 30
 
@@ -268,7 +274,8 @@ def _has_truth(scores: Mapping[str, Any]) -> bool:
 
 def scores_text(scores: Mapping[str, Any]) -> str:
     """The scores as a table: places, objects, then re-localisation by number of crops and views."""
-    lines = [_score_line(name, scores[name], _has_truth(scores)) for name in ("places", "objects")]
+    lines = [_score_line("places", scores["places"], scores["places"]["rooms"], "room")]
+    lines += [_score_line("objects", scores["objects"], scores["objects"]["instances"], "instance")]
     columns = {
         counted(int(n), word): column
         for word, group in (("crop", "relocalization"), ("view", "views"))
@@ -276,6 +283,13 @@ def scores_text(scores: Mapping[str, Any]) -> str:
     }
     lines += ["", f"re-localisation ({scores['method']})".ljust(_LABEL) + _cells(list(columns))]
     lines += _rows(_ROWS, columns)
+    floors = sorted({floor for column in columns.values() for floor in column["floors"]})
+    if floors:
+        lines += _rows((("wrong_floor", "on another floor"),), columns)
+    for floor in floors:
+        of_floor = {name: column["floors"].get(floor, {}) for name, column in columns.items()}
+        lines += [f"  from floor {visible(floor)}"]
+        lines += _rows(_FLOOR_ROWS, of_floor)
     return "\n".join(lines) + "\n"
 
 
@@ -294,9 +308,9 @@ def _rows(rows: Sequence[tuple[str, str]], columns: Mapping[str, Any]) -> Iterat
         yield "  " + label.ljust(_LABEL - 2) + _cells(values)
 
 
-def _score_line(title: str, scores: Mapping[str, Any], has_truth: bool) -> str:
-    if not has_truth:  # of no things all scores are perfect
-        return f"{title}: number {scores['number']}, not scored"
+def _score_line(title: str, scores: Mapping[str, Any], known: int, of: str) -> str:
+    if not known:
+        return f"{title}: number {scores['number']}, no {of} truth"
     return f"{title}: " + ", ".join(f"{k} {_cell(v)}" for k, v in scores.items())
 
 
@@ -307,7 +321,7 @@ def _cells(cells: list[str]) -> str:
 def _value_at(column: Mapping[str, Any], path: str) -> Any:
     value: Any = column
     for part in path.split("."):
-        value = value[part]
+        value = None if value is None else value.get(part)
     return value
 
 
