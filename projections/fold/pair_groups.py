@@ -67,25 +67,27 @@ class ApartPairs(Generic[_Thing]):
 
     def __init__(self, divided: Iterable[Collection[Collection[_Thing]]] = ()) -> None:
         sets = [parts for parts in divided if len(parts) > 1]
-        self.sets: list[list[_Thing]] = [list(chain.from_iterable(parts)) for parts in sets]
-        self.things = sorted(set(chain.from_iterable(self.sets)))
-        """All of them, ascending."""
+        self.things = sorted({thing for parts in sets for part in parts for thing in part})
+        """All of them, ascending; their indices stand for them in what follows."""
         rank = self._rank = {thing: number for number, thing in enumerate(self.things)}
-        self._single: list[set[int]] = [set() for _ in self.things]
-        """What a thing is kept apart from by sets of two, by rank."""
+        self.pairs: list[set[int]] = [set() for _ in self.things]
+        """What each is kept apart from by sets of two."""
+        self.sets: list[frozenset[int]] = []
+        """The larger sets."""
         self._inside: list[list[tuple[frozenset[int], frozenset[int]]]] = [[] for _ in self.things]
-        """The larger sets that a thing is in, and its part of each, by rank."""
-        for parts, things in zip(sets, self.sets, strict=True):
-            if len(things) == 2:
-                a, b = rank[things[0]], rank[things[1]]
-                self._single[a].add(b)
-                self._single[b].add(a)
+        """The larger sets that each is in, and its part of them."""
+        for parts in sets:
+            every = frozenset([rank[thing] for part in parts for thing in part])
+            if len(every) == 2:
+                a, b = every
+                self.pairs[a].add(b)
+                self.pairs[b].add(a)
                 continue
-            ranked = [frozenset(map(rank.__getitem__, part)) for part in parts]
-            every = frozenset[int]().union(*ranked)
-            for part in ranked:
-                for number in part:
-                    self._inside[number].append((every, part))
+            self.sets.append(every)
+            for part in parts:
+                own = frozenset([rank[thing] for thing in part])
+                for number in own:
+                    self._inside[number].append((every, own))
 
     @classmethod
     def of(cls, pairs: Iterable[tuple[_Thing, _Thing]]) -> "ApartPairs[_Thing]":
@@ -118,7 +120,7 @@ class ApartPairs(Generic[_Thing]):
     def against(self, number: int) -> set[int]:
         """The indices in `things` of those that one is kept apart from."""
         inside = self._inside[number]
-        return self._single[number].union(*(every - part for every, part in inside))
+        return self.pairs[number].union(*(every - part for every, part in inside))
 
     def greater(self) -> Iterator[tuple[int, list[int]]]:
         """The index in `things` of each that is the smaller one of a pair, and those of the greater
@@ -162,16 +164,14 @@ class PairGroups(Generic[_Thing]):
         }
         self._against: dict[int, Set[int]] = {}
         """The groups that a group is kept apart from; its own may be among them."""
+        of = [self.group_of[thing] for thing in apart.things]
         pairs: dict[int, set[int]] = {}
+        for group, others in zip(of, apart.pairs, strict=True):
+            if others:
+                pairs.setdefault(group, set()).update(map(of.__getitem__, others))
         sets_of: dict[int, set[frozenset[int]]] = {}
-        for things in apart.sets:
-            groups = [self.group_of[thing] for thing in things]
-            if len(groups) == 2:
-                a_group, b_group = groups
-                pairs.setdefault(a_group, set()).add(b_group)
-                pairs.setdefault(b_group, set()).add(a_group)
-                continue
-            every = frozenset(groups)
+        for ranks in apart.sets:
+            every = frozenset(map(of.__getitem__, ranks))
             for group in every:
                 sets_of.setdefault(group, set()).add(every)
         # Groups of the same sets share one value.
@@ -212,17 +212,17 @@ def without_contradictions(
     # What is one is never made one with what it is kept apart from: then every root is in a set of
     # things kept apart once, and two that share such a set are apart.
     sets_of: dict[_Thing, set[int]] = {}
-    parts_of: dict[frozenset[_Thing], list[list[_Thing]]] = {}
+    parts_of: dict[tuple[_Thing, ...], list[list[_Thing]]] = {}
     same = set[tuple[_Thing, _Thing]]()
     for things, is_same in reversed(list(statements)):
         if not is_same:
-            if (key := frozenset(things)) not in parts_of:
+            if things not in parts_of:
                 parts: dict[_Thing, list[_Thing]] = {}
-                for thing in key:
+                for thing in things:
                     parts.setdefault(roots.find(thing), []).append(thing)
                 for root in parts:
                     sets_of.setdefault(root, set()).add(len(parts_of))
-                parts_of[key] = list(parts.values())
+                parts_of[things] = list(parts.values())
             continue
         first, second = things
         a, b = roots.find(first), roots.find(second)

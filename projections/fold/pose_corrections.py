@@ -232,19 +232,15 @@ class _Stretches:
 
     def put(self, first: int, last: int, number: int) -> set[int | None]:
         """Make ``number`` the last from ``first`` to ``last``; returns those that were."""
-        self._split(first)
-        self._split(last + 1)
-        begin, end = bisect_left(self._starts, first), bisect_left(self._starts, last + 1)
-        before = set(self._last[begin:end])
-        self._starts[begin:end], self._last[begin:end] = [first], [number]
+        starts, lasts, after = self._starts, self._last, last + 1
+        begin, end = bisect_left(starts, first), bisect_left(starts, after)
+        is_cut = begin == len(starts) or starts[begin] != first
+        before = set(lasts[begin - is_cut : end])
+        if end == len(starts) or starts[end] != after:  # the rest of a stretch begins there
+            starts[begin:end], lasts[begin:end] = [first, after], [number, lasts[end - 1]]
+        else:
+            starts[begin:end], lasts[begin:end] = [first], [number]
         return before
-
-    def _split(self, at: int) -> None:
-        """Let a stretch begin at an id."""
-        index = bisect_left(self._starts, at)
-        if index == len(self._starts) or self._starts[index] != at:
-            self._starts.insert(index, at)
-            self._last.insert(index, self._last[index - 1])
 
 
 class _Stated:
@@ -266,6 +262,8 @@ class _Stated:
 
     def take(self, first: int, last: int) -> set[int | None]:
         """Remove the ids from ``first`` to ``last``; returns the corrections that were the last."""
+        if not self._last:
+            return set()
         near = range(first >> _BUCKET_BITS, (last >> _BUCKET_BITS) + 1)
         buckets: Iterable[int] = near
         if len(near) > len(self._buckets):

@@ -214,9 +214,8 @@ class MapView:
             absorbed = self.places.pop(ordinal, None)
             if absorbed is None:
                 continue
-            small, large = absorbed.unordered_members, survivor.unordered_members
-            if len(small) > len(large):
-                small, large = large, small
+            both = absorbed.unordered_members, survivor.unordered_members
+            small, large = sorted(both, key=len)
             large.extend(small)
             survivor.unordered_members = large
             absorbed.unordered_members = []
@@ -264,10 +263,10 @@ class MapView:
             moved = tuple(absorbed.observations)
             for observation in moved:
                 self.observations[observation].object = delta.survivor
-            less, more = sorted((absorbed.observations, survivor.observations), key=len)
-            for observation in less:  # to sort all would take long where an Object absorbs many
-                insort(more, observation)
-            survivor.observations = more
+            small, large = sorted((absorbed.observations, survivor.observations), key=len)
+            for observation in small:  # to sort all takes long where an Object absorbs many
+                insort(large, observation)
+            survivor.observations = large
             survivor.confirmed |= absorbed.confirmed
             confirm(survivor, moved, self.observations, self.keyframes)
             relocations = survivor.relocations + absorbed.relocations
