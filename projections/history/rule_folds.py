@@ -44,11 +44,10 @@ from projections.map.digest import map_digest
 from projections.map.fold import fold_parsed, new_map, read_ahead
 from projections.map.parsing import ParsedEvent, parsed_stretches
 from projections.map.view import MapView
-from projections.store.column_rows import TableWriter
 from projections.store.history import History
 from projections.store.history_recorder import map_at
 from projections.store.history_records import PlaceHistory
-from projections.store.tables import Tables
+from projections.store.tables import Tables, TableWriter
 
 from .known_history import Progress
 

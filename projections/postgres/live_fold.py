@@ -12,7 +12,7 @@ from projections.map.changes import ChangeTracker
 from projections.map.fold import fold_events, fold_parsed, with_vectors
 from projections.map.parsing import READ_AHEAD, ParsedEvent
 from projections.map.view import MapView
-from projections.store.column_rows import TableWriter
+from projections.store.tables import TableWriter
 
 
 class LiveFold:

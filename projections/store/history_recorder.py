@@ -27,11 +27,10 @@ from projections.map.fold import fold_events, fold_into, fold_log, new_map
 from projections.map.parsing import READ_AHEAD, parse_events
 from projections.map.view import MapView
 
-from .column_rows import TableWriter
 from .columns import STRIPE_EVENTS, Stripe, joined
 from .history import History
 from .stored_view import StoredView
-from .tables import DamagedPart, Tables
+from .tables import DamagedPart, Tables, TableWriter
 from .timeline_cache import TimelineCache
 from .vectors import RecordedVectors
 

@@ -14,11 +14,10 @@ from projections.fold.deltas import Delta, ObjectSeen, ObjectsMerged
 from projections.fold.settings import Settings
 from projections.map.state_output import state_document
 from projections.map.view import MapView
-from projections.store.column_rows import TableWriter
 from projections.store.history import History
 from projections.store.object_states import ObjectStates
 from projections.store.stored_view import StoredView
-from projections.store.tables import Tables
+from projections.store.tables import Tables, TableWriter
 from tests.support.envelopes import detection, envelope
 from tests.support.evidence_drives import EVIDENCE, SLOW
 from tests.support.folds import Folded

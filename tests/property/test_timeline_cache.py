@@ -45,7 +45,7 @@ def kept_early(stripe: int = 7) -> Iterator[None]:
     store = "projections.store"
     with (
         patch(f"{store}.timeline_cache.MIN_EVENTS", 1),
-        patch(f"{store}.column_rows.STRIPE_EVENTS", stripe),
+        patch(f"{store}.tables.STRIPE_EVENTS", stripe),
         patch(f"{store}.history_recorder.STRIPE_EVENTS", 2 * stripe),
         patch(f"{store}.columns.STRIPE_EVENTS", 4 * stripe),
     ):

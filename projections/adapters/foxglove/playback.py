@@ -39,11 +39,10 @@ from projections.map.parsing import READ_AHEAD
 from projections.map.phrases import change_lines
 from projections.map.scenes import Moments
 from projections.map.view import MapView
-from projections.store.column_rows import TableWriter
 from projections.store.history import History
 from projections.store.history_recorder import map_at
 from projections.store.stored_view import StoredView
-from projections.store.tables import Tables
+from projections.store.tables import Tables, TableWriter
 
 from .topics import FRAME, MapTopics
 
