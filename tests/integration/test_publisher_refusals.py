@@ -15,7 +15,7 @@ from eventsrc.record.robot.publisher import EnvelopePublisher, Sender
 from eventsrc.record.transport.session import Session, ZenohOptions
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY
-from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, NEVER_S, Program
 from tests.support.recorders import encoded_ack, keyframe_ids, robot_at, stored_payloads
 
 Sessions = Callable[[], Session]
@@ -63,13 +63,14 @@ def test_an_invalid_envelope_is_refused_on_publishing(
 
 
 def test_refused_envelopes_block_nothing(start: Start, endpoint: str, tmp_path: Path) -> None:
-    """More envelopes are refused than may be under way, before and between good ones."""
+    """More envelopes are refused than may be under way, before and between good ones; none is
+    sent again."""
     log = tmp_path / "log"
     recorder = start("record", str(log), "--connect", endpoint, "--max-payload", "1000")
     recorder.wait_for("recording")
     options = ZenohOptions(connect=(endpoint,))
     too_large = {*range(12), 20}
-    with EnvelopePublisher(options, tmp_path / "spool", window=8, resend_after_s=0.2) as robot:
+    with EnvelopePublisher(options, tmp_path / "spool", window=8, resend_after_s=NEVER_S) as robot:
         for k in range(25):
             robot.publish(envelope(k, note="x" * (1_000 if k in too_large else 10)))
         assert not robot.flush(DEADLINE_S), "not everything was acknowledged"

@@ -19,7 +19,7 @@ from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.session import Received, Session, ZenohOptions
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY, read_log
-from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, NEVER_S, Program
 
 Start = Callable[..., Program]
 
@@ -111,7 +111,8 @@ def test_a_segment_that_is_cut_short_is_reported_and_recording_goes_on(
     log = tmp_path / "log"
     recorder = start("record", str(log), "--connect", endpoint, "--fsync", "always", "--json")
     recorder.wait_for("recording")
-    with EnvelopePublisher(ZenohOptions(connect=(endpoint,)), tmp_path / "spool") as robot:
+    options = ZenohOptions(connect=(endpoint,))
+    with EnvelopePublisher(options, tmp_path / "spool", resend_after_s=NEVER_S) as robot:
         for k in range(5):
             robot.publish(envelope(k))
         assert robot.flush(DEADLINE_S)

@@ -20,7 +20,7 @@ from eventsrc.record.transport.session import Received, Session, ZenohOptions, o
 from tests.docs.console import ROOT
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import read_log
-from tests.support.fixtures_zenoh import DEADLINE_S, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, NEVER_S, Program
 from tests.support.thorough import mostly_slow
 
 PAGE = (ROOT / "docs" / "security.md").read_text()
@@ -107,7 +107,7 @@ def test_only_robots_get_into_the_log(
     stranger = session("stranger")
     stranger.send(KEY, payload(envelope(1, run_id="stranger")))
     stranger.confirm()
-    with EnvelopePublisher(options("robot-1"), folder / "spool") as robot:
+    with EnvelopePublisher(options("robot-1"), folder / "spool", resend_after_s=NEVER_S) as robot:
         for k in range(3):
             robot.publish(envelope(k, run_id="robot-1"))
         assert robot.flush(DEADLINE_S)

@@ -37,6 +37,8 @@ LONG_LEASE = Path(__file__).with_name("long_lease.json5")
 LOOPBACK = ZenohOptions(listen=("tcp/127.0.0.1:0",), config_file=LONG_LEASE)
 DEADLINE_S = 30.0
 """Longer than any wait in a healthy run; only a broken one ever waits that long."""
+NEVER_S = 1e6
+"""When a robot sends again what must be counted once."""
 
 
 def scrape(port: int) -> dict[str, float]:

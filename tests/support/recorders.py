@@ -82,9 +82,9 @@ def encoded_ack(*payloads: bytes, key: str = KEY) -> bytes:
 
 
 def stored_payloads(log: Path) -> list[bytes]:
-    """Envelopes in a log."""
+    """Envelopes in a log, each once: a robot that waits long for an acknowledgement sends again."""
     with LogReader(log) as reader:
-        return [event.payload for event in reader.read(keys={KEY})]
+        return list(dict.fromkeys(event.payload for event in reader.read(keys={KEY})))
 
 
 def keyframe_ids(log: Path) -> set[int]:
