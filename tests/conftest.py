@@ -31,7 +31,6 @@ pytest_plugins = [
     "tests.support.fixtures_log",
     "tests.support.fixtures_serve",
     "tests.support.fixtures_zenoh",
-    "tests.support.fixtures_zenoh",
 ]
 
 UNIT = Path(__file__).parent / "unit"

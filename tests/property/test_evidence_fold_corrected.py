@@ -23,8 +23,6 @@ from projections.map.view import MapView
 from tests.support.evidence_drives import EVIDENCE, SLOW, check_recounts, compiled, det_ids, drives
 from tests.support.folds import Folded
 
-TURNS = [(0.5, -1.0, 0.0), (0.0, 0.0, 0.3), (2.0, 1.0, 3.0)]
-
 
 @SLOW
 @given(documents=drives(), data=st.data())

@@ -15,11 +15,44 @@ from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.log.format import schema_of
 from tests.support.envelopes import detection, envelope, payload
-from tests.support.viewers import NotRead, parse_json_schema
 
 SYSTEM_KEYS = sorted(value for name, value in vars(system_events).items() if name.endswith("_KEY"))
 KEYS = ["tb/detections", "robots/7/seen", *SYSTEM_KEYS, "mapfold/of-a-later-version"]
 SAMPLE = Path(__file__).resolve().parents[2] / "logs" / "sample"
+SCALARS = {"boolean": "bool", "integer": "float64", "number": "float64", "string": "string"}
+
+
+class NotRead(Exception):
+    """A schema that viewers do not read."""
+
+
+def parse_json_schema(schema: dict[str, Any], name: str) -> dict[str, dict[str, str]]:
+    """Field names and types of ``name`` and of the objects in it, as Foxglove Studio reads them
+    by the function of this name. Raises NotRead.
+
+    It looks at ``type``, ``properties``, ``items`` and ``contentEncoding``, and at nothing else.
+    """
+    found: dict[str, dict[str, str]] = {}
+    if schema.get("type") != "object":
+        raise NotRead(f"{name} is of type {schema.get('type')}")
+    if "properties" not in schema:
+        raise NotRead(f"{name} has no properties")
+    fields = found[name] = {}
+    for field, each in schema["properties"].items():
+        at, kind, array = f"{name}.{field}", each.get("type"), ""
+        if kind == "array":
+            if not isinstance(each.get("items"), dict):
+                raise NotRead(f"{at} is an array of unknown items")
+            each, array = each["items"], "[]"
+            kind = each.get("type")
+        if kind == "object":
+            found.update(parse_json_schema(each, at))
+        elif kind not in SCALARS:
+            raise NotRead(f"{at} is of type {kind}")
+        elif "contentEncoding" in each:
+            raise NotRead(f"{at} is encoded")
+        fields[field] = (at if kind == "object" else SCALARS[kind]) + array
+    return found
 
 
 def parsed(key: str) -> dict[str, dict[str, str]]:

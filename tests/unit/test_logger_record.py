@@ -8,7 +8,6 @@ import pytest
 from eventsrc.record.importers.json_lines import read_line
 from eventsrc.record.importers.sources import ImportedMessage
 
-TS = 1740000000.123
 TS_NS = 1740000000123000000
 ODD = b'{ "run_id":"r\\u00e9", "n": 1e5, "n": 2,\t"x": 0.10, "s": "a\\"}, b" }'
 

@@ -142,7 +142,6 @@ def test_a_view_may_repeat_the_camera_of_its_question() -> None:
 
 ONE = {"crops": [{"embedding": VECTOR}]}
 MOVED = {"dx": 0.0, "dy": 0.0, "dyaw": 0.5, **ONE}
-BASE64 = embedding(VECTOR)["embedding"]
 NAN = embedding([float("nan"), 1.0])
 
 
