@@ -292,7 +292,8 @@ def changes(
         return
     display(changes_text(found, most=None if all_ else MOST_LINES))
     if found.unsure:
-        say(f"+ {counted(found.unsure, 'change')} not sure; `mapfold diff` shows them")
+        shows = advised("diff", "W1", "W2")
+        say(f"+ {counted(found.unsure, 'change')} not sure; `{shows}` shows them")
 
 
 def bisect(
