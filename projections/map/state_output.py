@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from eventsrc.base.text import advised, command_line, counted, table, visible
+from eventsrc.base.text import advised, command_line, counted, shortening, table, visible
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import MapGiven, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
@@ -15,6 +15,7 @@ from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
 from .confirmed import objects_text
+from .naming import ShortIds, things_of
 from .phrases import command_document, seen_times
 from .place_regions import Region, place_regions
 from .records import ObjectRecord
@@ -205,7 +206,8 @@ def state_text(
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")
-    lines += _place_lines(view, everything=everything)
+    with shortening(ShortIds.of(things_of(view)).text):
+        lines += _place_lines(view, everything=everything)
     return "\n".join(lines) + "\n"
 
 

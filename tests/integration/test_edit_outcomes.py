@@ -129,8 +129,8 @@ def test_a_place_is_named_by_its_name_unless_two_have_it(mapfold: Commands) -> N
     assert said["command"]["places"][0] == {"run_id": "run-a", "keyframe_id": 0}
     mapfold("edit", "log", "name-place", FAR, "hall", *WHY)
     said = mapfold("edit", "log", "join", "hall", FAR, *WHY, code=2)
-    assert f"'hall' means 2 places: {LEFT} (hall, " in said.err
-    assert f"; {FAR} (hall, " in said.err
+    assert f"'hall' means 2 places; give the id of one:\n  {LEFT} (hall, " in said.err
+    assert f"\n  {FAR} (hall, " in said.err
 
 
 @pytest.mark.parametrize(

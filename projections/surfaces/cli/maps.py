@@ -8,10 +8,9 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
-from eventsrc.base.text import counted, shorten_by, visible
+from eventsrc.base.text import counted, visible
 from projections.map.confirmed import objects_text
 from projections.map.digest import map_digest
-from projections.map.naming import ShortIds, things_of
 from projections.map.state_output import (
     places_advice,
     space_advice,
@@ -63,7 +62,6 @@ def state(
     elif digest:
         display(f"{hexdigits}\n")
     else:
-        shorten_by(ShortIds.of(things_of(view)).text)
         display(state_text(view, hexdigits, known, everything=all_))
     if digest:
         return
