@@ -218,7 +218,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
 NO_CORRECTIONS = Corrections()
 
 
-EVIDENCE_VERSION: Final = 2
+EVIDENCE_VERSION: Final = 3
 """To be raised with every change of fusion by evidence, or of where its Objects are located, that
 changes the map of some log: databases of such maps are then to be rebuilt."""
 

@@ -18,7 +18,7 @@ robot was in.
 """
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Final, TypeAlias
 
@@ -59,7 +59,7 @@ class FreeFloor:
         self._label_of: list[int] = self._labels.tolist()
         self._floor_bytes = self.is_floor.tobytes()
         stride = self.shape[1]
-        self._reach = _SIDE * metres_to_um(REACH_M) // self.side_um
+        self.reach = self.steps(metres_to_um(REACH_M))
         self._sides = (1, -1, stride, -stride)
         self._steps = tuple((side, _SIDE) for side in self._sides) + tuple(
             (down + right, _CORNER) for down in (stride, -stride) for right in (1, -1)
@@ -73,6 +73,10 @@ class FreeFloor:
         inside = 0 < row < rows - 1 and 0 < column < columns - 1
         return row * columns + column if inside else None
 
+    def steps(self, um: int) -> int:
+        """A distance as the length of a way."""
+        return _SIDE * um // self.side_um
+
     def label(self, block: Block) -> int:
         """The region of a block, `NOWHERE` for a wall."""
         return self._label_of[block]
@@ -81,26 +85,39 @@ class FreeFloor:
         """Where a thing stands: the first floor on the straight line from its estimated position to
         where it was seen from, without any before a wall within `BEHIND_M`. None if there is
         none."""
-        (x, y), (to_x, to_y) = at, seen_from
-        dx, dy = to_x - x, to_y - y
-        far = max(abs(dx), abs(dy))
-        steps = 2 * far // self.side_um + 1
-        behind = min(steps, steps * metres_to_um(BEHIND_M) // max(far, 1))
         found = None
-        for step in range(steps + 1):
-            if step > behind and found is not None:
+        for block, is_behind in self._line(at, seen_from):
+            if not is_behind and found is not None:
                 break
-            block = self.block_at((x + dx * step // steps, y + dy * step // steps))
-            if block is None:
-                continue
-            if step <= behind and self._label_of[block] == NOWHERE:
+            if is_behind and self._label_of[block] == NOWHERE:
                 found = None
             elif found is None and self._floor_bytes[block]:
                 found = block
         return found
 
-    def nearest(self, start: Block, sources: Mapping[Block, int]) -> int | None:
-        """The nearest source in the region of a block; ``sources`` are numbers by block."""
+    def entrance(self, at: Point, seen_from: Point, regions: Container[int]) -> Block | None:
+        """The first floor of some regions on the straight line from a position to where it was seen
+        from; None if there is none."""
+        for block, _ in self._line(at, seen_from):
+            if self._floor_bytes[block] and self._label_of[block] in regions:
+                return block
+        return None
+
+    def _line(self, start: Point, end: Point) -> Iterator[tuple[Block, bool]]:
+        """The blocks on a straight line, and whether each is within `BEHIND_M` of the start."""
+        (x, y), (to_x, to_y) = start, end
+        dx, dy = to_x - x, to_y - y
+        far = max(abs(dx), abs(dy))
+        steps = 2 * far // self.side_um + 1
+        behind = min(steps, steps * metres_to_um(BEHIND_M) // max(far, 1))
+        for step in range(steps + 1):
+            block = self.block_at((x + dx * step // steps, y + dy * step // steps))
+            if block is not None:
+                yield block, step <= behind
+
+    def nearest(self, start: Block, sources: Mapping[Block, int]) -> tuple[int, int] | None:
+        """The nearest source in the region of a block, and the length of the way there; ``sources``
+        are numbers by block."""
         label, ways, known = self._label_of[start], [(0, start)], set[Block]()
         found, limit = None, _FAR
         while ways:
@@ -117,7 +134,7 @@ class FreeFloor:
                 to = block + step
                 if self._label_of[to] == label and to not in known:
                     heapq.heappush(ways, (length + more, to))
-        return found
+        return None if found is None else (found, limit)
 
     def by_straight_way(
         self, start: Block, blocks: NDArray[np.int64]
@@ -130,6 +147,13 @@ class FreeFloor:
         far, near = np.maximum(across, down), np.minimum(across, down)
         for index in np.argsort(_SIDE * (far - near) + _CORNER * near, kind="stable").tolist():
             yield index, self._is_straight_way(start, int(blocks[index]))
+
+    def least_way(self, start: Block, end: Block) -> int:
+        """The length that a way between two blocks has at least."""
+        columns = self.shape[1]
+        across = abs(start % columns - end % columns)
+        down = abs(start // columns - end // columns)
+        return _SIDE * abs(across - down) + _CORNER * min(across, down)
 
     def _is_straight_way(self, start: Block, end: Block) -> bool:
         """Whether one of two shortest ways stays in a region: across corners first, or sides."""
@@ -168,7 +192,7 @@ class FreeFloor:
         for _ in range(MOST_DOORS):
             unowned = (keys == _FAR) & self.is_floor & ~driven
             entered = self._enter(keys, front, unowned)
-            self._spread(keys, entered, unowned, self._reach)
+            self._spread(keys, entered, unowned, self.reach)
             front = np.flatnonzero(unowned & (keys != _FAR))
         owned = self.is_floor & (keys != _FAR)
         return np.where(owned, keys & ((1 << _SOURCE_BITS) - 1), NOWHERE)
@@ -184,7 +208,7 @@ class FreeFloor:
             to = from_ + side
             length = before[from_] + (_SIDE << _SOURCE_BITS)
             own = unowned[to] & (self._labels[to] != self._labels[from_])
-            own &= length >> _SOURCE_BITS <= self._reach
+            own &= length >> _SOURCE_BITS <= self.reach
             keys[to[own]] = np.minimum(keys[to[own]], length[own])
         return np.flatnonzero(unowned & (keys != _FAR))
 

@@ -115,7 +115,10 @@ def _check_one_by_one(floor: FreeFloor, blocks: list[int], owners: NDArray[np.in
         own = {b: n for b, n in numbers.items() if floor.label(b) == label}
         if owner == NOWHERE or not own:
             continue
-        assert floor.nearest(block, own) == owner
+        nearest = floor.nearest(block, own)
+        assert nearest is not None
+        assert nearest[0] == owner
+        assert min(floor.least_way(block, each) for each in own) <= nearest[1]
         before = list[int]()
         for index, is_free in floor.by_straight_way(block, np.array(list(own), np.int64)):
             before.append(list(own.values())[index])

@@ -48,7 +48,7 @@ class Map:
     Examples:
         >>> house = fold("logs/sample")
         >>> house.places[3]["type"], house.digest[:8]
-        ('living room', '97223fec')
+        ('living room', '18fce70e')
     """
 
     def __init__(self, view: MapView, known_at: Offset | None = None) -> None:
