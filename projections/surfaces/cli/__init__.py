@@ -56,6 +56,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
     "Correct and measure": {
         "edit": "edit:edit",
         "edits": "edit:edits",
+        "align": "align_command:align",
         "evaluate": "evaluate:evaluate",
         "calibrate": "calibrate:calibrate_command",
         "reembed": "reembed:reembed_log",

@@ -2,7 +2,7 @@
 
 scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
     [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types | --bags |
-    --ask]
+    --ask | --align]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
@@ -31,6 +31,7 @@ from projections.fold.settings import Settings
 from projections.map.view import MapView
 
 from . import tables
+from .aligning import AlignRow, align_rows, align_table
 from .asking import AskedRow, asked_row, asked_table
 from .bags import BagRow, bag_row, bags_table
 from .calibrating import calibrated_settings, calibration_table
@@ -77,6 +78,12 @@ def main() -> None:
             _write(options.json, bags)
             return
         cases = _cases(generator, chosen, options, limit)
+        if options.align:
+            aligned = align_rows(list(cases), options.seed)
+            print(f"{options.half} half, {options.moved:g} of the movable things moved")
+            print(align_table(aligned))
+            _write(options.json, aligned)
+            return
         if options.ask:
             asked = [_asked_row(generator, case) for case in cases]
             print(f"{options.half} half, {options.moved:g} of the movable things moved")
@@ -132,7 +139,8 @@ def _world(case: Case) -> str:
 
 
 def _write(
-    path: Path | None, rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow]
+    path: Path | None,
+    rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow | AlignRow],
 ) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
@@ -217,6 +225,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--types", action="store_true", help="types of places against room names")
     parser.add_argument(
         "--ask", action="store_true", help="find, changes and goals; with --moved, instead"
+    )
+    parser.add_argument(
+        "--align", action="store_true", help="runs in frames of their own find each other, instead"
     )
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument(

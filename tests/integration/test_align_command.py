@@ -1,0 +1,97 @@
+"""`mapfold align`: two runs of one log, or of two logs, in frames of their own."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.property.test_align import HERE, in_frame
+from tests.support.commands import Commands
+from tests.support.logs import simulated
+
+FRAME = (12.0, -7.0, 2.1)
+CAMERA = {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
+
+
+def lines(run: str, frame: tuple[float, float, float], seed: int = 7) -> str:
+    documents = (in_frame(each, frame) for each in simulated(seed, run).envelopes)
+    return "".join(json.dumps(each | {"camera": CAMERA}) + "\n" for each in documents)
+
+
+@pytest.fixture
+def mapfold(tmp_path: Path) -> Commands:
+    return Commands.in_folder(tmp_path)
+
+
+def log_of(mapfold: Commands, name: str, *parts: str) -> Path:
+    (mapfold.folder / f"{name}.jsonl").write_text("".join(parts))
+    mapfold("import", name, f"{name}.jsonl", "--preset", "full")
+    return mapfold.folder / name
+
+
+def test_a_run_is_brought_into_the_frame_of_the_first(mapfold: Commands) -> None:
+    log = log_of(mapfold, "log", lines("a", HERE), lines("b", FRAME))
+    apart = mapfold("state", log, "--json").json["counts"]
+    said = mapfold("align", log, "--picture", "both.png")
+    assert said.out.startswith("sim-7-b into the frame of sim-7-a: moved by (")
+    assert "nothing is written; --write records" in said.err
+    assert (mapfold.folder / "both.png").read_bytes().startswith(b"\x89PNG")
+    told = mapfold("align", log, "--run", "sim-7-b", "--to", "sim-7-a", "--write", "--json").json
+    assert (told["verdict"], told["runs"], told["to"]) == ("sure", ["sim-7-b"], "sim-7-a")
+    assert len(told["pairs"]) == told["common"] >= 12
+    (command,) = told["recorded"]
+    edits = mapfold("edits", log).out
+    assert f"aligned to sim-7-a: {told['common']} common things" in edits
+    assert command["command_id"] in edits
+    joined = mapfold("state", log, "--json").json["counts"]
+    assert joined["places"] < apart["places"]
+    assert joined["objects"] < apart["objects"]
+    again = mapfold("align", log, "--write")
+    assert "already in one frame" in again.out
+    assert mapfold("edits", log).out.count("correct-poses") == 1
+
+
+@pytest.mark.slow
+def test_a_log_is_brought_into_the_frame_of_another(mapfold: Commands) -> None:
+    frame = log_of(mapfold, "frame", lines("a", HERE))
+    log = log_of(mapfold, "log", lines("b", FRAME))
+    mapfold("align", log, "--to", frame, "--write")
+    assert "already in one frame" in mapfold("align", log, "--to", frame).out
+
+
+@pytest.mark.slow
+def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> None:
+    """Two houses whose furniture happens to agree in part; and one with a part of a drive."""
+    log = log_of(mapfold, "log", lines("a", HERE), lines("a", HERE, seed=3))
+    said = mapfold("align", log, "--write", code=3)
+    assert "sim-3-a into the frame of sim-7-a: moved by (" in said.out
+    assert "but not surely" in said.out
+    assert "nothing is written; --write --yes records" in said.err
+    assert "correct-poses" not in mapfold("edits", log).out
+    mapfold("align", log, "--write", "--yes")
+    assert mapfold("edits", log).out.count("correct-poses") == 1
+    few = "".join(lines("b", FRAME).splitlines(keepends=True)[:12])
+    part = log_of(mapfold, "part", lines("a", HERE), few)
+    said = mapfold("align", part, "--write", "--yes", code=3)
+    assert "sim-7-b into the frame of sim-7-a: cannot tell: " in said.out
+
+
+@pytest.mark.slow
+def test_runs_that_are_not_there_are_named_with_those_that_are(mapfold: Commands) -> None:
+    log = log_of(mapfold, "log", lines("a", HERE), lines("b", HERE))
+    runs = "the runs are sim-7-a, sim-7-b"
+    said = mapfold("align", log, "--run", "x", code=2)
+    assert f"--run x: not in {log}; {runs}" in said.err
+    said = mapfold("align", log, "--to", "x", code=2)
+    assert f"--to x: neither a run of {log} nor a log; {runs}" in said.err
+    said = mapfold("align", log, "--run", "sim-7-a", "--to", "sim-7-a", code=2)
+    assert "--run and --to are both sim-7-a" in said.err
+    said = mapfold("align", log, "--picture", "both.jpg", code=2)
+    assert "a picture is .png, .svg or .pdf" in said.err
+
+
+@pytest.mark.slow
+def test_a_log_of_one_run_has_none_to_move(mapfold: Commands) -> None:
+    log = log_of(mapfold, "log", lines("a", HERE))
+    said = mapfold("align", log, code=2)
+    assert "--run is missing: which run is to be moved? it has no other runs" in said.err

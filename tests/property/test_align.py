@@ -1,0 +1,138 @@
+"""The transform between two runs' frames: found whatever the frames, refused between buildings, its
+matching the best one."""
+
+import math
+from functools import cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eventsrc.base.errors import MisuseError
+from projections.fold.settings import CameraSettings, Settings
+from projections.localize.align import FramedThings, align, decision_text, things_of_map
+from projections.localize.align.matching import Comparison, _best_matching, moved
+from tests.support.folds import Folded
+from tests.support.logs import simulated
+
+EVIDENCE = Settings(fusion="evidence", camera=CameraSettings(hfov_deg=69.4))
+Frame = tuple[float, float, float]
+HERE: Frame = (0.0, 0.0, 0.0)
+
+
+def in_frame(envelope: dict[str, Any], frame: Frame) -> dict[str, Any]:
+    """An envelope whose pose is told in another frame."""
+    ((x, y),) = moved(np.array([[envelope["map_x"], envelope["map_y"]]]), frame).tolist()
+    yaw = math.remainder(envelope["map_yaw"] + frame[2], math.tau)
+    return envelope | {"map_x": x, "map_y": y, "map_yaw": yaw}
+
+
+@cache
+def things(run: str, frame: Frame = HERE, seed: int = 7) -> FramedThings:
+    documents = [in_frame(envelope, frame) for envelope in simulated(seed, run).envelopes]
+    found = things_of_map(Folded.start(EVIDENCE).extend(documents).view)
+    assert found is not None
+    return found
+
+
+def error_m(things_: FramedThings, found: Frame, frame: Frame) -> float:
+    """How far the transform that was found puts the poses from where they were before ``frame``."""
+    here = things_.poses[:, :2]
+    turned = moved(here - frame[:2], (0.0, 0.0, -frame[2]))
+    return float(np.sqrt(((moved(here, found) - turned) ** 2).sum(1).mean()))
+
+
+@pytest.mark.parametrize(
+    "frame", [(-300.0, 80.0, -3.1), pytest.param((0.0, 0.5, 0.0), marks=pytest.mark.slow)]
+)
+def test_another_run_of_a_house_is_found_in_any_frame(frame: Frame) -> None:
+    found = align(things("a"), things("b", frame))
+    assert found is not None
+    assert found.verdict == "sure"
+    assert not found.is_one_frame
+    assert error_m(things("b", frame), found.transform, frame) < min(0.5, 3.0 * found.se_m)
+    assert len({one for one, _, _ in found.pairs}) == len(found.pairs) >= 12
+    assert f"{len(found.pairs)} common things" in decision_text(found)
+
+
+def test_two_runs_of_one_frame_are_left_as_they_are() -> None:
+    found = align(things("a"), things("b"))
+    assert found is not None
+    assert found.is_one_frame
+    assert "already in one frame" in decision_text(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 5, 11])
+def test_another_house_is_not_surely_this_one(seed: int) -> None:
+    found = align(things("a"), things("a", seed=seed))
+    assert found is None or found.verdict != "sure"
+    assert "but not surely" in decision_text(found) or "cannot tell: " in decision_text(found)
+
+
+def test_nothing_in_common_is_said() -> None:
+    assert decision_text(None) == "cannot tell: 0 common things; 12 are usually enough"
+
+
+def test_a_map_without_things_has_none_to_compare() -> None:
+    nothing = [envelope | {"detections": []} for envelope in simulated().envelopes[:9]]
+    assert things_of_map(Folded.start(EVIDENCE).extend(nothing).view) is None
+
+
+def test_looks_of_different_spaces_are_refused() -> None:
+    documents = []
+    for envelope in simulated().envelopes[:60]:
+        seen = [d | {"embedding_model": "another"} for d in envelope["detections"]]
+        documents.append(envelope | {"detections": seen})
+    other = things_of_map(Folded.start(EVIDENCE).extend(documents).view)
+    assert other is not None
+    with pytest.raises(MisuseError, match=r"different spaces, .* and another \(512\)"):
+        align(things("a"), other)
+
+
+def test_a_score_is_the_sum_over_pairs_of_its_parts() -> None:
+    """Against a recount pair by pair, without a tree and without arrays of pairs."""
+    first, second = things("a"), things("b")
+    both, transform = Comparison(first, second), (0.1, -0.05, 0.02)
+    found = both.matching(transform)
+    there = moved(second.xy, transform)
+    cos, sin = math.cos(transform[2]), math.sin(transform[2])
+    turn = np.array([[cos, -sin], [sin, cos]])
+    assert len(found) >= 12
+    for i, j, value in zip(found.firsts, found.seconds, found.values, strict=True):
+        spread = first.covariance[i] + turn @ second.covariance[j] @ turn.T + 0.04 * np.eye(2)
+        apart = first.xy[i] - there[j]
+        chi2 = float(apart @ np.linalg.inv(spread) @ apart)
+        by_chance = 2 * math.pi * math.sqrt(np.linalg.det(spread)) * first.density
+        by_looks = float(both.ratios_at(transform[2], np.array([i]), np.array([j]))[0])
+        assert value == pytest.approx(by_looks - chi2 / 2 - math.log(by_chance))
+
+
+PAIRS = st.dictionaries(
+    st.tuples(st.integers(0, 4), st.integers(0, 4)), st.integers(1, 1000), max_size=9
+)
+
+
+@given(PAIRS)
+@settings(max_examples=150)
+def test_the_matching_is_the_best_of_all(values: dict[tuple[int, int], int]) -> None:
+    pairs = sorted(values)
+    firsts, seconds = (np.array([pair[side] for pair in pairs], np.intp) for side in (0, 1))
+    found = _best_matching(HERE, firsts, seconds, np.array([values[pair] for pair in pairs], float))
+    chosen = found.pairs()
+    assert {i for i, _ in chosen} == set(found.firsts.tolist())
+    assert len({j for _, j in chosen}) == len(found) == len(chosen)
+    assert found.score == sum(values[pair] for pair in chosen) == _most(values, pairs)
+
+
+def _most(values: dict[tuple[int, int], int], pairs: list[tuple[int, int]]) -> int:
+    """The largest sum of any subset in which no thing is twice."""
+    return max(
+        sum(values[pair] for pair in some)
+        for size in range(min(5, len(pairs)) + 1)
+        for some in combinations(pairs, size)
+        if len({i for i, _ in some}) == len({j for _, j in some}) == size
+    )
