@@ -5,7 +5,7 @@ from dataclasses import replace
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from projections.fold.corrections import Keyframe
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal
-from projections.map.naming import NoSuchThing, Standing, Thing, things_of
+from projections.map.naming import Existence, NoSuchThing, Thing, things_of
 from projections.map.view import MapView
 from projections.store.history import History
 
@@ -66,12 +66,12 @@ def things_at(history: History, view: MapView) -> list[Thing]:
     for place in history.places[len(view.all_places) :]:
         fate = f"founded later, at offset {place.formed.offset:,}"
         found.append(
-            Thing("place", place.formed.place, place.place_id, standing=Standing.LATER, fate=fate)
+            Thing("place", place.formed.place, place.place_id, existence=Existence.LATER, fate=fate)
         )
     for each in history.objects[len(view.all_objects) :]:
         fate = f"found later, at offset {each.found.offset:,}"
         found.append(
-            Thing("object", each.found.object, each.object_id, standing=Standing.LATER, fate=fate)
+            Thing("object", each.found.object, each.object_id, existence=Existence.LATER, fate=fate)
         )
     return found
 

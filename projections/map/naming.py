@@ -62,7 +62,7 @@ class Rule(IntEnum):
     CLASS = 5
 
 
-class Standing(IntEnum):
+class Existence(IntEnum):
     """Whether a thing stands in a map, was merged into another, or comes later."""
 
     STANDS = 0
@@ -81,7 +81,7 @@ class Thing:
     id: str
     word: str | None = None
     name: str | None = None
-    standing: Standing = Standing.STANDS
+    existence: Existence = Existence.STANDS
     count: int = 0
     spot: tuple[float, float] | None = None
     place: str | None = None
@@ -90,7 +90,7 @@ class Thing:
     @property
     def stands(self) -> bool:
         """Whether it is in the map."""
-        return self.standing is Standing.STANDS
+        return self.existence is Existence.STANDS
 
     def __str__(self) -> str:
         """The id and what tells it apart: ``run_p3 (kitchen, 12 keyframes at (1.20, 3.40))``."""
@@ -136,27 +136,27 @@ class SeveralThings(MisuseError):
 
 def matches(text: str, things: Iterable[Thing]) -> tuple[Rule | None, list[Thing]]:
     """The things that a text means, in their order, and the rule by which; None for none."""
-    found: dict[tuple[Rule, bool, Standing], list[Thing]] = {}
+    found: dict[tuple[Rule, bool, Existence], list[Thing]] = {}
     folded = text.casefold()
     room = NAMES.get(folded)
     digits = _DIGITS.fullmatch(text)
     start = "" if digits is None else f"obj-{digits[1]}"
 
-    def rank(thing: Thing) -> tuple[Rule, bool, Standing] | None:
+    def rank(thing: Thing) -> tuple[Rule, bool, Existence] | None:
         """The rule, then what comes later among what it finds: the other case, the merged."""
         name, word, is_place = thing.name, thing.word, thing.kind == "place"
         if thing.id == text:
-            return Rule.ID, False, Standing.STANDS
+            return Rule.ID, False, Existence.STANDS
         if name is not None and thing.stands and name.casefold() == folded:
-            return Rule.NAME, name != text, thing.standing
+            return Rule.NAME, name != text, thing.existence
         if _place_number(thing.id) == text if is_place else start and thing.id.startswith(start):
-            return Rule.SHORT, False, thing.standing
+            return Rule.SHORT, False, thing.existence
         if word is None or not thing.stands:
             return None
         if is_place:
-            return (Rule.TYPE, False, thing.standing) if word in (room, folded) else None
+            return (Rule.TYPE, False, thing.existence) if word in (room, folded) else None
         same = word.casefold() == folded
-        return (Rule.CLASS, word != text, thing.standing) if same else None
+        return (Rule.CLASS, word != text, thing.existence) if same else None
 
     for thing in things:
         ranked = rank(thing)
@@ -205,7 +205,7 @@ def things_of(view: MapView) -> list[Thing]:
                 place.place_id,
                 None if kind is None else kind.type,
                 place.name,
-                Standing.STANDS if stands else Standing.MERGED,
+                Existence.STANDS if stands else Existence.MERGED,
                 place.keyframe_count,
                 (place.centroid_x, place.centroid_y) if place.keyframe_count else None,
                 fate=None if stands else _merged(view.place_id(view.survivors.find(place.ordinal))),
@@ -220,7 +220,7 @@ def things_of(view: MapView) -> list[Thing]:
                 each.ordinal,
                 each.object_id,
                 each.class_name,
-                standing=Standing.STANDS if stands else Standing.MERGED,
+                existence=Existence.STANDS if stands else Existence.MERGED,
                 count=each.obs_count,
                 spot=each.spot if each.obs_count else None,
                 place=view.place_id(each.place),

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from projections.fold.place_types import NAMES
 from projections.map.naming import (
     MOST_LISTED,
+    Existence,
     Kind,
     NoSuchThing,
     Rule,
     SeveralThings,
     ShortIds,
-    Standing,
     Thing,
     matches,
     thing_called,
@@ -27,19 +27,19 @@ object_ids = st.tuples(st.sampled_from(HEX), st.integers(0, 2)).map(
     lambda p: "obj-" + p[0].ljust(15, "0") + str(p[1])
 )
 names = st.none() | st.sampled_from([*WORDS, "p1", "p3", "1a2b3c", "obj-1a2b3c"]) | place_ids
-standings = st.sampled_from(Standing)
+existences = st.sampled_from(Existence)
 types = st.none() | st.sampled_from(sorted(set(NAMES.values())))
 maps = st.tuples(
-    st.lists(st.tuples(place_ids, types, names, standings), max_size=6, unique_by=lambda t: t[0]),
+    st.lists(st.tuples(place_ids, types, names, existences), max_size=6, unique_by=lambda t: t[0]),
     st.lists(
-        st.tuples(object_ids, st.sampled_from([*WORDS, "p3", "1a2b3c"]), standings),
+        st.tuples(object_ids, st.sampled_from([*WORDS, "p3", "1a2b3c"]), existences),
         max_size=6,
         unique_by=lambda t: t[0],
     ),
 ).map(
     lambda both: [
         *(Thing("place", n, i, t, name, s) for n, (i, t, name, s) in enumerate(both[0])),
-        *(Thing("object", n, i, c, standing=s) for n, (i, c, s) in enumerate(both[1])),
+        *(Thing("object", n, i, c, existence=s) for n, (i, c, s) in enumerate(both[1])),
     ]
 )
 texts = st.one_of(
@@ -71,7 +71,7 @@ def oracle(text: str, things: list[Thing]) -> list[Thing]:
         [t for t in standing if t.name == text],
         [t for t in standing if t.name is not None and t.name.casefold() == text.casefold()],
         [t for t in standing if short(t)],
-        [t for t in things if short(t) and t.standing is Standing.MERGED],
+        [t for t in things if short(t) and t.existence is Existence.MERGED],
         [t for t in things if short(t)],
         [t for t in standing if of_type(t)],
         [t for t in objects if t.word == text],

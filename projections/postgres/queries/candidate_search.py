@@ -98,11 +98,7 @@ class CandidateSearch:
     same connection."""
 
     def __init__(
-        self,
-        targets: Targets,
-        vectors: Connection,
-        graph: Connection,
-        memory: ConstantsMemory,
+        self, targets: Targets, vectors: Connection, graph: Connection, memory: ConstantsMemory
     ) -> None:
         self._targets, self._memory = targets, memory
         self._vectors, self._graph = vectors, graph
@@ -116,8 +112,7 @@ class CandidateSearch:
         looked = [number for number, crop in enumerate(crops) if crop.vector is not None]
         named = [number for number, crop in enumerate(crops) if crop.vector is None]
         near: Rows = []
-        linked = NO_LINKS
-        given = crops
+        linked, given = NO_LINKS, crops
         if looked or not named:
             near, linked = self._nearest([crops[number] for number in looked], neighbours)
             if looked and not near:
