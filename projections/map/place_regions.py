@@ -6,6 +6,7 @@ cells, with holes. Outer rings run counter-clockwise, holes clockwise; a ring to
 another one in single points only.
 """
 
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
@@ -41,6 +42,14 @@ class Region:
         if len(parts) == 1:
             return {"type": "Polygon", "coordinates": parts[0]}
         return {"type": "MultiPolygon", "coordinates": parts}
+
+    def document(self) -> dict[str, Any]:
+        """As JSON: the ``region`` and its ``area_m2``."""
+        return {"region": self.geometry(), "area_m2": self.area_m2}
+
+    def geometry_text(self) -> str:
+        """The geometry as compact JSON, for formats whose values are texts."""
+        return json.dumps(self.geometry(), separators=(",", ":"))
 
 
 def place_regions(view: MapView) -> dict[PlaceOrdinal, Region]:

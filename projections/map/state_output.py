@@ -17,7 +17,7 @@ from projections.fold.settings import Settings, assignment_texts
 from .confirmed import objects_text
 from .naming import ShortIds, things_of
 from .phrases import command_document, seen_times
-from .place_regions import Region, place_regions
+from .place_regions import place_regions
 from .records import ObjectRecord
 from .view import MapView
 
@@ -114,7 +114,7 @@ def _places(view: MapView) -> list[dict[str, Any]]:
             **({} if p.name is None else {"name": p.name}),
             **_floor(view.floor_of(p.ordinal)),
             **_type(view.type_of(p.ordinal)),
-            **_region(regions.get(p.ordinal)),
+            **(regions[p.ordinal].document() if p.ordinal in regions else {}),
         }
         for p in view.places.values()
     ]
@@ -134,13 +134,6 @@ def _type(found: PlaceType | None) -> dict[str, Any]:
         "type_probability": found.probability,
         "type_candidates": [{"type": t, "probability": p} for t, p in found.candidates],
     }
-
-
-def _region(region: Region | None) -> dict[str, Any]:
-    """The free floor, where walls are known."""
-    if region is None:
-        return {}
-    return {"region": region.geometry(), "area_m2": region.area_m2}
 
 
 def _objects(view: MapView) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ Place, Floor, Building and the edges LOCATED_IN, IN_PLACE, ADJACENT_TO, PART_OF.
 may become one, by a correction or under fusion by evidence, OBSERVES is a changing one too.
 """
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from json.encoder import encode_basestring
@@ -299,8 +298,8 @@ def _place_rows(
             probability = number(kind.probability)
             name += f', "type": {text(kind.type)}, "type_probability": {probability}'
         if (region := regions.get(p.ordinal)) is not None:
-            geometry = json.dumps(region.geometry(), separators=(",", ":"))
-            name += f', "region": {text(geometry)}, "area_m2": {number(region.area_m2)}'
+            geometry = text(region.geometry_text())
+            name += f', "region": {geometry}, "area_m2": {number(region.area_m2)}'
         properties = (
             f'{{"place_id": {text(p.place_id)}, "centroid_x": {number(p.centroid_x)},'
             f' "centroid_y": {number(p.centroid_y)}, "keyframe_count": {p.keyframe_count}{name}}}'

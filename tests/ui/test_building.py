@@ -1,9 +1,10 @@
 """Walls, floors and kinds of rooms: what the map and the panels say is what the log has."""
 
+import itertools
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -72,9 +73,18 @@ def labels(svg: ET.Element) -> list[str]:
 def outlines(svg: ET.Element) -> list[NDArray[np.float64]]:
     """The closed outlines of the walls, in pixels."""
     drawn = [path for path in svg.iter() if path.get("fill-rule") == "evenodd"]
-    if not drawn:
-        return []
-    parts = (drawn[0].get("d") or "").split("Z")
+    return _rings(drawn[0]) if drawn else []
+
+
+def regions(svg: ET.Element) -> list[list[NDArray[np.float64]]]:
+    """The rings of each region, in pixels: what is filled below the walls."""
+    paths = (path for path in svg.iter() if path.get("fill-rule") is not None)
+    below = itertools.takewhile(lambda path: path.get("fill-rule") != "evenodd", paths)
+    return [_rings(path) for path in below]
+
+
+def _rings(path: ET.Element) -> list[NDArray[np.float64]]:
+    parts = (path.get("d") or "").split("Z")
     return [np.array(re.findall(r"-?[\d.]+", part), float).reshape(-1, 2) for part in parts if part]
 
 
@@ -143,6 +153,67 @@ def test_walls_are_those_in_force_on_the_floor_at_the_moment(
     half = whole.cells.copy()
     half[: len(half) // 2] = 0
     check_walls(page, replace(whole, cells=half))
+
+
+def rings_of(place: dict[str, Any]) -> list[NDArray[np.float64]]:
+    """The rings of a place's region, in metres."""
+    parts = place["region"]["coordinates"]
+    if place["region"]["type"] == "MultiPolygon":
+        parts = [ring for part in parts for ring in part]
+    return [np.array(ring[1:]) for ring in parts]
+
+
+def test_the_region_of_a_place_is_its_free_floor(
+    building: Building, visit: Visit, mapfold: Commands
+) -> None:
+    """In the picture, and under the pointer where neither a keyframe nor an object is near."""
+    log, server = building
+    page = visit(server, "#at=300&panel=none")
+    for at in (RUN_A + 1, 300):
+        go(page, at)
+        digest(page)
+        state = mapfold("state", log, *ROOMS, "--at", str(at), "--json").json
+        rooms = {place["place_id"]: rings_of(place) for place in state["places"]}
+        drawn = regions(picture(page))
+        assert len(drawn) == len(rooms) > 3
+        low, high = _extent(rooms.values())
+        left, _ = _extent(drawn)[0]
+        right, bottom = _extent(drawn)[1]
+        k = (right - left) / (high - low)[0]
+        at_zero = np.array([left - low[0] * k, bottom + low[1] * k])
+        for rings in rooms.values():
+            wanted = [at_zero + ring * (k, -k) for ring in rings]
+            assert any(_same(wanted, each) for each in drawn)
+    box = page.locator("canvas.map").bounding_box()
+    assert box is not None
+    near = [(k["map_x"], k["map_y"]) for k in state["keyframes"]]
+    near += [(each["mean_x"], each["mean_y"]) for each in state["objects"]]
+    spots = np.random.default_rng(7).uniform(low, high, (400, 2))
+    spots = spots[(np.hypot(*(spots[:, None] - near).T) > 0.6).all(axis=0)][:40]
+    pointed_at = set()
+    for spot in spots:
+        (inside,) = [name for name, rings in rooms.items() if filled(rings, *spot)] or [None]
+        x, y = at_zero + spot * (k, -k)
+        page.mouse.move(box["x"] + x, box["y"] + y)
+        tip = page.locator(".tip .first")
+        if inside is None:
+            expect(tip).to_have_count(0)
+        else:
+            expect(tip).to_have_text(f"\u2068{inside}\u2069")
+        pointed_at.add(inside)
+    assert len(pointed_at) > 3
+
+
+def _extent(rooms: Iterable[list[NDArray[np.float64]]]) -> tuple[NDArray[np.float64], ...]:
+    """The lowest and the highest coordinates."""
+    corners = np.vstack([ring for rings in rooms for ring in rings])
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _same(wanted: list[NDArray[np.float64]], drawn: list[NDArray[np.float64]]) -> bool:
+    return [len(ring) for ring in wanted] == [len(ring) for ring in drawn] and all(
+        np.abs(a - b).max() < 0.05 for a, b in zip(wanted, drawn, strict=True)
+    )
 
 
 def places_of(mapfold: Commands, log: Path, at: int, *words: str) -> list[dict[str, Any]]:
@@ -242,7 +313,7 @@ def _percent(share: float) -> int:
     return int(share * 100 + 0.5)
 
 
-def test_the_state_taken_away_has_types_and_floors(
+def test_the_state_taken_away_has_types_floors_and_regions(
     building: Building, visit: Visit, mapfold: Commands
 ) -> None:
     log, server = building
@@ -252,7 +323,8 @@ def test_the_state_taken_away_has_types_and_floors(
     with page.expect_download() as waiting:
         page.get_by_role("menuitem", name="State as JSON").click()
     saved = json.loads(Path(waiting.value.path()).read_text())
-    names = ("place_id", "floor", "type", "type_probability")
+    names = ("place_id", "floor", "type", "type_probability", "region", "area_m2")
     kept = [{n: p[n] for n in names if n in p} for p in saved["places"]]
     wanted = places_of(mapfold, log, 500, *ROOMS)
+    assert {"region" in place for place in wanted} == {True, False}  # above is no map yet
     assert kept == [{n: p[n] for n in names if n in p} for p in wanted]

@@ -9,6 +9,7 @@ import pytest
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.adapters.export.geojson import geojson
+from projections.adapters.export.graphs import graphml
 from projections.adapters.scene import places_of
 from projections.fold.settings import Settings
 from projections.map.place_regions import place_regions
@@ -90,9 +91,14 @@ def test_places_without_walls_have_no_region(places: str) -> None:
     assert all("region" not in row for row in state_document(view, None)["places"])
 
 
-def test_geojson_and_viewers_have_the_region_instead_of_a_hull() -> None:
+def test_geojson_graphml_and_viewers_have_the_region_instead_of_a_hull() -> None:
+    import networkx
+
     view = two_rooms([drawn_map("\n".join(ROWS), 0.5)], list(SIDES))
     features = [f for f in json.loads(geojson(view))["features"] if "area_m2" in f["properties"]]
     regions = list(place_regions(view).values())
     assert [f["geometry"] for f in features] == [region.geometry() for region in regions]
     assert [shown.outlines for shown in places_of(view)] == [r.polygons[0] for r in regions]
+    nodes = networkx.parse_graphml(graphml(view)).nodes.values()
+    assert [json.loads(node["region"]) for node in nodes] == [r.geometry() for r in regions]
+    assert [node["area_m2"] for node in nodes] == [region.area_m2 for region in regions]

@@ -2,8 +2,9 @@
 
 A node's ``kind`` and an edge's ``label`` are the labels of the database's graph: Place, Object,
 ADJACENT_TO, LOCATED_IN. A node's ``label`` is what viewers show: the name, likely type or id of a
-Place, the class of an Object. Node ids are place_id and object_id; where they are escaped, a
-backslash is doubled, so that different ids stay different. A property that is unknown is left out.
+Place, the class of an Object; a Place's ``region`` is a GeoJSON geometry in metres. Node ids are
+place_id and object_id; where they are escaped, a backslash is doubled, so that different ids stay
+different. A property that is unknown is left out.
 """
 
 import re
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from eventsrc.base.text import visible
+from projections.map.place_regions import place_regions
 from projections.map.view import MapView
 
 if TYPE_CHECKING:
@@ -22,8 +24,9 @@ _NOT_IN_XML: Final = re.compile("[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff
 def _graph(view: MapView) -> "networkx.Graph":
     import networkx  # here: it takes longer to import than most commands take to run
 
-    graph = networkx.Graph()
+    graph, regions = networkx.Graph(), place_regions(view)
     for place in view.places.values():
+        region = regions.get(place.ordinal)
         kind = view.type_of(place.ordinal)
         typed = kind is not None and kind.type is not None
         graph.add_node(
@@ -38,6 +41,8 @@ def _graph(view: MapView) -> "networkx.Graph":
                 x=place.centroid_x,
                 y=place.centroid_y,
                 keyframe_count=place.keyframe_count,
+                region=None if region is None else region.geometry_text(),
+                area_m2=None if region is None else region.area_m2,
             ),
         )
     for found in view.objects.values():

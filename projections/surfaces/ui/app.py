@@ -155,7 +155,10 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             return Response(content, media_type="application/json")
 
     answers(
-        "digest", "The digest of the map at W, and the types of its places", digest_answer, *_AT_W
+        "digest",
+        "The digest of the map at W, and types and regions of places",
+        digest_answer,
+        *_AT_W,
     )
     answers("walls", "The walls of an occupancy map of the log", walls_answer, "number")
     answers(

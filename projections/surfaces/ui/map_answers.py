@@ -19,6 +19,7 @@ from projections.fold.exact import UM_PER_M, mean_m
 from projections.fold.map_errors import QuestionError
 from projections.history.names import keyframe_name
 from projections.map.digest import map_digest
+from projections.map.place_regions import place_regions
 from projections.map.view import MapView
 from projections.map.wall_segments import wall_segments
 from projections.store.columns import NONE, Array
@@ -63,13 +64,17 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``, and
-    the type of each place."""
+    the type and the region of each place that has one."""
     asked = AskedPoint.of(shown, query)
     view = asked.known.at(asked.end)
     return {
         **asked.document(),
         "digest": map_digest(view),
         "types": _types(view),
+        "regions": [
+            {"place_id": view.place_id(place), **region.document()}
+            for place, region in place_regions(view).items()
+        ],
         "command": asked.command("state", "--digest"),
     }
 

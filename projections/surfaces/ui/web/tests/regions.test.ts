@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
 import { decodeHistory } from "../src/history/decode";
 import { mapAt } from "../src/model/map_at";
-import { REACH_M, boundsOf, gridOf, regionsOf } from "../src/model/regions";
+import { REACH_M, boundsOf, gridOf, regionsOf, ringsOf } from "../src/model/regions";
 import { encoded, random, randomTables } from "./histories";
 
 /** Whether a point is inside loops, by the nonzero rule. */
@@ -27,7 +27,7 @@ describe("regionsOf", () => {
       const bounds = boundsOf(history);
       if (bounds === null) throw new Error("no poses");
       const grid = gridOf(bounds);
-      const { regions, placeAt } = regionsOf(history, map, grid);
+      const { regions, placeAt } = regionsOf(history, map, grid, new Map());
       const next = random(seed + 99);
       let asked = 0;
       for (let point = 0; point < 600; point++) {
@@ -49,6 +49,25 @@ describe("regionsOf", () => {
         for (const { place, loops } of regions) expect(winding(loops, x, y) !== 0).toBe(place === wanted);
       }
       expect(asked).toBeGreaterThan(100);
+    }
+  });
+
+  it("is the free floor of a place that has one, without its holes, whatever its keyframes are near", () => {
+    const history = decodeHistory(encoded(randomTables(3)));
+    const map = mapAt(history, history.through);
+    const [place, ...others] = map.places;
+    const far = [[100, 100], [110, 100], [110, 110], [100, 110], [100, 100]];
+    const hole = [[104, 104], [104, 106], [106, 106], [106, 104], [104, 104]];
+    const floors = new Map([[place, ringsOf({ type: "Polygon", coordinates: [far, hole] }, history.origin)]]);
+    const bounds = boundsOf(history);
+    if (bounds === null || others.length === 0) throw new Error("too little");
+    const { regions, placeAt } = regionsOf(history, map, gridOf(bounds), floors);
+    expect(regions.filter((each) => each.place === place)).toEqual([{ place, loops: floors.get(place) }]);
+    expect(new Set(regions.map((each) => each.place)).size).toBeGreaterThan(1);
+    expect([placeAt(102, 105), placeAt(105, 105), placeAt(111, 105)]).toEqual([place, -1, -1]);
+    const { x, y } = history.keyframes;
+    for (let each = 0; each < map.keyframeCount; each++) {
+      if (map.placeOf[each] === place) expect(placeAt(x[each], y[each])).not.toBe(place);
     }
   });
 });

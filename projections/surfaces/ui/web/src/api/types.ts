@@ -50,3 +50,17 @@ export interface PlaceType {
   probability: number;
   candidates: [string, number][];
 }
+
+/** A GeoJSON geometry in metres of the map frame; rings are closed. */
+export type Geometry =
+  | { type: "Polygon"; coordinates: number[][][] }
+  | { type: "MultiPolygon"; coordinates: number[][][][] };
+
+/** What the server knows about the map at W: its digest, and of places their types and, where walls are known, their free floor. */
+export interface MapFacts {
+  at: number;
+  known_at: number;
+  digest: string;
+  types: PlaceType[];
+  regions: { place_id: string; region: Geometry; area_m2: number }[];
+}

@@ -136,7 +136,7 @@ function inputs(side: Side) {
   return [
     store.at, store.view, store.layers, store.selection, store.hovered, store.dark, store.log,
     side === "main" ? store.history : store.otherHistory,
-    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.types, walls,
+    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.mapFacts, walls,
   ];
 }
 

@@ -1,13 +1,16 @@
 /** The map at W as JSON. */
 
-import type { PlaceType } from "../api/types";
+import type { MapFacts, PlaceType } from "../api/types";
 import { floorOfPlace } from "./floors";
 import type { History } from "../history/types";
 import { placeNow } from "./compare";
 import type { MapState } from "./map_at";
 import { keyframeId } from "./names";
 
-export function stateDocument(history: History, map: MapState, types: ReadonlyMap<string, PlaceType>) {
+/** `facts` are those of the same W, null while the server has not sent them. */
+export function stateDocument(history: History, map: MapState, facts: MapFacts | null) {
+  const types = new Map(facts?.types.map((each) => [each.place_id, each]));
+  const regions = new Map(facts?.regions.map(({ place_id, ...region }) => [place_id, region]));
   const place = (number: number) => (number < 0 ? null : history.placeIds[number]);
   const [ox, oy] = history.origin;
   const { keyframes, changes, floors } = history;
@@ -21,6 +24,7 @@ export function stateDocument(history: History, map: MapState, types: ReadonlyMa
       keyframes: map.size[each],
       ...(floors.length > 0 && { floor: floors[floorOfPlace(history, each)] ?? null }),
       ...typeOf(types.get(history.placeIds[each])),
+      ...regions.get(history.placeIds[each]),
       centroid_x: map.x[each] + ox,
       centroid_y: map.y[each] + oy,
     })),

@@ -1,8 +1,10 @@
 /**
- * The region of each place: all that lies near one of its keyframes and nearer to it than to any
- * other place's, as closed outlines (marching squares over a grid of distances).
+ * The region of each place as closed outlines: its free floor, where the server has sent it. Of
+ * other places all that lies near one of their keyframes and nearer to it than to any other place's
+ * (marching squares over a grid of distances).
  */
 
+import type { Geometry } from "../api/types";
 import type { History } from "../history/types";
 import { type MapState, NONE } from "./map_at";
 
@@ -67,7 +69,42 @@ function reachOf(step: number): number {
   return Math.max(REACH_M, 1.5 * step);
 }
 
-export function regionsOf(history: History, map: MapState, grid: Grid): Regions {
+/** The rings of a geometry, in metres from the origin of a history. */
+export function ringsOf(geometry: Geometry, [ox, oy]: readonly [number, number]): Float32Array[] {
+  const polygons = geometry.type === "Polygon" ? [geometry.coordinates] : geometry.coordinates;
+  return polygons.flat().map((ring) => Float32Array.from(ring.slice(1).flatMap(([x, y]) => [x - ox, y - oy])));
+}
+
+/** `floors` is the free floor of places that have one. */
+export function regionsOf(history: History, map: MapState, grid: Grid, floors: ReadonlyMap<number, Float32Array[]>): Regions {
+  const known = map.places.flatMap((place) => (floors.has(place) ? { place, loops: floors.get(place) as Float32Array[] } : []));
+  const near = known.length === map.places.length ? null : nearRegions(history, map, grid);
+  return {
+    regions: [...known, ...(near?.regions ?? []).filter(({ place }) => !floors.has(place))],
+    placeAt(x, y) {
+      const on = known.find(({ loops }) => isInside(loops, x, y));
+      if (on !== undefined) return on.place;
+      const beside = near?.placeAt(x, y) ?? NONE;
+      return floors.has(beside) ? NONE : beside;
+    },
+  };
+}
+
+/** Whether a point is within rings, by the even-odd rule. */
+function isInside(loops: Float32Array[], x: number, y: number): boolean {
+  let inside = false;
+  for (const loop of loops) {
+    let [x0, y0] = loop.subarray(-2);
+    for (let i = 0; i < loop.length; i += 2) {
+      const [x1, y1] = [loop[i], loop[i + 1]];
+      if (y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0)) inside = !inside;
+      [x0, y0] = [x1, y1];
+    }
+  }
+  return inside;
+}
+
+function nearRegions(history: History, map: MapState, grid: Grid): Regions {
   const { owner, distance } = nearest(history, map, grid);
   const reach = reachOf(grid.step);
   return {

@@ -115,7 +115,7 @@ function miniScene({ history, map }: Shown, merge: MergeStory, width: number, he
   return {
     history,
     map,
-    regions: bounds === null ? null : regionsOf(history, map, gridOf(bounds)),
+    regions: bounds === null ? null : regionsOf(history, map, gridOf(bounds), new Map()),
     view: fitted(points.length > 0 ? near : (bounds ?? near), width, height, 0, 0),
     palette: dark ? DARK : LIGHT,
     width,

@@ -102,7 +102,7 @@ function saveSvg() {
 function saveJson() {
   const [history, map] = [store.history.value, store.map.value];
   if (history === null || map === null) return;
-  const text = JSON.stringify(stateDocument(history, map, store.types.value), null, 1);
+  const text = JSON.stringify(stateDocument(history, map, store.mapFactsNow.value), null, 1);
   save(new Blob([`${text}\n`], { type: "application/json" }), "json");
 }
 

@@ -1,12 +1,13 @@
 /** What the page shows, as signals. Panels and the canvas read them; actions.ts changes them. */
 
 import { computed, signal } from "@preact/signals";
-import type { LogInfo, PlaceType } from "../api/types";
+import type { LogInfo, MapFacts, PlaceType } from "../api/types";
 import type { History } from "../history/types";
 import { type Shown, firstFloor, floorsOf, onFloor } from "../model/floors";
+import { findPlace } from "../model/names";
 import { type MapState, mapAt } from "../model/map_at";
 import { type Moments, Stamps, momentsOf } from "../model/moments";
-import { type Bounds, type Grid, type Regions, boundsOf, gridOf, regionsOf } from "../model/regions";
+import { type Bounds, type Grid, type Regions, boundsOf, gridOf, regionsOf, ringsOf } from "../model/regions";
 import type { View } from "../map/view";
 
 export type ThingKind = "place" | "object" | "keyframe" | "merge";
@@ -49,8 +50,8 @@ export function knownAt(asked: number): number | null {
   return known.value === "then" && asked === at.value ? null : (history.value?.knownAt ?? null);
 }
 
-/** The digest and the types of places at one W, as the server last sent them. */
-export const mapFacts = signal<{ at: number; known_at: number; digest: string; types: PlaceType[] } | null>(null);
+/** What the server last sent about the map at one W. */
+export const mapFacts = signal<MapFacts | null>(null);
 /** The same if they belong to the map that is shown, otherwise null. */
 export const mapFactsNow = computed(() => {
   const now = known.value === "then" ? at.value : history.value?.knownAt;
@@ -144,11 +145,23 @@ export const bounds = computed<Bounds | null>(() => {
 });
 const grid = computed<Grid | null>(() => (bounds.value === null ? null : gridOf(bounds.value)));
 
-function regionsIn(part: Shown | null): Regions | null {
-  return part === null || grid.value === null ? null : regionsOf(part.history, part.map, grid.value);
+const NO_FLOORS: ReadonlyMap<number, Float32Array[]> = new Map();
+/** The free floor of places as the server last sent it, and the places that stood then. */
+const sentFloors = computed(() => {
+  const [facts, of] = [mapFacts.value, history.value];
+  if (facts === null || of === null || facts.regions.length === 0) return null;
+  const floors = new Map(facts.regions.map(({ place_id, region }) => [findPlace(of, place_id), ringsOf(region, of.origin)]));
+  return { floors, places: mapAt(of, Math.min(facts.at, of.through)).places.join() };
+});
+/** While W moves, the last ones stay as long as the same places stand. */
+const floorsNow = computed(() => (sentFloors.value?.places === map.value?.places.join() ? (sentFloors.value?.floors ?? NO_FLOORS) : NO_FLOORS));
+
+function regionsIn(part: Shown | null, floors: typeof NO_FLOORS): Regions | null {
+  return part === null || grid.value === null ? null : regionsOf(part.history, part.map, grid.value, floors);
 }
-export const regions = computed(() => regionsIn(shown.value));
-export const otherRegions = computed(() => regionsIn(otherShown.value));
+export const regions = computed(() => regionsIn(shown.value, floorsNow.value));
+/** Of a map under other settings the rule of places knows no walls. */
+export const otherRegions = computed(() => regionsIn(otherShown.value, NO_FLOORS));
 
 /** The map at the other moment of a comparison, while its panel is open. */
 export const comparedMap = computed<MapState | null>(() =>

@@ -2,6 +2,7 @@
 
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
+import type { MapFacts } from "../api/types";
 import type { History } from "../history/types";
 import { floorName, floorsOf } from "../model/floors";
 import { counted, isolated, label } from "../model/names";
@@ -13,7 +14,7 @@ export function Digest() {
   const [map, history] = [store.map.value, store.history.value];
   const at = store.restedAt.value;
   const path = history === null || at > history.through ? null : address("/api/digest", { at, known_at: store.knownAt(at) });
-  const asked = useAnswer<NonNullable<typeof store.mapFacts.value> & { command: string }>(path);
+  const asked = useAnswer<MapFacts & { command: string }>(path);
   useEffect(() => {
     const found = (store.mapFacts.value = asked.value);
     store.stateCommand.value = found === null ? null : { at: found.at, command: found.command.replace(/ --digest\b/, "") };
