@@ -3,8 +3,8 @@
 `find` is pure over a `MapView`. What is asked for is a class (`class_names`), an Object's id, or
 nothing, which is everything.
 
-Answers are ordered by distance where ``near`` is given; else those that are where they were last
-seen come before those that are missing, then the ones seen most often.
+Answers are ordered by way where ``start`` is given, by distance where ``near`` is; else those that
+are where they were last seen come before those that are missing, then the ones seen most often.
 """
 
 import math
@@ -23,6 +23,7 @@ from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 from .class_names import ClassMatch, classes_meant, near_classes
+from .driven_ground import DrivenGround
 
 Match = Literal["id", "everything"] | ClassMatch
 """How an Object is what was asked for."""
@@ -37,7 +38,8 @@ class Wanted:
     """What is asked for.
 
     ``what`` is None for everything. ``room`` is the Place that it is in, ``near`` a point ``X,Y``
-    in metres, or an Object or Place, by any of its names. Times are robot seconds since the epoch:
+    in metres, or an Object or Place, by any of its names; so is ``start``, from which the way over
+    driven ground counts instead of the straight line. Times are robot seconds since the epoch:
     last seen at ``seen_since`` or later, and before ``not_seen_since``. There are at most ``top``
     answers, Objects that were seen once among them only with ``every``.
     """
@@ -45,6 +47,7 @@ class Wanted:
     what: str | None = None
     room: str | None = None
     near: str | None = None
+    start: str | None = None
     missing: bool = False
     moved: bool = False
     seen_since: float | None = None
@@ -71,8 +74,9 @@ class FoundObject:
 
     ``x`` and ``y`` are metres; ``sigma_m`` is their standard error in the direction in which it is
     largest, None where they are the mean position of the robot that saw it. ``distance_m`` is from
-    what it should be near. ``missing_in`` is the run that should have seen it and did not,
-    ``moved_from`` where it stood before, in metres. ``offsets`` are the events that saw it.
+    what it should be near, ``way_m`` the way to it over driven ground, None for none.
+    ``missing_in`` is the run that should have seen it and did not, ``moved_from`` where it stood
+    before, in metres. ``offsets`` are the events that saw it.
     """
 
     object_id: str
@@ -85,6 +89,7 @@ class FoundObject:
     y: float
     sigma_m: float | None
     distance_m: float | None
+    way_m: float | None
     obs_count: int
     confirmed: bool
     first_seen: SeenAt
@@ -132,7 +137,8 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
     if wanted.room is not None:
         ordinal = PlaceOrdinal(thing_called(wanted.room, things, ["place"]).ordinal)
         room = view.survivors.find(ordinal)
-    spot = None if wanted.near is None else _spot(wanted.near, things)
+    spot = None if wanted.near is None else spot_of(wanted.near, things)
+    ways = None if wanted.start is None else _Ways(view, spot_of(wanted.start, things))
     match, objects = _meant(view, wanted.what, things)
     classes = tuple(sorted({each.class_name for each in objects}))
     found = [each for each in objects if _is_wanted(each, wanted, room)]
@@ -140,11 +146,21 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
     if match != "id" and not wanted.every:
         kept = [each for each in found if each.confirmed]
 
-    def order(each: ObjectRecord) -> tuple[float, bool, int, int]:
-        distance = 0.0 if spot is None else _distance(each.spot, spot)
-        return distance, each.missing_in is not None, -each.obs_count, each.ordinal
+    way_to = {} if ways is None else {each.ordinal: ways.to(each) for each in kept}
 
-    answers = [_answer(view, each, match, spot) for each in sorted(kept, key=order)[: wanted.top]]
+    def order(each: ObjectRecord) -> tuple[float, float, bool, int, int]:
+        way = 0.0 if ways is None else way_to[each.ordinal]
+        distance = 0.0 if spot is None else _distance(each.spot, spot)
+        return (
+            math.inf if way is None else way,
+            distance,
+            each.missing_in is not None,
+            -each.obs_count,
+            each.ordinal,
+        )
+
+    best = sorted(kept, key=order)[: wanted.top]
+    answers = [answer_of(view, each, match, spot, way_to.get(each.ordinal)) for each in best]
     return FoundObjects(match, classes, len(kept), len(found) - len(kept), tuple(answers))
 
 
@@ -196,13 +212,21 @@ def _nothing(what: str, standing: list[ObjectRecord], things: list[Thing]) -> Mi
     return MisuseError(f"no class like {what!r} in this map; {listed}{more}")
 
 
-def _spot(near: str, things: list[Thing]) -> tuple[float, float]:
-    """The point that things should be near, in metres."""
-    point = _POINT.fullmatch(near)
+def point_of(text: str) -> tuple[float, float] | None:
+    """The point ``X,Y``; None for other text."""
+    point = _POINT.fullmatch(text)
+    if point is None:
+        return None
+    x, y = float(point[1]), float(point[2])
+    return (x, y) if math.isfinite(x) and math.isfinite(y) else None
+
+
+def spot_of(near: str, things: list[Thing]) -> tuple[float, float]:
+    """The point that a text means, in metres: ``X,Y``, or an Object or a Place. Raises MisuseError,
+    also NoSuchThing and SeveralThings."""
+    point = point_of(near)
     if point is not None:
-        x, y = float(point[1]), float(point[2])
-        if math.isfinite(x) and math.isfinite(y):
-            return x, y
+        return point
     thing = thing_called(near, things, ["place", "object"])
     if thing.spot is None:
         raise MisuseError(f"{near!r} has no position in this map; give X,Y in metres")
@@ -221,12 +245,32 @@ def _is_wanted(each: ObjectRecord, wanted: Wanted, room: PlaceOrdinal | None) ->
     return wanted.not_seen_since is None or each.last_seen < wanted.not_seen_since
 
 
-def _answer(
-    view: MapView, each: ObjectRecord, match: Match, spot: tuple[float, float] | None
+class _Ways:
+    """Ways over driven ground from a spot."""
+
+    def __init__(self, view: MapView, start: tuple[float, float]) -> None:
+        self._ground = DrivenGround(view)
+        node = self._ground.nearest(start)
+        self._more = math.dist(self._ground.spots[node], start)
+        self._lengths = self._ground.lengths_from(node)[0]
+
+    def to(self, each: ObjectRecord) -> float | None:
+        """The length of the way to an Object, in metres; None where there is none."""
+        way = self._ground.way_m(each, self._lengths)
+        return None if way is None else self._more + way
+
+
+def answer_of(
+    view: MapView,
+    each: ObjectRecord,
+    match: Match,
+    spot: tuple[float, float] | None = None,
+    way_m: float | None = None,
 ) -> FoundObject:
+    """An Object as an answer."""
     at, place = each.estimate, each.place
     x, y = each.spot
-    keyframes = [view.keyframes[view.observations[o].keyframe] for o in each.observations]
+    keyframes = view.sightings(each)
     kind = None if place is None else view.type_of(place)
     moved = each.relocations[-1] if each.relocations else None
     return FoundObject(
@@ -240,6 +284,7 @@ def _answer(
         y=y,
         sigma_m=None if at is None else at.est_sigma_m,
         distance_m=None if spot is None else _distance(each.spot, spot),
+        way_m=way_m,
         obs_count=each.obs_count,
         confirmed=each.confirmed,
         first_seen=seen_at(min(keyframes, key=_time)),

@@ -30,8 +30,9 @@ from .object_changes import KNOWN_M, Point, became, is_within, object_rows
 ChangeKind = Literal["moved", "missing", "new", "back"]
 KINDS: Final[tuple[ChangeKind, ...]] = ("moved", "missing", "new", "back")
 
-_LOOKS: Final = 3
-"""Keyframes that must have looked at a spot before what stands there is new."""
+_LOOKS: Final = 6
+"""Keyframes that must have looked at a spot before what stands there is new. On the developing half
+of generated buildings 49 of 50 such are new, with 3 looks 69 of 80."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def map_changes(first: MapView, second: MapView) -> MapChanges:
         record = writer.objects[absence.after.object_id]
         spot = absence.after.spot
         if absence.back:
-            later = [k.offset for k in _sightings(second, record) if k.offset >= first.next_offset]
+            later = [k.offset for k in second.sightings(record) if k.offset >= first.next_offset]
             changes.append(writer.change("back", record, None, spot, min(later, default=None)))
         else:
             changes.append(writer.change("missing", record, spot, None))
@@ -142,10 +143,6 @@ def changes_text(found: MapChanges, most: int | None = None) -> str:
     return "".join(f"{line}\n" for line in lines) or "nothing changed for sure\n"
 
 
-def _sightings(view: MapView, record: ObjectRecord) -> Iterable[KeyframeRecord]:
-    return (view.keyframes[view.observations[o].keyframe] for o in record.observations)
-
-
 def _new(first: MapView, second: MapView) -> tuple[list[ObjectRecord], int]:
     """The Objects that are new for sure, and how many others may be."""
     known = {each.object_id for each in first.all_objects}
@@ -158,7 +155,7 @@ def _new(first: MapView, second: MapView) -> tuple[list[ObjectRecord], int]:
         at = record.estimate
         if record.object_id in known or not record.confirmed or at is None or record.missing_in:
             continue
-        if any(k.offset < first.next_offset for k in _sightings(second, record)):
+        if any(k.offset < first.next_offset for k in second.sightings(record)):
             continue
         alike = any(is_within(e.estimate, at) for e in there.get(record.class_name, ()))
         if at.est_sigma_m > KNOWN_M or alike:
@@ -172,7 +169,7 @@ def _looks(view: MapView, record: ObjectRecord, earlier: Iterable[KeyframeRecord
     """How many of some keyframes looked at where an Object stands."""
     vantages = [
         (k.pose.x_um / UM_PER_M, k.pose.y_um / UM_PER_M)
-        for k in _sightings(view, record)
+        for k in view.sightings(record)
         if k.pose is not None
     ]
     count = 0
@@ -209,7 +206,7 @@ class _Writer:
         keyframe = None if offset is None else self._at.get(offset)
         if keyframe is None:
             pick = max if kind == "missing" else min
-            keyframe = pick(_sightings(view, record), key=lambda k: (k.timestamp, k.offset))
+            keyframe = pick(view.sightings(record), key=lambda k: (k.timestamp, k.offset))
         seen = seen_at(keyframe)
         type_ = None if place is None else view.type_of(place)
         moved_m = None if from_ is None or to is None else math.dist(from_, to)

@@ -142,6 +142,10 @@ class MapView:
         names = (self.observations[number].class_name for number in found.observations)
         return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
+    def sightings(self, found: ObjectRecord) -> list[KeyframeRecord]:
+        """The keyframes that saw an Object, one for each observation, in their order."""
+        return [self.keyframes[self.observations[o].keyframe] for o in found.observations]
+
     def edges(self) -> list[tuple[PlaceOrdinal, PlaceOrdinal, int]]:
         """(a, b, shared_transitions), ascending."""
         return [(a, b, n) for (a, b), n in sorted(self.adjacency.items())]

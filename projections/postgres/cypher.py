@@ -41,7 +41,7 @@ PARENTS: Final = ("_ag_label_vertex", "_ag_label_edge")
 """The tables that AGE has all labels' tables inherit from."""
 
 
-def connect_for_cypher(url: str, *, application: str = "mapfold query") -> Connection:
+def connect_for_cypher(url: str, *, application: str = "mapfold ask") -> Connection:
     """An autocommit connection for Cypher: AGE loaded, ag_catalog on the search path."""
     connection = connect(url, application=application, autocommit=True)
     try:

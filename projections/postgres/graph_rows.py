@@ -217,7 +217,8 @@ def _keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRo
     base = BASE["Keyframe"]
     for i in keyframes:
         k = view.keyframes[i]
-        properties = f'{{{_keyframe_key(k)}, "timestamp": {k.timestamp!r}{_camera(k.camera)}}}'
+        more = f'"timestamp": {k.timestamp!r}, "offset": {k.offset}{_camera(k.camera)}'
+        properties = f"{{{_keyframe_key(k)}, {more}}}"
         yield base + i, properties
 
 
@@ -260,7 +261,7 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
     base, by_evidence = BASE["Object"], view.settings.fusion == "evidence"
     for i in objects:
         o = view.all_objects[i]
-        more = _evidence(o) if by_evidence else ""
+        more = _evidence(view, o) if by_evidence else ""
         properties = (
             f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
             f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'
@@ -270,9 +271,17 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
         yield base + i, properties
 
 
-def _evidence(found: ObjectRecord) -> str:
-    """More properties of an Object; one without an estimate has no position."""
-    at, missing = found.estimate, "false" if found.missing_in is None else "true"
+def _evidence(view: MapView, found: ObjectRecord) -> str:
+    """More properties of an Object; one without an estimate has no position. One that is missing
+    has the run in which it is, one that moved where it stood before."""
+    at, missing = found.estimate, "false"
+    if found.missing_in is not None:
+        missing = f'true, "missing_in": {text(view.runs[found.missing_in].run_id)}'
+    if found.relocations:
+        moved = found.relocations[-1]
+        missing += f', "moved_from_x": {number(moved.from_x_um / UM_PER_M)}'
+        missing += f', "moved_from_y": {number(moved.from_y_um / UM_PER_M)}'
+        missing += f', "moved_at": {moved.offset}'
     if at is None:
         return f', "missing": {missing}'
     xx, xy, yy = at.covariance_m2

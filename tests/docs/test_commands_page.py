@@ -68,7 +68,7 @@ def test_tables_in_help_are_code_in_the_page() -> None:
     assert "\n    place_count() " in said
 
 
-@pytest.mark.parametrize("path", ["", "log", "db", "query", "edit"])
+@pytest.mark.parametrize("path", ["", "log", "db", "fleet", "edit"])
 def test_lists_of_commands_show_whole_sentences(path: str) -> None:
     program = command_line()
     group: Any = typer.main.get_command(program)

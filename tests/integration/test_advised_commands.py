@@ -143,7 +143,7 @@ OWN = ("--settings", SETTINGS, "--set", "min_samples=4")
             ("merges", LOG, "--show", "99", "--preset", "rooms"),
             [["merges", LOG, "--preset", "rooms"]],
         ),
-        (("query", "contents", "nowhere", "--log", LOG, *OWN), [["state", LOG, *OWN]]),
+        (("room", LOG, "nowhere", *OWN), [["state", LOG, *OWN]]),
         (("edits", LOG), [["edit", LOG]]),
         (("log", "cat", LOG, "--from", "run-a:4711"), [["log", "cat", LOG]]),
         (("state", "my logs/a file", *OWN), [["import", "LOG", "my logs/a file"]]),

@@ -21,7 +21,7 @@ from projections.postgres.graph_sink import GraphSink
 from projections.postgres.loader import LoaderName
 from projections.postgres.queries.candidate_search import prepare_graph
 from projections.postgres.queries.graph_reads import objects_near
-from projections.postgres.queries.map_queries import FoldedMap, LiveMap
+from projections.postgres.queries.live_view import read_view
 from projections.postgres.vector_sink import VectorSink
 from tests.integration.test_projections import parsed
 from tests.support.memory_sink import MemorySink, MemoryTables
@@ -155,14 +155,13 @@ def test_questions_use_where_objects_stand(one_database: Targets) -> None:
     with session(one_database) as connection:
         view = follow(connection, events, 10, "copy")
         prepare_graph(connection)
-        live, folded = LiveMap(connection), FoldedMap(view)
+        live = {each.object_id: each for each in read_view(connection).objects.values()}
+        assert [*live] == [each.object_id for each in view.objects.values()]
         for thing in view.objects.values():
-            found = live.find_object(thing.object_id)
-            assert found is not None
-            assert found == folded.find_object(thing.object_id)
-            assert list(found) == list(folded.find_object(thing.object_id) or {})
-            assert found["missing"] is (thing.missing_in is not None)
-            x, y = found.get("est_x", found["mean_x"]), found.get("est_y", found["mean_y"])
+            found = live[thing.object_id]
+            assert (found.estimate, found.spot) == (thing.estimate, thing.spot)
+            assert (found.missing_in is None) == (thing.missing_in is None)
+            x, y = found.spot
             (nearest, *_) = objects_near(connection, x, y, 0.5)
             assert nearest["distance_m"] == 0.0
         for radius in (1.0, 3.0):

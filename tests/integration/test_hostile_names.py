@@ -53,8 +53,10 @@ def check(said: Said) -> Said:
         "whatif L --set eps_m=1.0",
         "bisect L place_count>=1",
         "evaluate --map L --query L",
-        "query where-is L",
         "find L --all",
+        "room L p0",
+        "path L 0,0 p0",
+        "changes L",
     ],
 )
 def test_a_command_prints_nothing_that_a_terminal_obeys(run: Commands, command: str) -> None:

@@ -23,7 +23,7 @@ from tests.support.logs import SAMPLE
 from tests.support.models import drive, write
 
 ASKED = [
-    ("query", "contents", "sim-7-a_p0", "--log", "LOG"),
+    ("room", "LOG", "sim-7-a_p0"),
     ("export", "LOG", "--graphml", "map.graphml"),
     ("relocalize", "--class", "toilet", "--log", "LOG"),
     ("draw", "LOG", "--out", "map.svg", "--merges"),

@@ -191,7 +191,7 @@ QUESTIONS: dict[str, tuple[str, ...]] = {
     "export": ("export", "log", *CUP_AT, "--graphml", "out/map.graphml", "--csv", "out/csv"),
     "foxglove": ("export", "log", *CUP_AT, "--foxglove", "out/map.mcap"),
     "rerun": ("export", "log", *CUP_AT, "--rerun", "out/map.rrd"),
-    "contents": ("query", "contents", LEFT, "--log", "log", *CUP_AT, "--json"),
+    "room": ("room", "log", LEFT, *CUP_AT, "--json"),
     "relocalize": ("relocalize", "question.json", "--log", "log", "--as-of", str(W), "--json"),
     "evaluate": ("evaluate", "--map", "log", *CUP_AT, "--truth", "truth.jsonl", "--json"),
     "cat": ("log", "cat", "log", "--to", str(W), "--json"),

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader
+from projections.ask.find import Wanted, find
+from projections.ask.room_and_path import path, room
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, rank, read_question
 from projections.map.fold import fold_log
@@ -15,15 +17,7 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
 from projections.postgres.queries.candidate_search import CandidateReader, prepare_graph
-from projections.postgres.queries.map_queries import (
-    FoldedMap,
-    LiveMap,
-    objects_of,
-    path_between,
-    places_holding,
-    similar_objects,
-    where_is,
-)
+from projections.postgres.queries.live_view import read_view
 from projections.surfaces.serve import Answerer, Pools
 from tests.support.logs import append_command, name_place, walk, write_log
 
@@ -55,25 +49,23 @@ def test_queries_of_the_live_map_and_of_the_log_show_the_same_names(
     inside = next(o for o in view.objects.values() if o.place == named.ordinal)
     with connect_for_cypher(one_database.graph_url) as connection:
         prepare_graph(connection)
-        live, folded = LiveMap(connection), FoldedMap(view)
-        answers = [
-            [
-                where_is(source, inside.object_id),
-                objects_of(source, named.place_id),
-                objects_of(source, other.place_id),
-                path_between(source, named.place_id, other.place_id),
-                places_holding(source, inside.class_name, named.place_id, 3),
-            ]
-            for source in (live, folded)
+        live = read_view(connection)
+    answers = [
+        [
+            find(map_, Wanted(what=inside.object_id)).document(),
+            room(map_, named.place_id).document(),
+            room(map_, other.place_id).document(),
+            path(map_, named.place_id, other.place_id).document(),
         ]
+        for map_ in (live, view)
+    ]
     assert answers[0] == answers[1]
-    where, in_named, in_other, path, holding = answers[0]
-    assert where["place_name"] == NAME  # type: ignore[call-overload]
-    assert {o["place_name"] for o in in_named} == {NAME}  # type: ignore[index]
-    assert in_other
-    assert all("place_name" not in o for o in in_other)
-    assert [step.get("name") for step in path] == [NAME, *[None] * (len(path) - 1)]  # type: ignore[attr-defined]
-    assert holding[0]["name"] == NAME  # type: ignore[index,call-overload]
+    found, in_named, in_other, way = answers[0]
+    assert found["answers"][0]["place_name"] == NAME
+    assert in_named["name"] == NAME
+    assert {o["place_name"] for o in in_named["objects"]} == {NAME}
+    assert {o["place_name"] for o in in_other["objects"]} == {None}
+    assert [step["name"] for step in way["places"]] == [NAME, *[None] * (len(way["places"]) - 1)]
 
 
 def test_answers_to_where_is_this_show_the_name(
@@ -95,9 +87,6 @@ def test_answers_to_where_is_this_show_the_name(
     assert names == {place_id: expected[place_id] for place_id in names}
     assert NAME in names.values()
     assert any("name" not in place for place in answer["places"])
-    similar = similar_objects(crops, candidates, 20)
-    assert NAME in {found.get("place_name") for found in similar}
-
     with Pools(one_database, 1, lambda _: None) as pools:
         answerer = Answerer(pools, per_second=100.0)
         served = answerer.relocalize(json.dumps({"crops": question, "top": 9}).encode(), {})

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from eventsrc.log import LogReader
+from projections.ask.find import Wanted, find
+from projections.ask.room_and_path import path, room
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.naming import NoSuchThing, SeveralThings
@@ -14,14 +16,7 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
 from projections.postgres.queries.candidate_search import prepare_graph
-from projections.postgres.queries.map_queries import (
-    FoldedMap,
-    LiveMap,
-    objects_of,
-    path_between,
-    places_holding,
-    where_is,
-)
+from projections.postgres.queries.live_view import read_view
 from projections.surfaces.python import Timeline, fold
 from tests.integration.test_types_of_places import BATHROOM, DOCUMENTS, KITCHEN, SHED
 from tests.support.commands import Commands
@@ -122,24 +117,20 @@ def test_the_live_map_and_the_log_take_the_same(log: Path, one_database: Targets
     (box,) = (each.object_id for each in view.objects.values() if each.class_name == "box")
     with connect_for_cypher(one_database.graph_url) as connection:
         prepare_graph(connection)
-        answers: list[list[Any]] = []
-        for source in (LiveMap(connection), FoldedMap(view)):
-            answers.append(
-                [where_is(source, t) for t in ("BOX", box, box[4:10], "p1", "sink", "wc")]
-            )
-            answers[-1].append(objects_of(source, "p2"))
-            answers[-1].append(path_between(source, "kitchen", "p1"))
-            answers[-1].append(places_holding(source, "toilet", "kitchen", 1))
-            for text in ("p'; drop table x; --", "obj-0000000", "%", "\\"):
-                with pytest.raises(NoSuchThing, match="under these settings"):
-                    where_is(source, text)
-    assert answers[0] == answers[1]
-    by_class, by_id, by_digits, place, sinks, rooms, inside, way, holding = answers[0]
-    assert by_class == by_id == by_digits == inside[0]
-    assert place[0]["place_id"] == rooms[0]["place_id"] == BATHROOM
-    assert [sink["place_id"] for sink in sinks] == [KITCHEN, BATHROOM]
-    assert [step["place_id"] for step in way] == [KITCHEN, BATHROOM]
-    assert [each["place_id"] for each in holding] == [BATHROOM]
+        live = read_view(connection)
+    for map_ in (live, view):
+        for text in ("BOX", box, box[4:10]):
+            (answer,) = find(map_, Wanted(what=text, every=True)).answers
+            assert (answer.object_id, answer.place_id) == (box, SHED)
+        assert [room(map_, t).place_id for t in ("p1", "wc", "kitchen")] == [
+            *(BATHROOM, BATHROOM, KITCHEN)
+        ]
+        assert [each.place_id for each in path(map_, "wc", "p1").places] == [BATHROOM]
+        for text in ("p'; drop table x; --", "obj-0000000", "%", "\\"):
+            with pytest.raises(NoSuchThing, match="under these settings"):
+                room(map_, text)
+            with pytest.raises(NoSuchThing, match="under these settings"):
+                path(map_, "kitchen", text)
 
 
 def test_python_takes_them(log: Path) -> None:

@@ -51,7 +51,6 @@ WITHOUT = {
     "db stop": "reads no log",
     "db reset": "reads no log",
     "db roles": "reads no log",
-    "query similar": "asks the databases",
     "log info": "reads indexes only",
     "completion": "reads no log",
     "help": "reads no log",
@@ -96,10 +95,8 @@ PROVOKED = {
     "log verify": ["L"],
     "log recover": ["L"],
     "log spaces": ["L"],
-    "query where": ["hall", "--log", "L"],
-    "query contents": ["run-a_p0", "--log", "L"],
-    "query holding": ["cup", "--from", "run-a_p0", "--log", "L"],
-    "query path": ["run-a_p0", "run-a_p0", "--log", "L"],
+    "room": ["L", "hall"],
+    "path": ["L", "hall", "0,0"],
 } | {f"edit {kind}": ["L", kind, *given, "--dry-run"] for kind, given in EDITS.items()}
 
 SLOW = {"simulate", "draw"}

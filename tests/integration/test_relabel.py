@@ -13,7 +13,7 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher
 from projections.postgres.queries.candidate_search import prepare_graph
-from projections.postgres.queries.map_queries import LiveMap
+from projections.postgres.queries.live_view import read_view
 from tests.integration.test_types_of_places import DOCUMENTS, KITCHEN
 from tests.support.commands import Commands
 from tests.support.logs import write_log
@@ -153,8 +153,8 @@ def test_a_tail_folds_again_when_a_label_is_named(
     assert all(report.sound for report in check(log, one_database, Settings()))
     with connect_for_cypher(one_database.graph_url) as connection:
         prepare_graph(connection)
-        found = LiveMap(connection).all_objects()
-    assert {each["class_name"] for each in found} == {*NUMBERS}
+        found = read_view(connection).objects.values()
+    assert {each.class_name for each in found} == {*NUMBERS}
 
 
 def test_a_copy_of_a_log_keeps_its_names(mapfold: Commands, log: Path) -> None:

@@ -35,7 +35,7 @@ ASKED: list[tuple[str, ...]] = [
     ("diff", "log", THEN),
     ("bisect", "log", "place_count > 0", "--to", THEN),
     ("relocalize", "question.json", "--log", "log", "--as-of", THEN),
-    ("query", "contents", "run-b_p0", "--log", "log", "--at", THEN),
+    ("room", "log", "run-b_p0", "--at", THEN),
     ("draw", "log", "--at", THEN, "--out", "map.svg"),
     ("merges", "log", "--at", THEN),
     ("why", "log", "run-b_p0", "--at", THEN),
@@ -43,8 +43,8 @@ ASKED: list[tuple[str, ...]] = [
     ("bisect", "log", "place_count > 0", "--from", THEN),
     ("whatif", "log", "--set", "eps_m=1", "--at", THEN),
     ("evaluate", "--map", "log", "--at", THEN),
-    ("query", "holding", "cup", "--from", "run-b_p0", "--log", "log", "--at", THEN),
-    ("query", "path", "run-b_p0", "run-b_p0", "--log", "log", "--at", THEN),
+    ("find", "log", "cup", "--near", "run-b_p0", "--at", THEN),
+    ("path", "log", "run-b_p0", "0,0", "--at", THEN),
 ]
 
 

@@ -88,22 +88,18 @@ def test_a_name_overrides_the_type(mapfold: Commands, log: Path) -> None:
 
 
 @pytest.mark.slow
-def test_query_where_finds_places_by_type_and_by_name(mapfold: Commands, log: Path) -> None:
-    def where(what: str) -> Any:
-        return mapfold("query", "where", what, "--log", log, "--json").json
+def test_room_finds_a_place_by_type_and_by_name(mapfold: Commands, log: Path) -> None:
+    def room(what: str) -> Any:
+        return mapfold("room", log, what, "--json").json
 
-    found = where("kitchen")
-    assert [place["place_id"] for place in found] == [KITCHEN]
-    assert found[0]["type"] == "kitchen"
+    found = room("kitchen")
+    assert (found["place_id"], found["type"]) == (KITCHEN, "kitchen")
     mapfold("edit", log, "name-place", SHED, "Anna's kitchen", "--reason", "so she says")
-    assert [place["place_id"] for place in where("kitchen")] == [SHED, KITCHEN]
-    assert [place["place_id"] for place in where("Anna's kitchen")] == [SHED, KITCHEN]
-    assert where("toilets")[0]["place_id"] == BATHROOM
-    thing = mapfold("state", log, "--json").json["objects"][0]["object_id"]
-    assert where(thing)["object_id"] == thing
-    said = mapfold("query", "where", "office", "--log", log, code=2).err
-    assert "no place or object 'office' under these settings; there are " in said
-    said = mapfold("query", "where", "bathrom", "--log", log, code=2).err
+    assert [room(what)["place_id"] for what in ("kitchen", "Anna's kitchen")] == [KITCHEN, SHED]
+    assert room("toilets")["place_id"] == BATHROOM
+    said = mapfold("room", log, "office", code=2).err
+    assert "no place 'office' under these settings; there are " in said
+    said = mapfold("room", log, "bathrom", code=2).err
     assert "near it: bathroom" in said
 
 
@@ -150,7 +146,6 @@ def test_the_live_map_answers_where_the_kitchen_is(
     mapfold: Commands, log: Path, one_database: Targets
 ) -> None:
     rebuild(log, one_database, Settings())
-    arguments = ("query", "where", "kitchen", "--json")
-    live = mapfold(*arguments, "--db", one_database.graph_url).json
-    assert live == mapfold(*arguments, "--log", log).json
+    live = mapfold("room", "kitchen", "--json", "--db", one_database.graph_url).json
+    assert live == mapfold("room", log, "kitchen", "--json").json
     assert json.dumps(live)

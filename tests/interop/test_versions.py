@@ -73,7 +73,7 @@ HELP_OF_ALL = """
 from typer.testing import CliRunner
 from projections.surfaces.cli import COMMANDS, command_line
 program = command_line()
-for name in ["", *COMMANDS, "log cat", "db check", "query path", "edit join"]:
+for name in ["", *COMMANDS, "log cat", "db check", "log info", "edit join"]:
     done = CliRunner().invoke(program, [*name.split(), "--help"])
     assert done.exit_code == 0, (name, done.output, done.exception)
 """

@@ -124,7 +124,7 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
     for k in view.keyframes:
         n = k.ordinal + 1
         name = {"run_id": k.run_id, "keyframe_id": k.keyframe_id}
-        taken: dict[str, Any] = {"timestamp": k.timestamp}
+        taken: dict[str, Any] = {"timestamp": k.timestamp, "offset": k.offset}
         if k.camera is not None:
             taken["camera"] = {
                 name: getattr(k.camera, name)
@@ -227,6 +227,15 @@ def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> No
         }
         if view.settings.fusion == "evidence":
             properties["missing"] = obj.missing_in is not None
+            if obj.missing_in is not None:
+                properties["missing_in"] = view.runs[obj.missing_in].run_id
+            if obj.relocations:
+                moved = obj.relocations[-1]
+                properties |= {
+                    "moved_from_x": moved.from_x_um / 1e6,
+                    "moved_from_y": moved.from_y_um / 1e6,
+                    "moved_at": moved.offset,
+                }
             if (at := obj.estimate) is not None:
                 properties |= {"est_x": at.x_um / 1e6, "est_y": at.y_um / 1e6}
                 properties["est_sigma_m"] = at.est_sigma_m

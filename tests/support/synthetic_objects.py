@@ -229,6 +229,16 @@ def expected_rows(events: Iterable[Sequence[d.Delta]]) -> dict[str, list[tuple[A
             if isinstance(seen, d.ObjectSeen) and now(seen.object) == found.object
         ]
         properties = _properties(found, about, deltas)
+        moved = [
+            each
+            for each in deltas
+            if isinstance(each, d.ObjectRelocated) and now(each.object) == found.object
+        ]
+        if moved:
+            last = max(moved, key=lambda each: (each.offset, each.observation))
+            properties["moved_from_x"] = last.from_x_um / 1e6
+            properties["moved_from_y"] = last.from_y_um / 1e6
+            properties["moved_at"] = last.offset
         properties["confirmed"] = _is_confirmed(found, members, deltas)
         objects.append((gid("Object", found.object + 1), properties))
         moves = [m.place for m in about if isinstance(m, d.ObjectMoved)]
@@ -253,14 +263,17 @@ def _properties(
     found: d.ObjectFound, about: Sequence[d.Delta], deltas: Sequence[d.Delta]
 ) -> dict[str, Any]:
     class_name, missing, properties = found.class_name, False, {}
+    missing_in: dict[str, Any] = {}
+    runs = {each.run: each.run_id for each in deltas if isinstance(each, d.RunSeen)}
     for delta in about:
         match delta:
             case d.ObjectClassified():
                 class_name = delta.class_name
             case d.ObjectMissing():
                 missing = delta.missing
+                missing_in = {"missing_in": runs[delta.run]} if missing else {}
             case d.ObjectRelocated():
-                missing = False
+                missing, missing_in = False, {}
             case d.ObjectEstimated():
                 properties = {
                     "est_x": delta.x_um / 1e6,
@@ -288,6 +301,7 @@ def _properties(
         "first_seen": last.first_seen,
         "last_seen": last.last_seen,
         "missing": missing,
+        **missing_in,
         **properties,
     }
 

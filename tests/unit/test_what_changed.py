@@ -1,5 +1,6 @@
 """What `changes` says of two maps: what is sure, one sentence each, the farthest moves first."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from eventsrc.envelope.commands import UseSettings
 from projections.ask.what_changed import MapChanges, changes_text, map_changes
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
+from projections.surfaces.python import Timeline, fold
 from tests.support.commands import Commands
 from tests.support.folds import Folded
 from tests.support.logs import append_command, command, write_log
@@ -95,6 +97,16 @@ def test_moments_are_runs_days_and_points(log: Path) -> None:
         by_default, by_run = timeline.changes(), timeline.changes(timeline.moment("a", is_end=True))
     assert by_default == by_run
     assert len(by_default.changes) == 3
+
+
+def test_python_says_the_same(log: Path, tmp_path: Path) -> None:
+    document = Commands.in_folder(tmp_path)("changes", log, "--json").json
+    with Timeline(log) as timeline:
+        assert json.loads(json.dumps(timeline.changes("b").document())) == document
+        before, after = timeline.at("a:95"), timeline.at()
+        assert timeline.changes() == fold(log).changes(fold(log, at="a:95", known_at="end"))
+        assert after.changes(after).changes == ()
+        assert before.digest != after.digest
 
 
 def test_the_command_says_a_sentence_for_each_change(log: Path, tmp_path: Path) -> None:

@@ -348,15 +348,13 @@ class CandidateReader:
 
     def __init__(self, targets: Targets, memory: ConstantsMemory | None = None) -> None:
         self._targets, self._memory = targets, memory or ConstantsMemory()
-        self._vectors = connect(targets.vector_url, application="mapfold query", autocommit=True)
+        self._vectors = connect(targets.vector_url, application="mapfold ask", autocommit=True)
         self._graph = self._vectors
         try:
             with database_errors(targets.vector_url):
                 prepare_vectors(self._vectors)
             if not targets.one_database:
-                self._graph = connect(
-                    targets.graph_url, application="mapfold query", autocommit=True
-                )
+                self._graph = connect(targets.graph_url, application="mapfold ask", autocommit=True)
             with database_errors(targets.graph_url):
                 prepare_graph(self._graph)
         except BaseException:

@@ -1,5 +1,5 @@
--- Objects and Places for `mapfold query` and `serve`. Properties are agtype, parsed as JSON;
--- `ag_catalog.agtype_access_operator` with a constant key is what the btree indexes serve.
+-- Objects and Places for `mapfold find`, `room`, `path` and `serve`. Properties are agtype, parsed as
+-- JSON; `ag_catalog.agtype_access_operator` with a constant key is what the btree indexes serve.
 
 -- name: places
 SELECT id::text, properties FROM {place} ORDER BY id
@@ -7,39 +7,33 @@ SELECT id::text, properties FROM {place} ORDER BY id
 -- name: edges
 SELECT start_id::text, end_id::text, properties FROM {adjacent_to} ORDER BY id
 
+-- name: runs
+SELECT id::text, properties FROM {run} ORDER BY id
+
 -- name: objects
 -- All Objects with the Place they are located in, if any.
-SELECT thing.properties, its.properties
+SELECT thing.id::text, thing.properties, located.end_id::text
 FROM {object} AS thing
 LEFT JOIN {located_in} AS located ON located.start_id = thing.id
-LEFT JOIN {place} AS its ON its.id = located.end_id
 ORDER BY thing.id
 
--- name: object
-SELECT thing.properties, its.properties
-FROM {object} AS thing
-LEFT JOIN {located_in} AS located ON located.start_id = thing.id
-LEFT JOIN {place} AS its ON its.id = located.end_id
-WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"object_id"'::ag_catalog.agtype])
-    = %(id)s::text::ag_catalog.agtype
+-- name: keyframes
+-- All keyframes with their run, their pose and the Place they are in, where they have one.
+SELECT keyframe.id::text, its.start_id::text, keyframe.properties, pose.properties,
+       placed.end_id::text
+FROM {keyframe} AS keyframe
+JOIN {has_keyframe} AS its ON its.end_id = keyframe.id
+LEFT JOIN {has_pose} AS posed ON posed.start_id = keyframe.id
+LEFT JOIN {pose} AS pose ON pose.id = posed.end_id
+LEFT JOIN {in_place} AS placed ON placed.start_id = keyframe.id
+ORDER BY keyframe.id
 
--- name: objects_of_place
-SELECT thing.properties, its.properties
-FROM {place} AS its
-JOIN {located_in} AS located ON located.end_id = its.id
-JOIN {object} AS thing ON thing.id = located.start_id
-WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[its.properties, '"place_id"'::ag_catalog.agtype])
-    = %(id)s::text::ag_catalog.agtype
-ORDER BY thing.id
-
--- name: object_counts
--- Places with Objects of a class, how many, and how many of them are confirmed.
-SELECT located.end_id::text, count(*),
-       count(*) FILTER (WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"confirmed"'::ag_catalog.agtype]) = 'true'::ag_catalog.agtype)
-FROM {object} AS thing JOIN {located_in} AS located ON located.start_id = thing.id
-WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[thing.properties, '"class_name"'::ag_catalog.agtype])
-    = %(id)s::text::ag_catalog.agtype
-GROUP BY 1
+-- name: sightings
+-- Of each observation of an Object, by its number: the Object and the keyframe.
+SELECT seen.end_id::text, made.start_id::text
+FROM {observes} AS seen
+JOIN {has_observation} AS made ON made.end_id = seen.start_id
+ORDER BY seen.start_id
 
 -- name: near_places
 SELECT properties FROM {place}

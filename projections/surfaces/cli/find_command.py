@@ -1,22 +1,113 @@
-"""``mapfold find``: where things are."""
+"""``mapfold find``, ``room`` and ``path``: where things are, what is in a place, the way to it."""
 
-from typing import Annotated
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, Literal
 
 import typer
 
-from eventsrc.base.text import shorten_by, table, visible
-from projections.ask.find import FoundObject, FoundObjects, Wanted, find, robot_seconds
+from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.base.text import advised, counted, shorten_by, table, visible
+from projections.ask.driven_ground import CLEARANCE_M, GoalPose
+from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find, robot_seconds
+from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
 from projections.map.naming import ShortIds, things_of
+from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 
-from .folded_log import CachedLog, FoldToOption, KnownAtOption
-from .options import JsonOption
+from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
+from .options import Databases, JsonOption
 from .terminal import display, emit, say
+
+GoalForm = Literal["json", "yaml", "ros2"]
+
+GoalOption = Annotated[
+    GoalForm | None,
+    typer.Option(
+        "--goal",
+        metavar="json|yaml|ros2",
+        help="Print instead the pose from which a robot sees it: as JSON, a PoseStamped in YAML, or"
+        " a ros2 command that sends it.",
+    ),
+]
+ClearanceOption = Annotated[
+    float,
+    typer.Option(
+        "--clearance", metavar="METRES", min=0.0, help="Least distance of goals from walls."
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AskedMap(FoldSettings):
+    """The map that is asked: a log folded to a point, or with ``--db`` that of the databases."""
+
+    log: Annotated[
+        Path | None,
+        typer.Argument(metavar="LOG", help="The log's folder; leave it out with --db."),
+    ] = None
+    at: FoldToOption = "end"
+    known_at: KnownAtOption = None
+    no_cache: NoCacheOption = False
+    db: Annotated[
+        str | None,
+        typer.Option(
+            "--db",
+            metavar="URL",
+            help="Ask this database's live map, not a log; '' is the embedded server.",
+        ),
+    ] = None
+
+    def words(self, *given: str | None) -> list[str | None]:
+        """The arguments after LOG; with ``--db`` LOG is the first of them. Raises MisuseError."""
+        if self.db is None:
+            if self.log is None:
+                raise MisuseError("give a LOG, or --db URL to ask the databases")
+            return list(given)
+        if given and given[-1] is not None:
+            raise MisuseError(f"--db asks the databases, not the log {self.log}; give one of them")
+        return [None if self.log is None else str(self.log), *given[:-1]]
+
+    def view(self) -> MapView:
+        """The map that is asked; texts printed from here on have its short ids."""
+        view = self._view()
+        shorten_by(ShortIds.of(things_of(view)).text)
+        return view
+
+    def _view(self) -> MapView:
+        if self.db is None:
+            source = CachedLog(
+                preset=self.preset,
+                space=self.space,
+                set_=self.set_,
+                settings_file=self.settings_file,
+                log=self.log or Path(),
+            )
+            with source.opened(self.at, self.known_at) as (reader, end, _, corrections, settings):
+                cache = not self.no_cache
+                return map_after(
+                    reader, settings, end, corrections=corrections, note=say, cache=cache
+                )
+        self.of_past_map(None)  # refuses settings
+        if self.at != "end" or self.known_at is not None:
+            raise MisuseError("--at and --known-at ask a past map, which only the log knows")
+        # Imported here: the drivers take as long to import as a small map to fold.
+        from projections.postgres.connection import connect
+        from projections.postgres.queries.candidate_search import prepare_graph
+        from projections.postgres.queries.live_view import read_view
+
+        with (
+            Databases(db=self.db or None).opened() as targets,
+            connect(targets.graph_url, application="mapfold find", autocommit=True) as connection,
+        ):
+            prepare_graph(connection)
+            return read_view(connection)
 
 
 def find_things(
     *,
-    source: CachedLog,
+    asked: AskedMap,
     what: Annotated[
         str | None,
         typer.Argument(
@@ -24,7 +115,7 @@ def find_things(
             help="A class, such as chair or chairs, or an object's id [default: everything].",
         ),
     ] = None,
-    room: Annotated[
+    in_: Annotated[
         str | None,
         typer.Option("--in", metavar="PLACE", help="Only what is in this place, such as kitchen."),
     ] = None,
@@ -34,8 +125,14 @@ def find_things(
             "--near", metavar="X,Y|THING", help="Nearest first, to a point in metres or a thing."
         ),
     ] = None,
-    at: FoldToOption = "end",
-    known_at: KnownAtOption = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="X,Y|THING",
+            help="Nearest first by the way from there, over ground that robots drove on.",
+        ),
+    ] = None,
     missing: Annotated[
         bool,
         typer.Option(
@@ -53,16 +150,20 @@ def find_things(
     ] = None,
     top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Most answers.")] = 10,
     every: Annotated[bool, typer.Option("--all", help="Also what was seen once.")] = False,
+    goal: GoalOption = None,
+    clearance: ClearanceOption = CLEARANCE_M,
     json_: JsonOption = False,
 ) -> None:
     """Find things: where they are, how often and when they were seen.
 
     WHAT forgives letter case, plurals and near spellings; a place is given by its id, name or type.
     """
+    (what,) = asked.words(what)
     wanted = Wanted(
         what=what,
-        room=room,
+        room=in_,
         near=near,
+        start=start,
         missing=missing,
         moved=moved,
         seen_since=None if seen_since is None else robot_seconds(seen_since),
@@ -70,12 +171,13 @@ def find_things(
         top=top,
         every=every,
     )
-    with source.opened(at, known_at) as (reader, end, _, corrections, settings):
-        view = map_after(
-            reader, settings, end, corrections=corrections, note=say, cache=not source.no_cache
-        )
-    shorten_by(ShortIds.of(things_of(view)).text)
+    view = asked.view()
     found = find(view, wanted)
+    if goal is not None:
+        if not found.answers:
+            raise MapfoldError("nothing found, so there is no goal")
+        _print_goal(goal_of(view, found.answers[0].object_id, clearance), goal)
+        return
     if json_:
         emit(found.document())
         return
@@ -84,10 +186,120 @@ def find_things(
         say(line)
 
 
+def show_room(
+    *,
+    asked: AskedMap,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="A place: p3, a name, a type of room.")
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="List all objects, not only ten.")] = False,
+    json_: JsonOption = False,
+) -> None:
+    """Show a place: what it is, what is in it, its neighbours, and when robots were there."""
+    (name,) = asked.words(name)
+    if name is None:
+        raise MisuseError("give the NAME of a place, such as p3 or kitchen")
+    view = asked.view()
+    found = room(view, name)
+    if json_:
+        emit(found.document())
+        return
+    display(_room_text(found, None if all_ else _MOST_IN_ROOM))
+    if found.unconfirmed:
+        lists = visible(advised("find", "--in", found.place_id, "--all"))
+        say(f"+ {found.unconfirmed:,} seen once; `{lists}` lists them")
+
+
+def show_path(
+    *,
+    asked: AskedMap,
+    start: Annotated[
+        str | None, typer.Argument(metavar="A", help="A point X,Y in metres, a place or a thing.")
+    ] = None,
+    end: Annotated[str | None, typer.Argument(metavar="B", help="The other end.")] = None,
+    goal: GoalOption = None,
+    clearance: ClearanceOption = CLEARANCE_M,
+    json_: JsonOption = False,
+) -> None:
+    """Show the way from one place or thing to another, over ground that robots drove on."""
+    start, end = asked.words(start, end)
+    if start is None or end is None:
+        raise MisuseError("give both ends A and B of the way, such as p3 fridge")
+    view = asked.view()
+    found = path(view, start, end, clearance)
+    if goal is not None:
+        if found.goal is None:
+            raise MisuseError(f"--goal faces a thing, and {visible(end)} is none; give an object")
+        _print_goal(found.goal, goal)
+    elif json_:
+        emit(found.document())
+    else:
+        display(_path_text(found))
+
+
+_MOST_IN_ROOM: Final = 10
+
+
+def _print_goal(found: GoalPose, form: GoalForm) -> None:
+    if form == "json":
+        emit(found.document())
+    else:
+        display(found.pose_stamped() if form == "yaml" else found.topic_pub())
+
+
+def _room_text(found: Room, most: int | None) -> str:
+    sure = "" if found.type_probability is None else f" (probability {found.type_probability:.2f})"
+    size = "" if found.area_m2 is None else f", {found.area_m2:.1f} m²"
+    at = f"({found.centroid_x:.2f}, {found.centroid_y:.2f})"
+    visits = counted(found.keyframe_count, "keyframe")
+    lines = [
+        f"{_called(found)}{sure}: {visits} around {at}{size}",
+        f"visited {_seen(found.first_visited)} to {_seen(found.last_visited)}",
+    ]
+    if found.neighbours:
+        beside = (f"{_called(n)} ({n.shared_transitions:,}×)" for n in found.neighbours)
+        lines.append(f"next to {', '.join(beside)}")
+    shown = found.objects[:most]
+    rows = [
+        [o.object_id, visible(o.class_name), _position(o), f"{o.obs_count:,}×", _last(o)]
+        for o in shown
+    ]
+    if rows:
+        header = ["object", "class", "position (m)", "seen", "last seen"]
+        lines.append(table(header, rows, right=("seen",)).rstrip("\n"))
+    if len(shown) < len(found.objects):
+        lines.append(f"… and {len(found.objects) - len(shown):,} more (--all lists them)")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _called(place: NamedPlace) -> str:
+    word = place.name or place.type
+    return visible(place.place_id if word is None else f"{place.place_id} {word}")
+
+
+def _path_text(found: DrivenPath) -> str:
+    names = [_called(place) for place in found.places]
+    doors = counted(len(found.doors), "passage")
+    points = counted(len(found.way_points), "way point")
+    lines = [f"{found.length_m:.2f} m, {doors}, {points}: {' → '.join(names) or 'in no place'}"]
+    lines += [
+        f"  from {visible(d.before)} to {visible(d.after)} at ({d.x:.2f}, {d.y:.2f})"
+        for d in found.doors
+    ]
+    if found.goal is not None:
+        g = found.goal
+        facing = f"facing {math.degrees(g.yaw):.0f}°, {g.distance_m:.2f} m from it"
+        lines.append(f"ends at ({g.x:.2f}, {g.y:.2f}), {facing}")
+    return "".join(f"{line}\n" for line in lines)
+
+
 def _table(found: FoundObjects) -> str:
     header = ["object", "class", "place", "position (m)", "seen", "last seen"]
-    if found.answers[0].distance_m is not None:
-        header.insert(4, "away (m)")
+    away, way = (
+        any(getattr(each, name) is not None for each in found.answers)
+        for name in ("distance_m", "way_m")
+    )
+    header[4:4] = [*(["away (m)"] if away else []), *(["way (m)"] if way else [])]
     rows = []
     for each in found.answers:
         row = [
@@ -98,10 +310,10 @@ def _table(found: FoundObjects) -> str:
             f"{each.obs_count:,}×",
             _last(each),
         ]
-        if each.distance_m is not None:
-            row.insert(4, f"{each.distance_m:.2f}")
+        measured = [each.distance_m] * away + [each.way_m] * way
+        row[4:4] = ["none" if metres is None else f"{metres:.2f}" for metres in measured]
         rows.append(row)
-    return table(header, rows, right=("seen", "away (m)"))
+    return table(header, rows, right=("seen", "away (m)", "way (m)"))
 
 
 def _place(each: FoundObject) -> str:
@@ -117,9 +329,13 @@ def _position(each: FoundObject) -> str:
     return f"seen from {at}" if each.sigma_m is None else f"{at} ± {each.sigma_m:.2f}"
 
 
+def _seen(at: SeenAt) -> str:
+    return f"{at.iso} {visible(at.run_id)}:{at.keyframe_id}"
+
+
 def _last(each: FoundObject) -> str:
     """When it was last seen, and what became of it."""
-    seen = f"{each.last_seen.iso} {visible(each.last_seen.run_id)}:{each.last_seen.keyframe_id}"
+    seen = _seen(each.last_seen)
     if each.missing_in is not None:
         return f"{seen}; missing in {visible(each.missing_in)}"
     if each.moved_from is not None:

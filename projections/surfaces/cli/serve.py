@@ -186,9 +186,9 @@ def serve(
 ) -> None:
     """Answer questions from the live databases until Ctrl-C.
 
-    Over Zenoh at mapfold/relocalize and mapfold/state/**, over HTTP as described at its /docs. An
-    invalid question gets an error as its answer. On SIGINT or SIGTERM open questions are answered
-    first.
+    Over Zenoh at mapfold/relocalize, mapfold/find and mapfold/state/**, over HTTP as described at
+    its /docs. An invalid question gets an error as its answer. On SIGINT or SIGTERM open questions
+    are answered first.
     """
     if http is None and not zenoh:
         raise MisuseError("nothing to serve on; give --http HOST:PORT, or leave out --no-zenoh")
@@ -215,7 +215,7 @@ def serve(
         if session is not None:
             watch = (lambda *_: None) if metrics is None else metrics.watch
             stack.enter_context(ZenohService(session, answerer, queue, watch))
-            say("answering mapfold/relocalize and mapfold/state/** over Zenoh")
+            say("answering mapfold/relocalize, mapfold/find and mapfold/state/** over Zenoh")
         if endpoint is not None and metrics is not None:
             url = stack.enter_context(endpoint.serving(answerer, queue, metrics))
             say(f"answering {url}, described at /docs")

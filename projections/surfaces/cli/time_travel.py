@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import advised, counted, shorten_by
+from eventsrc.base.text import advised, counted, shorten_by, visible
 from eventsrc.envelope.model import Offset
 from projections.ask.what_changed import changes_text
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
@@ -292,7 +292,7 @@ def changes(
         return
     display(changes_text(found, most=None if all_ else MOST_LINES))
     if found.unsure:
-        shows = advised("diff", "W1", "W2")
+        shows = visible(advised("diff", found.since, found.until))
         say(f"+ {counted(found.unsure, 'change')} not sure; `{shows}` shows them")
 
 

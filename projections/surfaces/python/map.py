@@ -14,7 +14,10 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
+from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObjects, Wanted, find, robot_seconds
+from projections.ask.room_and_path import DrivenPath, Room, goal_of, path, room
+from projections.ask.what_changed import MapChanges, map_changes
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
@@ -106,6 +109,7 @@ class Map:
         *,
         room: str | None = None,
         near: str | tuple[float, float] | None = None,
+        start: str | tuple[float, float] | None = None,
         missing: bool = False,
         moved: bool = False,
         seen_since: float | str | None = None,
@@ -116,8 +120,9 @@ class Map:
         """The Objects that are ``what``, such as ``"chairs"`` or an id, None for all, best first.
 
         ``room`` is the Place they are in, ``near`` the point in metres or the thing from which they
-        are ordered. Times are ISO 8601 or robot seconds. Objects that were seen once are left out
-        without ``every``. Raises MisuseError for what this map does not have.
+        are ordered, ``start`` that from which the way over driven ground counts. Times are ISO 8601
+        or robot seconds. Objects that were seen once are left out without ``every``. Raises
+        MisuseError for what this map does not have.
 
         Examples:
             >>> house = fold("logs/sample", preset="full")
@@ -129,7 +134,8 @@ class Map:
             Wanted(
                 what=what,
                 room=room,
-                near=near if near is None or isinstance(near, str) else f"{near[0]},{near[1]}",
+                near=None if near is None else _text(near),
+                start=None if start is None else _text(start),
                 missing=missing,
                 moved=moved,
                 seen_since=_seconds(seen_since),
@@ -138,6 +144,43 @@ class Map:
                 every=every,
             ),
         )
+
+    def room(self, name: str) -> Room:
+        """What the Place that ``name`` names is, what is in it, its neighbours and visits. Raises
+        NoSuchThing and SeveralThings.
+
+        Examples:
+            >>> fold("logs/sample").room("kitchen").objects[0].class_name
+            'oven'
+        """
+        return room(self.view, name)
+
+    def path(
+        self,
+        start: str | tuple[float, float],
+        end: str | tuple[float, float],
+        *,
+        clearance_m: float = CLEARANCE_M,
+    ) -> DrivenPath:
+        """The way over driven ground between two points, Objects or Places; to an Object it ends at
+        its `goal`. Raises MisuseError, also NoSuchThing and SeveralThings.
+
+        Examples:
+            >>> way = fold("logs/sample").path("kitchen", "bathroom")
+            >>> round(way.length_m, 1), [place.type for place in way.places]
+            (6.1, ['kitchen', None, 'bathroom'])
+        """
+        return path(self.view, _text(start), _text(end), clearance_m)
+
+    def goal(self, thing: str, *, clearance_m: float = CLEARANCE_M) -> GoalPose:
+        """The pose from which a robot sees an Object, so far from walls. Raises MisuseError where
+        there is none, also NoSuchThing and SeveralThings."""
+        return goal_of(self.view, thing, clearance_m)
+
+    def changes(self, since: "Map") -> MapChanges:
+        """What changed for sure since an earlier map of the same log, folded by evidence; see also
+        `Timeline.changes`."""
+        return map_changes(since.view, self.view)
 
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
@@ -177,6 +220,10 @@ class Map:
             f' src="data:image/png;base64,{picture}">'
             f"<table><tr>{head}</tr>{rows}</table>{rest}"
         )
+
+
+def _text(spot: str | tuple[float, float]) -> str:
+    return spot if isinstance(spot, str) else f"{spot[0]},{spot[1]}"
 
 
 def _seconds(time: float | str | None) -> float | None:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar, cast
 from eventsrc.envelope.model import Offset
 from eventsrc.log.seek import resolve
 from projections import history
+from projections.ask.what_changed import MapChanges
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.history.merge_reasons import merge_document
@@ -113,6 +114,14 @@ class Timeline:
     def diff(self, start: int | str, end: int | str = "end") -> dict[str, Any]:
         """The difference between the maps at two points, as ``mapfold diff --json``."""
         return self._timeline.diff(self._offset(start), self._offset(end)).document()
+
+    @_one_at_a_time
+    def changes(self, since: str | None = None, until: str = "end") -> MapChanges:
+        """What changed in the building for sure: since a day, a run or another point, by default
+        since the last run began, until the end of another."""
+        end = self._timeline.moment(until, is_end=True)
+        start = None if since is None else self._timeline.moment(since, is_end=False)
+        return self._timeline.changes(start, end)
 
     @_one_at_a_time
     def bisect(

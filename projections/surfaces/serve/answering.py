@@ -36,6 +36,7 @@ from projections.localize.relocalize import (
 from projections.localize.relocalize.question import Movement
 from projections.localize.relocalize.track import Track, movement_of
 
+from .asked import MapQuestion, NotInMapError, asked
 from .pools import Pools
 from .states import refuse_unknown, state_read
 
@@ -168,6 +169,7 @@ DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (BusyError, "too_much", 503, None),
     (TooMuchError, "too_much", 429, None),
+    (NotInMapError, "bad_question", 404, None),
     (QuestionError, "bad_question", 400, None),
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
     (ProjectionMismatch, "database", 503, "graph and vectors are not of one map"),
@@ -217,19 +219,19 @@ class Answerer:
             )
         refuse_unknown(options, OPTIONS)
         with self._parsing:
-            asked = _read(payload, options)
-        question = asked.question
+            read = _read(payload, options)
+        question = read.question
         with self._reporting_errors():
             self._bucket.take_token()
             candidates = self._pools.candidates(question.crops)
-        answer = rank(question, candidates, top=asked.top, method=asked.method, camera=self._camera)
-        if asked.session is None:
+        answer = rank(question, candidates, top=read.top, method=read.method, camera=self._camera)
+        if read.session is None:
             return answer.document()
         followed = answer  # only the method joint has poses that can be followed
-        if asked.method != "joint":
+        if read.method != "joint":
             followed = rank(question, candidates, camera=self._camera)
-        moved = movement_of(asked.moved, question)
-        tracked = self._sessions.tracked(asked.session, moved, followed)
+        moved = movement_of(read.moved, question)
+        tracked = self._sessions.tracked(read.session, moved, followed)
         return answer.document() | {"track": tracked}
 
     def state(self, what: str, options: Mapping[str, str]) -> dict[str, Any]:
@@ -239,6 +241,13 @@ class Answerer:
         with self._reporting_errors():
             self._bucket.take_token()
             return self._pools.on_graph(read)
+
+    def ask(self, question: MapQuestion) -> dict[str, Any]:
+        """The answer to a question of the map. Raises NotInMapError."""
+        with self._reporting_errors():
+            self._bucket.take_token()
+            view = self._pools.view()
+        return asked(question, view)
 
     @property
     def session_count(self) -> int:

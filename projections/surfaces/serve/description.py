@@ -166,7 +166,7 @@ _EVERYWHERE: Final[tuple[tuple[int, str, dict[str, Any]], ...]] = (
     (400, "The request is wrong, or it does not fit the map", {}),
     (401, "The token is missing or wrong", _TOKEN),
     (403, "The Origin header names another site, which --cors does not allow", {}),
-    (404, "No such path", {}),
+    (404, "No such path, or the map does not have what is asked for", {}),
     (405, "The path does not have this method", _ALLOW),
     (408, "The request did not end within 10 seconds", {}),
     (411, "The body came in chunks; send a Content-Length", {}),

@@ -21,10 +21,22 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.record.metrics import METRICS_TYPE
+from projections.ask.driven_ground import CLEARANCE_M
+from projections.ask.find import FoundObject
+from projections.ask.room_and_path import DrivenPath, Room
 from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Method, describe_value
 
 from .answering import MAX_NAME, MAX_TOP, OPTIONS, Answerer, TooMuchError, encode, refusal
+from .asked import (
+    FIND_NAMES,
+    MOST_TEXT,
+    FindQuery,
+    FoundPageShape,
+    object_question,
+    path_question,
+    room_question,
+)
 from .connections import peer_of
 from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
 from .fair_queue import FairQueue
@@ -33,6 +45,8 @@ from .service_metrics import ServiceMetrics
 from .states import State, refuse_unknown
 
 _DRAIN_FACTOR: Final = 8
+_NAME: Final = Path(min_length=1, max_length=MOST_TEXT)
+_END: Final = "X,Y in metres, a Place or an Object; the way to an Object ends at its goal."
 _RETRY_AFTER: Final = {"Retry-After": "1"}
 _ABOUT: Final = """Answers come from the map as it is in the databases when they are asked.
 
@@ -120,6 +134,58 @@ def create_app(
         given = asked.model_dump(exclude_none=True)
         options = {name: str(value) for name, value in given.items()}
         return await answered(request, what, lambda: answerer.state(what, options))
+
+    @app.get(
+        "/find",
+        summary="Objects by class or id, best first, with where and when they were seen",
+        response_model=FoundPageShape,
+        responses=refusals(asking=True),
+        dependencies=[only(*FIND_NAMES)],
+    )
+    async def find(request: Request, wanted: Annotated[FindQuery, Query()]) -> Response:
+        return await answered(request, "find", lambda: answerer.ask(wanted.question()))
+
+    @app.get(
+        "/rooms/{name}",
+        summary="A Place: what it is, what is in it, its neighbours, when robots were there",
+        response_model=Room,
+        responses=refusals(asking=True),
+        dependencies=[only()],
+    )
+    async def room(request: Request, name: Annotated[str, _NAME]) -> Response:
+        return await answered(request, "room", lambda: answerer.ask(room_question(name)))
+
+    @app.get(
+        "/objects/{name}",
+        summary="An Object by its id, the first six characters of it or more, or its class",
+        response_model=FoundObject,
+        responses=refusals(asking=True),
+        dependencies=[only()],
+    )
+    async def object_(request: Request, name: Annotated[str, _NAME]) -> Response:
+        return await answered(request, "object", lambda: answerer.ask(object_question(name)))
+
+    @app.get(
+        "/path",
+        summary="The way over driven ground between two points, Places or Objects",
+        response_model=DrivenPath,
+        responses=refusals(asking=True),
+        dependencies=[only("from", "to", "clearance")],
+    )
+    async def path(
+        request: Request,
+        start: Annotated[
+            str, Query(alias="from", min_length=1, max_length=MOST_TEXT, description=_END)
+        ],
+        end: Annotated[
+            str, Query(alias="to", min_length=1, max_length=MOST_TEXT, description=_END)
+        ],
+        clearance: Annotated[
+            float, Query(ge=0, le=100, description="Metres of a goal from walls.")
+        ] = CLEARANCE_M,
+    ) -> Response:
+        question = path_question(start, end, clearance)
+        return await answered(request, "path", lambda: answerer.ask(question))
 
     @app.get(
         "/health",

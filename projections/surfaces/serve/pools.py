@@ -16,6 +16,7 @@ from psycopg_pool import ConnectionPool, PoolTimeout
 from eventsrc.base.text import advised
 from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import MapCandidates, QuestionCrop
+from projections.map.view import MapView
 from projections.postgres import checkpoints
 from projections.postgres.connection import (
     Connection,
@@ -32,6 +33,8 @@ from projections.postgres.queries.candidate_search import (
     prepare_graph,
     prepare_vectors,
 )
+
+from .asked import MapMemory
 
 OUTAGE_TIMEOUT_S: Final = 10.0
 """Questions in the first seconds of an outage wait for its end, later ones fail at once."""
@@ -95,7 +98,7 @@ class Pools:
         self, targets: Targets, size: int, note: Callable[[str], None] = lambda _: None
     ) -> None:
         self._targets, self._size, self._outage = targets, size, Outage(note)
-        self._memory = ConstantsMemory()
+        self._memory, self._map = ConstantsMemory(), MapMemory()
         self._require_maps()  # a clear error at once; a pool would retry without one
         CandidateReader(targets).close()
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
@@ -134,6 +137,10 @@ class Pools:
                 return ask(connection)
 
         return self._ask(once)
+
+    def view(self) -> MapView:
+        """The map of the graph's database, not to be changed."""
+        return self.on_graph(self._map.view)
 
     def _candidates(self, crops: Sequence[QuestionCrop], wait_s: float) -> MapCandidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:

@@ -1,4 +1,5 @@
-"""The service over Zenoh: ``mapfold/relocalize`` and ``mapfold/state/places|objects``.
+"""The service over Zenoh: ``mapfold/relocalize``, ``mapfold/find`` and
+``mapfold/state/places|objects``.
 
 Zenoh's thread only puts a question into the `FairQueue`. One that is too long is refused before it
 is read, and when too many wait one is refused at once. Every question gets a reply, if need be an
@@ -15,9 +16,11 @@ from eventsrc.record.transport.session import Query, Session
 from projections.fold.map_errors import QuestionError
 
 from .answering import Answerer, encode, refusal
+from .asked import FindQuery
 from .fair_queue import FairQueue
 
 RELOCALIZE: Final = "mapfold/relocalize"
+FIND: Final = "mapfold/find"
 STATE: Final = "mapfold/state"
 MAX_SELECTOR: Final = 4096
 _PEER: Final = "zenoh"
@@ -41,6 +44,7 @@ class ZenohService:
         self._answerer, self._queue, self._watch = answerer, queue, watch
         self._declared = [
             session.queryable(RELOCALIZE, self._receive),
+            session.queryable(FIND, self._receive),
             session.queryable(f"{STATE}/**", self._receive),
         ]
         session.confirm()
@@ -69,6 +73,8 @@ class ZenohService:
         options = {n: value for n, value in query.parameters.items() if not n.startswith("_")}
         if query.key == RELOCALIZE:
             return RELOCALIZE, self._answerer.relocalize(query.payload, options)
+        if query.key == FIND:
+            return FIND, self._answerer.ask(FindQuery.read(options).question())
         return query.key, self._answerer.state(query.key.removeprefix(f"{STATE}/"), options)
 
     def __enter__(self) -> Self:

@@ -60,7 +60,7 @@ def _serve_demands_a_token(arena: Arena) -> None:
 
 
 def _password_is_not_printed(arena: Arena, url: str) -> None:
-    attacked = arena.run("reader", "query", "MATCH (n) RETURN n", "--db", url, codes=(1, 2))
+    attacked = arena.run("reader", "find", "MATCH (n) RETURN n", "--db", url, codes=(1, 2))
     said = attacked.output() + "\n".join(attacked.lines)
     if SECRET in said:
         arena.complain(f"a password is printed: {said[:300]}")

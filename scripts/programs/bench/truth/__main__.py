@@ -26,13 +26,14 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 from projections.map.view import MapView
 
 from . import tables
 from .aligning import AlignRow, align_rows, align_table
-from .asking import AskedRow, asked_row, asked_table
+from .asking import AskedRow, Building, asked_row, asked_table
 from .bags import BagRow, bag_row, bags_table
 from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
@@ -85,7 +86,7 @@ def main() -> None:
             _write(options.json, aligned)
             return
         if options.ask:
-            asked = [_asked_row(generator, case) for case in cases]
+            asked = [_asked_row(generator, case, options) for case in cases]
             print(f"{options.half} half, {options.moved:g} of the movable things moved")
             print(asked_table(asked))
             _write(options.json, asked)
@@ -304,20 +305,26 @@ def _told(case: Case, settings: Settings) -> ToldScores:
     return score_told(*_two_maps(case, settings), case.truth, case.things)
 
 
-def _two_maps(case: Case, settings: Settings) -> tuple[MapView, MapView]:
+def _two_maps(
+    case: Case, settings: Settings, walls: OccupancyMap | None = None
+) -> tuple[MapView, MapView]:
     """The maps after run a and after run b."""
     runs = list(dict.fromkeys(each.envelope.run_id for each in case.events))
     before, after = (
-        fold_timed([e for e in case.events if e.envelope.run_id in runs[:count]], settings)[0]
+        fold_timed([e for e in case.events if e.envelope.run_id in runs[:count]], settings, walls)[
+            0
+        ]
         for count in (1, 2)
     )
     return before, after
 
 
-def _asked_row(generator: ModuleType, case: Case) -> AskedRow:
+def _asked_row(generator: ModuleType, case: Case, options: argparse.Namespace) -> AskedRow:
+    profile, world = case.name.split()
+    building = Building(generator, world, profile, options.moved, options.seed)
     settings = Settings(fusion="evidence", camera=case.camera_settings)
-    same = {word: name for name, words in generator.SYNONYMS.items() for word in words}
-    return asked_row(case.name, *_two_maps(case, settings), case.truth, case.things, same)
+    maps = _two_maps(case, settings, world_walls(generator, world).map)
+    return asked_row(case.name, *maps, case.truth, case.things, generator.SYNONYMS, building)
 
 
 if __name__ == "__main__":

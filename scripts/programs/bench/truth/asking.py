@@ -1,10 +1,13 @@
-"""Scores of `mapfold find` and `mapfold changes` on a building in which things were moved: the
-table of ``scripts/bench_truth --ask``."""
+"""Scores of `mapfold find`, of goals and of `mapfold changes` on a building in which things were
+moved: the table of ``scripts/bench_truth --ask``."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
+from eventsrc.base.errors import MisuseError
+from projections.ask.driven_ground import DrivenGround
 from projections.ask.find import Wanted, find
 from projections.ask.what_changed import KINDS, map_changes
 from projections.localize.evaluate.truth import Truth
@@ -18,7 +21,9 @@ from .worlds import TrueThing
 class AskedRow:
     """``first`` of the ``classes`` found have a true thing of the class as their first answer, as
     far from the truth as ``errors_m``. ``told`` and ``true`` are the changes of each kind: a thing
-    of a true change stands elsewhere than in run a."""
+    of a true change stands elsewhere than in run a. ``goals`` are those of confirmed Objects of
+    true things, how many are on free ground, neither wall nor furniture, and from how many the
+    generator's camera sees the thing."""
 
     name: str
     classes: int
@@ -26,6 +31,7 @@ class AskedRow:
     errors_m: tuple[float, ...]
     told: tuple[int, ...]
     true: tuple[int, ...]
+    goals: tuple[int, ...]
 
 
 def asked_row(
@@ -34,10 +40,11 @@ def asked_row(
     after: MapView,
     truth: Truth,
     things: Mapping[str, TrueThing],
-    same_class: Mapping[str, str],
+    synonyms: Mapping[str, Collection[str]],
+    building: "Building",
 ) -> AskedRow:
     """Ask the map of both runs for each class that it has, and what changed since the first.
-    ``same_class`` gives for a detector's word the class that the truth has."""
+    ``synonyms`` are the words that a detector has for a class of the truth."""
     owners = majorities(after, truth)
     owner_of = {each.object_id: owners.get(number) for number, each in after.objects.items()}
     classes = sorted({each.class_name for each in after.objects.values() if each.confirmed})
@@ -45,11 +52,13 @@ def asked_row(
     for class_name in classes:
         found = find(after, Wanted(what=class_name, top=1)).answers[0]
         thing = things.get(owner_of[found.object_id] or "")
-        if thing is None or same_class.get(class_name, class_name) != thing.class_name:
+        if thing is None or class_name not in (
+            thing.class_name,
+            *synonyms.get(thing.class_name, ()),
+        ):
             continue
         first += 1
-        spots = [thing.moved_to or (thing.x, thing.y)]
-        errors.append(min(math.dist((found.x, found.y), spot) for spot in spots))
+        errors.append(math.dist((found.x, found.y), thing.moved_to or (thing.x, thing.y)))
     moved = {thing.instance for thing in things.values() if thing.moved_to is not None}
     told, true = dict.fromkeys(KINDS, 0), dict.fromkeys(KINDS, 0)
     was = majorities(before, truth)
@@ -59,13 +68,53 @@ def asked_row(
         of = owner_of if change.kind == "new" else was_of
         true[change.kind] += of[change.object_id] in moved
     return AskedRow(
-        name, len(classes), first, tuple(errors), tuple(told.values()), tuple(true.values())
+        name,
+        len(classes),
+        first,
+        tuple(errors),
+        tuple(told.values()),
+        tuple(true.values()),
+        building.score_goals(after, owner_of),
     )
+
+
+class Building:
+    """A generated building as it stands from run b on, and the camera of a profile in it."""
+
+    def __init__(
+        self, generator: ModuleType, world: str, profile: str, moved: float, seed: int
+    ) -> None:
+        self._world = generator.World(world)
+        chance = generator.np.random.default_rng(generator.crc(world, "moved", seed))
+        after = generator.moved(self._world, moved, chance) if moved else self._world.objects
+        self._world.objects = after
+        self._world.place()
+        self._camera = generator.Camera(generator.PROFILES[profile], self._world, after)
+        self._number = {f"{world}/{thing['id']}": n for n, thing in enumerate(after)}
+
+    def score_goals(
+        self, view: MapView, owner_of: Mapping[str, str | None]
+    ) -> tuple[int, int, int]:
+        """Goals, those on free ground, and those in view of the thing."""
+        ground = DrivenGround(view)
+        goals = free = seen = 0
+        for each in view.objects.values():
+            number = self._number.get(owner_of[each.object_id] or "")
+            if not each.confirmed or each.missing_in is not None or number is None:
+                continue
+            try:
+                goal = ground.goal(each)
+            except MisuseError:
+                continue
+            goals += 1
+            free += bool(self._world.clear[self._world.cell(goal.x, goal.y)] > 0.0)
+            seen += any(hit[0] == number for hit in self._camera.see(goal.x, goal.y, goal.yaw))
+        return goals, free, seen
 
 
 def asked_table(rows: Sequence[AskedRow]) -> str:
     """A line for each case, the one with the least share of classes found last; then all."""
-    heads = ["classes", "first", "share", "p50 m", *(f"{kind}" for kind in KINDS), "precise"]
+    heads = ["classes", "first", "share", "p50 m", *KINDS, "precise", "goals", "free", "in view"]
     lines = [_line("find and changes", heads)]
     ordered = sorted(rows, key=lambda row: -_share(row.first, row.classes))
     lines += [_line(row.name, _cells(row)) for row in ordered]
@@ -76,6 +125,7 @@ def asked_table(rows: Sequence[AskedRow]) -> str:
         tuple(error for row in rows for error in row.errors_m),
         tuple(map(sum, zip(*(row.told for row in rows), strict=True))),
         tuple(map(sum, zip(*(row.true for row in rows), strict=True))),
+        tuple(map(sum, zip(*(row.goals for row in rows), strict=True))),
     )
     return "\n".join([*lines, _line("all", _cells(whole))])
 
@@ -89,6 +139,8 @@ def _cells(row: AskedRow) -> list[str]:
         f"{errors[len(errors) // 2]:.2f}" if errors else "-",
         *(f"{true}/{told}" for true, told in zip(row.true, row.told, strict=True)),
         f"{_share(sum(row.true), sum(row.told)):.3f}" if sum(row.told) else "-",
+        str(row.goals[0]),
+        *(f"{_share(part, row.goals[0]):.3f}" for part in row.goals[1:]),
     ]
 
 

@@ -1,0 +1,196 @@
+"""The map of the databases as a `MapView`, so that it is asked as a map folded from a log is.
+
+It has what the graph has: all but embeddings, detections, corrections and what the log rejected.
+Places and Objects that were absorbed are not in the graph, so the rest is numbered anew, in the
+same order.
+"""
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from psycopg import sql
+
+from eventsrc.base.text import advised
+from eventsrc.envelope.model import KeyframeId, Offset, RunId, StatedCamera
+from projections.fold.deltas import (
+    KeyframeOrdinal,
+    MapGiven,
+    ObjectOrdinal,
+    ObservationOrdinal,
+    PlaceOrdinal,
+    Pose,
+    RunOrdinal,
+)
+from projections.fold.exact import UM_PER_M, metres_to_um
+from projections.fold.map_errors import ProjectionMismatch
+from projections.fold.settings import Settings
+from projections.map.records import (
+    EstimatedPosition,
+    KeyframeRecord,
+    ObjectRecord,
+    PlaceRecord,
+    Relocation,
+    RunRecord,
+)
+from projections.map.view import MapView
+from projections.postgres import checkpoints, map_table
+from projections.postgres.connection import Connection, describe_connection
+from projections.postgres.statements import statements, tables
+
+from .graph_reads import map_errors
+
+_UM2_PER_M2 = 1e12
+
+
+class LiveView(MapView):
+    """A map read from the graph's database. Its Objects have no observations: `sightings` gives
+    their keyframes."""
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings, keep_embeddings=False)
+        self.seen_in: dict[int, list[KeyframeRecord]] = {}
+
+    def sightings(self, found: ObjectRecord) -> list[KeyframeRecord]:
+        """The keyframes that saw an Object, one for each observation, in their order."""
+        return self.seen_in.get(found.ordinal, [])
+
+
+def read_view(connection: Connection) -> LiveView:
+    """The map as one transaction sees it; ``connection`` was set up by `prepare_graph`.
+
+    Raises ProjectionMissing, and ProjectionMismatch for the graph of an older mapfold.
+    """
+    with map_errors(connection.info.dsn), connection.transaction():
+        connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY")
+        for setting in ("enable_hashjoin", "enable_mergejoin"):  # it joins whole tables
+            connection.execute(sql.SQL("SET LOCAL {} = on").format(sql.Identifier(setting)))
+        kept = checkpoints.load(connection, "graph")
+        rows = {
+            name: connection.execute(statements("objects")[name].format(**tables())).fetchall()
+            for name in ("runs", "places", "edges", "objects", "keyframes", "sightings")
+        }
+        settings = Settings() if kept is None else Settings.model_validate_json(kept.settings)
+        view = LiveView(settings)
+        for floor, given in map_table.read_with_key(connection)[1].items():
+            view.maps[floor] = MapGiven(Offset(0), given)
+    if kept is not None:
+        view.advance(kept.next_offset)
+    try:
+        _fill(view, rows)
+    except KeyError as error:
+        raise ProjectionMismatch(
+            f"{describe_connection(connection)}: the graph there has no property {error}: an older"
+            f" mapfold made it; run `{advised('replay')}`, which makes it again"
+        ) from None
+    return view
+
+
+def _fill(view: LiveView, rows: dict[str, list[Any]]) -> None:
+    runs = _numbers(row[0] for row in rows["runs"])
+    for ordinal, (_, properties) in enumerate(rows["runs"]):
+        run = json.loads(properties)
+        view.runs.append(RunRecord(RunOrdinal(ordinal), RunId(run["run_id"]), run["started_at"]))
+    places = _numbers(row[0] for row in rows["places"])
+    for ordinal, (_, properties) in enumerate(rows["places"]):
+        place = _place(PlaceOrdinal(ordinal), json.loads(properties))
+        view.all_places.append(place)
+        view.places[place.ordinal] = place
+    for a, b, properties in rows["edges"]:
+        pair = PlaceOrdinal(places[a]), PlaceOrdinal(places[b])
+        view.adjacency[pair] = json.loads(properties)["shared_transitions"]
+    _fill_keyframes(view, rows["keyframes"], runs, places)
+    run_of = {run.run_id: run.ordinal for run in view.runs}
+    objects = _numbers(row[0] for row in rows["objects"])
+    for ordinal, (_, properties, place_id) in enumerate(rows["objects"]):
+        found = _object(ObjectOrdinal(ordinal), json.loads(properties), run_of)
+        found.place = None if place_id is None else PlaceOrdinal(places[place_id])
+        view.all_objects.append(found)
+        view.objects[found.ordinal] = found
+        view.contents.update(found)
+    keyframes = {row[0]: view.keyframes[number] for number, row in enumerate(rows["keyframes"])}
+    for thing, keyframe in rows["sightings"]:
+        view.seen_in.setdefault(objects[thing], []).append(keyframes[keyframe])
+
+
+def _numbers(graphids: Iterable[str]) -> dict[str, int]:
+    """The new number of each row."""
+    return {graphid: number for number, graphid in enumerate(graphids)}
+
+
+def _fill_keyframes(
+    view: LiveView, rows: list[Any], runs: dict[str, int], places: dict[str, int]
+) -> None:
+    """The keyframes, and what Places have of them: members, founder and floor."""
+    for ordinal, (_, run, properties, posed, place_id) in enumerate(rows):
+        known = json.loads(properties)
+        pose, floor = None, None
+        if posed is not None:
+            at = json.loads(posed)
+            pose = Pose(metres_to_um(at["map_x"]), metres_to_um(at["map_y"]), at["map_yaw"])
+            floor = at.get("floor")
+        keyframe = KeyframeRecord(
+            KeyframeOrdinal(ordinal),
+            Offset(known["offset"]),
+            RunOrdinal(runs[run]),
+            RunId(known["run_id"]),
+            KeyframeId(known["keyframe_id"]),
+            known["timestamp"],
+            pose,
+            view.survivors,
+            joined=None if place_id is None else PlaceOrdinal(places[place_id]),
+            floor=floor,
+            camera=StatedCamera(**known["camera"]) if "camera" in known else None,
+        )
+        view.keyframes.append(keyframe)
+        view.runs[keyframe.run].keyframe_count += 1
+        if floor is not None:
+            view.floors.setdefault(floor, len(view.floors))
+        if keyframe.joined is not None:
+            place = view.all_places[keyframe.joined]
+            if not place.unordered_members:
+                place.founder, place.founded_offset = keyframe.ordinal, keyframe.offset
+            place.unordered_members.append(keyframe.ordinal)
+
+
+def _place(ordinal: PlaceOrdinal, known: dict[str, Any]) -> PlaceRecord:
+    count = known["keyframe_count"]
+    return PlaceRecord(
+        ordinal,
+        known["place_id"],
+        KeyframeOrdinal(0),
+        Offset(0),
+        count,
+        round(known["centroid_x"] * count * UM_PER_M),
+        round(known["centroid_y"] * count * UM_PER_M),
+        known.get("name"),
+    )
+
+
+def _object(
+    ordinal: ObjectOrdinal, known: dict[str, Any], run_of: dict[RunId, RunOrdinal]
+) -> ObjectRecord:
+    count = known["obs_count"]
+    found = ObjectRecord(
+        ordinal,
+        known["object_id"],
+        known["class_name"],
+        count,
+        round(known["mean_x"] * count * UM_PER_M),
+        round(known["mean_y"] * count * UM_PER_M),
+        known["first_seen"],
+        known["last_seen"],
+        confirmed=known["confirmed"],
+    )
+    if "est_x" in known:
+        xx, xy, yy = (round(known[f"est_{each}"] * _UM2_PER_M2) for each in ("xx", "xy", "yy"))
+        at = metres_to_um(known["est_x"]), metres_to_um(known["est_y"])
+        found.estimate = EstimatedPosition(*at, xx, xy, yy, known["est_spots"])
+    if known.get("missing"):
+        found.missing_in = run_of[known["missing_in"]]
+    if "moved_at" in known:
+        before = metres_to_um(known["moved_from_x"]), metres_to_um(known["moved_from_y"])
+        now = metres_to_um(found.spot[0]), metres_to_um(found.spot[1])
+        moved = Relocation(Offset(known["moved_at"]), ObservationOrdinal(0), *before, *now)
+        found.relocations.append(moved)
+    return found

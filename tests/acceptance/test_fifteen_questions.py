@@ -1,0 +1,242 @@
+"""Fifteen questions of a map whose truth is known, each one command: the command, Python and, for
+the live map, HTTP give the same JSON, and it is right.
+
+A robot drives past a chair, a table, a plant and a tv; a day later the plant is gone, the chair
+stands elsewhere, and a bed is new.
+"""
+
+import json
+import math
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from eventsrc.envelope.commands import UseSettings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
+from projections.surfaces.python import Map, Timeline, fold
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from tests.support.commands import Commands
+from tests.support.logs import append_command, command, write_log
+from tests.support.serve_questions import DEADLINE_S, http_at
+from tests.unit.test_moved_things import ROOM, run
+from tests.unit.test_what_changed import LATER, SETTINGS
+
+DAY_S = 86400.0
+BETWEEN = "2026-03-25T00:00:00Z"
+"""After run a, before run b."""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    tomorrow = [{**each, "timestamp": each["timestamp"] + DAY_S} for each in run("b", LATER)]
+    folder = tmp_path_factory.mktemp("asked") / "log"
+    write_log(folder, [*run("a", ROOM), *tomorrow])
+    append_command(folder, command(UseSettings, settings={"fusion": "evidence"}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mapfold(log: Path) -> Commands:
+    return Commands.in_folder(log.parent)
+
+
+@pytest.fixture(scope="module")
+def house(log: Path) -> Map:
+    return fold(log)
+
+
+@pytest.fixture(scope="module")
+def http(log: Path, module_database: Targets) -> Iterator[str]:
+    rebuild(log, module_database, SETTINGS)
+    with Pools(module_database, 2) as pools, FairQueue(2) as queue:
+        answerer = Answerer(pools, per_second=1000.0)
+        with http_at(answerer, queue) as port:
+            yield f"http://127.0.0.1:{port}"
+
+
+def near(answer: Any, spot: tuple[float, float], most: float = 0.4) -> bool:
+    return math.dist((answer["x"], answer["y"]), spot) <= most
+
+
+def classes(document: Any) -> list[str]:
+    return [answer["class_name"] for answer in document["answers"]]
+
+
+Question = tuple[
+    str, tuple[str, ...], Callable[[Map], Any], str | None, Callable[[dict[str, Any]], bool]
+]
+QUESTIONS: list[Question] = [
+    (
+        "where is a chair?",
+        ("find", "chairs"),
+        lambda house: house.find("chairs"),
+        "/find?what=chairs",
+        lambda d: classes(d) == ["chair"] and near(d["answers"][0], LATER["chair"]),
+    ),
+    (
+        "what is in this room?",
+        ("find", "--in", "p0"),
+        lambda house: house.find(room="p0"),
+        "/find?in=p0",
+        lambda d: set(classes(d)) == {*ROOM, "bed"},
+    ),
+    (
+        "what is nearest to me?",
+        ("find", "--near", "6.0,1.5", "--top", "2"),
+        lambda house: house.find(near=(6.0, 1.5), top=2),
+        "/find?near=6.0,1.5&limit=2",
+        lambda d: classes(d) == ["tv", "chair"],
+    ),
+    (
+        "what is nearest by the way?",
+        ("find", "--from", "0,0", "--top", "1"),
+        lambda house: house.find(start=(0, 0), top=1),
+        "/find?from=0,0&limit=1",
+        lambda d: classes(d) == ["table"] and d["answers"][0]["way_m"] >= 2.0,
+    ),
+    (
+        "when was the plant last seen, and by whom?",
+        ("find", "plant"),
+        lambda house: house.find("plant"),
+        "/find?what=plant",
+        lambda d: d["answers"][0]["last_seen"]["run_id"] == "a",
+    ),
+    (
+        "what is missing?",
+        ("find", "--missing"),
+        lambda house: house.find(missing=True),
+        "/find?missing=true",
+        lambda d: classes(d) == ["plant"] and d["answers"][0]["missing_in"] == "b",
+    ),
+    (
+        "what has moved, and from where?",
+        ("find", "--moved"),
+        lambda house: house.find(moved=True),
+        "/find?moved=true",
+        lambda d: (
+            classes(d) == ["chair"]
+            and math.dist(d["answers"][0]["moved_from"], ROOM["chair"]) < 0.4
+        ),
+    ),
+    (
+        "what was seen today?",
+        ("find", "--seen-since", BETWEEN),
+        lambda house: house.find(seen_since=BETWEEN),
+        f"/find?seen_since={BETWEEN}",
+        lambda d: set(classes(d)) == {*LATER},
+    ),
+    (
+        "what was not?",
+        ("find", "--not-seen-since", BETWEEN),
+        lambda house: house.find(not_seen_since=BETWEEN),
+        f"/find?not_seen_since={BETWEEN}",
+        lambda d: classes(d) == ["plant"],
+    ),
+    (
+        "which tabel?",
+        ("find", "tabel"),
+        lambda house: house.find("tabel"),
+        "/find?what=tabel",
+        lambda d: d["match"] == "spelling" and near(d["answers"][0], ROOM["table"]),
+    ),
+    (
+        "what is this room?",
+        ("room", "p0"),
+        lambda house: house.room("p0"),
+        "/rooms/p0",
+        lambda d: {o["class_name"] for o in d["objects"]} == {*ROOM, "bed"},
+    ),
+    (
+        "how do I get to the tv?",
+        ("path", "0,0", "tv"),
+        lambda house: house.path((0, 0), "tv"),
+        "/path?from=0,0&to=tv",
+        lambda d: near(d["goal"], ROOM["tv"], 2.6) and 4.0 < d["length_m"] < 8.0,
+    ),
+    (
+        "where do I stand to see the bed?",
+        ("find", "bed", "--goal", "json"),
+        lambda house: house.goal("bed"),
+        None,
+        lambda d: d["ground"] == "seen" and near(d, LATER["bed"], 2.6),
+    ),
+    (
+        "where was the chair yesterday?",
+        ("find", "chair", "--at", "a:95", "--known-at", "end"),
+        lambda _: None,
+        None,
+        lambda d: near(d["answers"][0], ROOM["chair"]),
+    ),
+    (
+        "what changed since then?",
+        ("changes", "--since", "b"),
+        lambda _: None,
+        None,
+        lambda d: (
+            [(c["kind"], c["class_name"]) for c in d["changes"]]
+            == [("moved", "chair"), ("missing", "plant"), ("new", "bed")]
+        ),
+    ),
+]
+
+
+def test_there_are_fifteen() -> None:
+    assert len(QUESTIONS) == 15
+
+
+@pytest.mark.parametrize("question", QUESTIONS, ids=[question[0] for question in QUESTIONS])
+def test_each_is_answered_rightly_and_alike_everywhere(
+    question: Question, mapfold: Commands, house: Map, http: str, log: Path
+) -> None:
+    _, (name, *words), in_python, url, is_right = question
+    by_command = mapfold(name, log, *words, "--json").json
+    assert is_right(by_command)
+    if name == "changes":
+        with Timeline(log) as timeline:
+            by_python: Any = timeline.changes("b")
+    elif "--at" in words:
+        by_python = fold(log, at="a:95", known_at="end").find("chair")
+    else:
+        by_python = in_python(house)
+    assert json.loads(json.dumps(by_python.document())) == by_command
+    if url is not None:
+        with urllib.request.urlopen(http + url, timeout=DEADLINE_S) as answer:
+            by_http = json.loads(answer.read())
+        by_http.pop("next", None)
+        assert by_http == by_command
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("/find?what=xyzzy", "no class like 'xyzzy' in this map"),
+        ("/rooms/ballroom", "no place 'ballroom'"),
+        ("/objects/obj-000000", "no object 'obj-000000'"),
+        ("/path?from=0,0&to=nan,1", "no place or object 'nan,1'"),
+        ("/find?seen_since=yesterday", "'yesterday' is no time"),
+    ],
+)
+def test_what_the_map_does_not_have_is_refused_in_one_form(http: str, path: str, said: str) -> None:
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(http + path, timeout=DEADLINE_S)
+    error = json.loads(refused.value.read())["error"]
+    assert (refused.value.code, error["kind"]) == (404, "bad_question")
+    assert said in error["message"]
+
+
+def test_pages_follow_each_other(http: str, house: Map) -> None:
+    seen, cursor = list[str](), "0"
+    while cursor:
+        url = f"{http}/find?limit=2&all=true&cursor={cursor}"
+        with urllib.request.urlopen(url, timeout=DEADLINE_S) as answer:
+            page = json.loads(answer.read())
+        seen += [each["object_id"] for each in page["answers"]]
+        cursor = page.get("next", "")
+    assert seen == [each.object_id for each in house.find(every=True, top=1000).answers]
+    with urllib.request.urlopen(f"{http}/objects/{seen[0]}", timeout=DEADLINE_S) as answer:
+        assert json.loads(answer.read())["object_id"] == seen[0]
