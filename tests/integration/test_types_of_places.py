@@ -97,7 +97,7 @@ def test_room_finds_a_place_by_type_and_by_name(mapfold: Commands, log: Path) ->
     mapfold("edit", log, "name-place", SHED, "Anna's kitchen", "--reason", "so she says")
     assert room("Anna's kitchen")["place_id"] == SHED
     assert "'kitchen' means 2 places" in mapfold("room", log, "kitchen", code=2).err
-    assert room("toilets")["place_id"] == BATHROOM
+    assert room("wc")["place_id"] == BATHROOM
     said = mapfold("room", log, "office", code=2).err
     assert "no place 'office' under these settings; there are " in said
     said = mapfold("room", log, "bathrom", code=2).err
