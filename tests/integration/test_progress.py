@@ -97,6 +97,7 @@ PROVOKED = {
     "log spaces": ["L"],
     "room": ["L", "hall"],
     "path": ["L", "hall", "0,0"],
+    "align": ["L"],
 } | {f"edit {kind}": ["L", kind, *given, "--dry-run"] for kind, given in EDITS.items()}
 
 SLOW = {"simulate", "draw"}
