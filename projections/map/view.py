@@ -380,8 +380,7 @@ class MapView:
         }
 
     def embedded(self) -> NDArray[np.int64]:
-        """The observations that have a vector of the map's space, as ascending ordinals; none in a
-        view without embeddings."""
+        """The observations with a vector of the map's space, ascending; none without embeddings."""
         found = (o.ordinal for o in self.observations if o.embedding is not None)
         return np.fromiter(found, np.int64)
 
@@ -391,13 +390,10 @@ class MapView:
         return np.array(rows, np.int32)
 
     def _sums(self) -> tuple[int, int, int]:
-        """The numbers of keyframes with a pose, and of observations with an Object and with a
-        foreign embedding."""
-        return (
-            sum(k.pose is not None for k in self.keyframes),
-            sum(o.object is not None for o in self.observations),
-            sum(o.foreign_space for o in self.observations),
-        )
+        """Numbers of posed keyframes, of fused observations, and of those of foreign spaces."""
+        posed = sum(k.pose is not None for k in self.keyframes)
+        fused = sum(o.object is not None for o in self.observations)
+        return posed, fused, sum(o.foreign_space for o in self.observations)
 
     def without_camera(self) -> int:
         """The number of keyframes with observations whose envelopes do not state a camera."""

@@ -155,7 +155,7 @@ _WIDTHS_M = {
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class PlannedRoom:
     """A room and its inner extent."""
 
     name: str
@@ -163,7 +163,7 @@ class Room:
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class PlannedDoor:
     """A gap in the wall between two rooms. ``flat`` if the wall runs along x."""
 
     rooms: tuple[str, str]
@@ -177,15 +177,15 @@ class FloorPlan:
     """Rooms, doors and walls; the walls already have the doors cut out."""
 
     outline: Rect
-    rooms: tuple[Room, ...]
-    doors: tuple[Door, ...]
+    rooms: tuple[PlannedRoom, ...]
+    doors: tuple[PlannedDoor, ...]
     walls: tuple[Segment, ...]
 
     def room_at(self, x: float, y: float) -> str | None:
         """The name of the room around (x, y), None outside."""
         return next((room.name for room in self.rooms if room.rect.contains(x, y)), None)
 
-    def room(self, name: str) -> Room:
+    def room(self, name: str) -> PlannedRoom:
         """The room of this name."""
         return next(room for room in self.rooms if room.name == name)
 
@@ -206,7 +206,7 @@ def build_floor_plan(seed: int) -> FloorPlan:
     night = _row(
         _order(rng, NIGHT_ROOMS, shuffle=True), widths, length, *_band(levels, not day_first)
     )
-    hall = Room(HALL, Rect(0.0, levels[1], length, levels[2]))
+    hall = PlannedRoom(HALL, Rect(0.0, levels[1], length, levels[2]))
     doors = _doors(rng, day, night, levels[1:3], day_first=day_first)
     outline = Rect(0.0, 0.0, length, levels[3])
     return FloorPlan(
@@ -226,26 +226,26 @@ def _order(rng: np.random.Generator, names: tuple[str, ...], *, shuffle: bool) -
 
 def _row(
     names: list[str], widths: dict[str, float], length: float, y0: float, y1: float
-) -> tuple[Room, ...]:
+) -> tuple[PlannedRoom, ...]:
     """Rooms side by side, stretched so that together they are ``length`` long."""
     scale = length / sum(widths[name] for name in names)
-    rooms: list[Room] = []
+    rooms: list[PlannedRoom] = []
     x = 0.0
     for index, name in enumerate(names):
         end = length if index == len(names) - 1 else round(x + widths[name] * scale, 1)
-        rooms.append(Room(name, Rect(x, y0, end, y1)))
+        rooms.append(PlannedRoom(name, Rect(x, y0, end, y1)))
         x = end
     return tuple(rooms)
 
 
 def _doors(
     rng: np.random.Generator,
-    day: tuple[Room, ...],
-    night: tuple[Room, ...],
+    day: tuple[PlannedRoom, ...],
+    night: tuple[PlannedRoom, ...],
     hall_sides: tuple[float, ...],
     *,
     day_first: bool,
-) -> tuple[Door, ...]:
+) -> tuple[PlannedDoor, ...]:
     day_y, night_y = hall_sides if day_first else hall_sides[::-1]
     doors = [_hall_door(rng, room, night_y) for room in night]
     doors += [_hall_door(rng, room, day_y) for room in day if room.name != "dining room"]
@@ -254,22 +254,22 @@ def _doors(
         width = OPENING_M if wide else DOOR_M
         margin = 0.4 + width / 2
         y = round(uniform(rng, left.rect.y0 + margin, left.rect.y1 - margin), 1)
-        doors.append(Door((left.name, right.name), (left.rect.x1, y), width, flat=False))
+        doors.append(PlannedDoor((left.name, right.name), (left.rect.x1, y), width, flat=False))
     return tuple(doors)
 
 
-def _hall_door(rng: np.random.Generator, room: Room, y: float) -> Door:
+def _hall_door(rng: np.random.Generator, room: PlannedRoom, y: float) -> PlannedDoor:
     margin = 0.3 + DOOR_M / 2
     x = round(uniform(rng, room.rect.x0 + margin, room.rect.x1 - margin), 1)
-    return Door((room.name, HALL), (x, y), DOOR_M, flat=True)
+    return PlannedDoor((room.name, HALL), (x, y), DOOR_M, flat=True)
 
 
 def _walls(
     outline: Rect,
     levels: tuple[float, ...],
-    day: tuple[Room, ...],
-    night: tuple[Room, ...],
-    doors: tuple[Door, ...],
+    day: tuple[PlannedRoom, ...],
+    night: tuple[PlannedRoom, ...],
+    doors: tuple[PlannedDoor, ...],
 ) -> tuple[Segment, ...]:
     walls: list[Segment] = []
     for y in levels:

@@ -20,7 +20,7 @@ from eventsrc.base.errors import MapfoldError
 from eventsrc.envelope.occupancy_map import OCCUPIED, OccupancyMap
 
 from .drive import DriveGrid
-from .floorplan import Door, FloorPlan, Point, Rect, Room, Walls, build_floor_plan
+from .floorplan import FloorPlan, PlannedDoor, PlannedRoom, Point, Rect, Walls, build_floor_plan
 from .random_streams import stream, uniform
 
 
@@ -217,7 +217,7 @@ def _dining_set(plan: FloorPlan, rng: np.random.Generator) -> list[SimulatedThin
 
 def _against_a_wall(
     plan: FloorPlan,
-    room: Room,
+    room: PlannedRoom,
     model: Model,
     placed: list[SimulatedThing],
     rng: np.random.Generator,
@@ -246,20 +246,20 @@ def _spot(rect: Rect, model: Model, side: int, along: float) -> Rect:
     return Rect.around(x, y, model.width_m, model.depth_m)
 
 
-def _thing(model: Model, room: Room, spot: Rect, side: int) -> SimulatedThing:
+def _thing(model: Model, room: PlannedRoom, spot: Rect, side: int) -> SimulatedThing:
     """``side`` is the wall at its back; its front faces the other way."""
     quarter_turns = {0: 0.0, 1: 0.5, 2: 1.0, 3: -0.5}
     return SimulatedThing("", model, room.name, spot, quarter_turns[side] * np.pi)
 
 
-def _door_areas(plan: FloorPlan, room: Room) -> Iterator[Rect]:
+def _door_areas(plan: FloorPlan, room: PlannedRoom) -> Iterator[Rect]:
     """The floor around the room's doors, which stays free."""
     for door in plan.doors:
         if room.name in door.rooms:
             yield _door_area(door)
 
 
-def _door_area(door: Door) -> Rect:
+def _door_area(door: PlannedDoor) -> Rect:
     deep, wide = 2 * _DOOR_CLEAR_M, door.width_m
     return Rect.around(*door.centre, *((wide, deep) if door.flat else (deep, wide)))
 

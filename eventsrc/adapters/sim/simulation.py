@@ -31,7 +31,7 @@ from eventsrc.record.transport.session import Publisher, Session
 
 from .detector import HEIGHT_PX, HFOV_DEG, WIDTH_PX, detect, visible_objects
 from .drive import Stop, TruePose, drive, keyframes, nearest_by_route
-from .floorplan import HALL, OPENING_M, Point, Room, wrap
+from .floorplan import HALL, OPENING_M, PlannedRoom, Point, wrap
 from .house import House, build_house
 from .random_streams import bernoulli, normal, stream, uniform
 
@@ -115,7 +115,7 @@ def _revisit(house: House, run: str) -> tuple[Stop, ...]:
     return (Stop(stops[0].spot, look_around=True), *stops[1:])
 
 
-def _viewpoints(house: House, room: Room) -> list[Point]:
+def _viewpoints(house: House, room: PlannedRoom) -> list[Point]:
     """One spot with clearance near the middle; two in a long room."""
     rect = room.rect
     x, y = rect.centre
@@ -126,7 +126,7 @@ def _viewpoints(house: House, room: Room) -> list[Point]:
     return [house.grid.clearest(spot, rect, _SEARCH_M) for spot in wanted]
 
 
-def _moved_spot(house: House, room: Room, spot: Point, rng: np.random.Generator) -> Point:
+def _moved_spot(house: House, room: PlannedRoom, spot: Point, rng: np.random.Generator) -> Point:
     """A random free spot up to ``_MOVE_M`` from ``spot`` in x and y; ``spot`` if none is found."""
     for _ in range(50):
         x = round(spot[0] + uniform(rng, -_MOVE_M, _MOVE_M), 2)
