@@ -40,6 +40,7 @@ from projections.fold.deltas import (
 )
 from projections.fold.settings import Settings
 from projections.map.records import EstimatedPosition, ObjectRecord, Relocation
+from projections.map.view import MapView
 from projections.store.history import NEVER, NO_PLACE, History
 from projections.store.history_records import (
     Cause,
@@ -85,6 +86,9 @@ class MemoryHistory(History):
         self.keyframe_ordinals: dict[tuple[RunId, KeyframeId], KeyframeOrdinal] = {}
         self.place_ordinals: dict[str, PlaceOrdinal] = {}
         self.object_ordinals: dict[str, ObjectOrdinal] = {}
+        self._view = MapView(settings, keep_embeddings=False, corrections=corrections)
+        self._confirmed: dict[ObjectOrdinal, Offset] = {}
+        """The event that confirmed an object."""
 
     def apply(self, offset: Offset, deltas: Sequence[Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
@@ -106,6 +110,10 @@ class MemoryHistory(History):
                 links.append(self._places_linked(delta))
         for merge in merges:
             self._places_merged(merge, cause, moves, links)
+        self._view.apply_event(offset, deltas)
+        for each in self._view.all_objects:
+            if each.confirmed:
+                self._confirmed.setdefault(each.ordinal, offset)
 
     @cached_property
     def neighbours(self) -> Neighbours:
@@ -134,11 +142,14 @@ class MemoryHistory(History):
 
     def object_at(self, found: ObjectOrdinal, end: Offset) -> ObjectRecord:
         """What an object is after the events below ``end``."""
-        return object_of(self.objects[found], end)
+        record = object_of(self.objects[found], end)
+        record.confirmed = self._confirmed.get(found, end) < end
+        return record
 
     def objects_at(self, end: Offset) -> list[ObjectRecord]:
         """`object_at` of all objects found by the events below ``end``."""
-        return [object_of(each, end) for each in self.objects if each.found.offset < end]
+        found = [each.found for each in self.objects if each.found.offset < end]
+        return [self.object_at(each.object, end) for each in found]
 
     def _run_seen(self, delta: RunSeen, _: Cause) -> None:
         if delta.run == len(self.runs):

@@ -11,6 +11,7 @@ from projections.fold.deltas import (
     PlaceLink,
     PlacesMerged,
     Pose,
+    RunSeen,
 )
 from projections.fold.settings import Settings
 from projections.history.explanation import explain_place, explain_same_place
@@ -34,7 +35,7 @@ def keyframe(number: int) -> list[Delta]:
 def commanded() -> MemoryHistory:
     """Two places merged by an event without a keyframe."""
     history = MemoryHistory(Settings())
-    history.apply(0, keyframe(0))
+    history.apply(0, [RunSeen(0, 0, "run", 1.0), *keyframe(0)])
     history.apply(1, keyframe(1))
     merged = PlacesMerged(2, 0, (1,), 1, (PlaceLink(0, 1, 10**7),), 1, (1,))
     history.apply(2, [merged, PlaceChanged(2, 0, 2, 10**7, 0)])
