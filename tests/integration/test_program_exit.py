@@ -126,7 +126,7 @@ def _into_closed_pipe(mapfold: Commands, *args: str, stream: str = "stdout") -> 
 @pytest.mark.parametrize(
     ("args", "code"),
     [
-        (("state", "log"), 0),  # little: the command is done before anything is written
+        (("state", "log", "--digest"), 0),  # little: the command is done before anything is written
         (("--help",), EXIT_READER_GONE),
         (("log", "cat", "log", "--json"), EXIT_READER_GONE),
     ],
@@ -154,7 +154,7 @@ def test_an_import_completes_when_stderr_is_closed(mapfold: Commands) -> None:
 @pytest.mark.parametrize(
     "args",
     [
-        ("state", "log"),  # little: found out at the end
+        ("state", "log", "--digest"),  # little: found out at the end
         ("log", "cat", "log", "--json"),  # much: found out on the way
         pytest.param(("log", "info", "log", "--json"), marks=pytest.mark.slow),
         pytest.param(("--help",), marks=pytest.mark.slow),
