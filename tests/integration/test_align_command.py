@@ -95,3 +95,16 @@ def test_a_log_of_one_run_has_none_to_move(mapfold: Commands) -> None:
     log = log_of(mapfold, "log", lines("a", HERE))
     said = mapfold("align", log, code=2)
     assert "--run is missing: which run is to be moved? it has no other runs" in said.err
+
+
+@pytest.mark.slow
+def test_a_map_without_embeddings_has_nothing_to_compare(mapfold: Commands) -> None:
+    bare = []
+    for line in (lines("a", HERE) + lines("b", FRAME)).splitlines():
+        envelope = json.loads(line)
+        for seen in envelope["detections"]:
+            for field in ("embedding", "embedding_dim", "embedding_model"):
+                del seen[field]
+        bare.append(json.dumps(envelope) + "\n")
+    said = mapfold("align", log_of(mapfold, "log", *bare), code=1)
+    assert "sim-7-a: no object has both an embedding and a position" in said.err

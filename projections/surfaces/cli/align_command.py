@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from eventsrc.base.errors import MisuseError
+from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
@@ -139,8 +139,13 @@ def align(
         ) from None
     with frames.opened() as opened:
         frame, moved, target, runs = frames.maps(opened)
-    things = [things_of_map(each) for each in (frame, moved)]
-    found = None if None in things else align_things(*things)  # type: ignore[arg-type]
+    first, second = things_of_map(frame), things_of_map(moved)
+    if first is None or second is None:
+        bare = visible(target) if first is None else ", ".join(map(visible, runs))
+        raise MapfoldError(
+            f"{bare}: no object has both an embedding and a position, by which maps are compared"
+        )
+    found = align_things(first, second)
     title = f"{', '.join(map(visible, runs))} into the frame of {visible(target)}"
     if picture is not None and found is not None:
         from projections.adapters.drawing.align_picture import draw_alignment
