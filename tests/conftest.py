@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from eventsrc.base.text import shorten_by
 from tests.support.commands import Commands
 from tests.support.thorough import examples
 
@@ -58,6 +59,11 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
         gc.set_threshold(20_000, 20, 20)
         gc.enable()
+
+
+def pytest_runtest_setup() -> None:
+    """Leave ids whole: a command that an earlier test ran in this process has shortened them."""
+    shorten_by(None)
 
 
 def pytest_runtest_logfinish() -> None:

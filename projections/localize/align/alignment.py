@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 
 from .framed_things import FramedThings
 from .matching import Comparison, MatchedPairs, Transform, jacobians, moved, rotation
@@ -109,8 +109,8 @@ def align(first: FramedThings, second: FramedThings) -> Alignment | None:
     if spaces[0] != spaces[1]:
         named = " and ".join(f"{visible(str(name))} ({size})" for name, size in spaces)
         raise MisuseError(
-            f"the embeddings are of different spaces, {named}: `mapfold reembed` adds vectors of"
-            " another model to a log, and --space chooses them"
+            f"the embeddings are of different spaces, {named}: `{advised('reembed')}` adds vectors"
+            " of another model to a log, and --space chooses them"
         )
     both = Comparison(first, second)
     found = candidates(both)
