@@ -401,4 +401,4 @@ def test_state_has_names_and_commands_only_where_there_are_any(corridor: Open) -
     text = state_text(after, "", Offset(14))
     assert "commands 2 in force, of those before 14\n" in text
     assert "1 detection dropped" in text
-    assert text.splitlines()[-2].split()[:3] == ["run-a_p0", "kitchen", "8"]
+    assert text.splitlines()[-2].split()[:3] == ["p0", "kitchen", "8"]
