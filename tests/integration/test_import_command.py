@@ -181,7 +181,8 @@ def test_info_and_cat(run: Commands) -> None:
         (1, json.loads(PAYLOADS[1])),
         (2, json.loads(PAYLOADS[2])),
     ]
-    assert set(shown[0]) == {"offset", "logged_ns", "stamp_ns", "key", "payload"}
+    times = {"logged_ns", "logged", "stamp_ns", "stamp"}
+    assert set(shown[0]) == {"offset", "key", "payload"} | times
     assert len(run("log", "cat", "a", "--from", "3").out.splitlines()) == 2
     assert run("log", "cat", "a", "--key", "absent").out == ""
     assert "after" in run("log", "cat", "a", "--from", "3", "--to", "1", code=2).err

@@ -292,7 +292,7 @@ def changes(
         return
     display(changes_text(found, most=None if all_ else MOST_LINES))
     if found.unsure:
-        shows = visible(advised("diff", found.since, found.until))
+        shows = visible(advised("diff", past.log, found.since, found.until))
         say(f"+ {counted(found.unsure, 'change')} not sure; `{shows}` shows them")
 
 
