@@ -224,6 +224,7 @@ def _look_ratios(first: FramedThings, second: FramedThings) -> Floats:
     likeness = np.maximum((cosines - different) / (1.0 - different), 0.0)
     agree = first.classes[first.owners][:, None] == second.classes[second.owners][None]
     apart = first.sides[:, None] - second.sides[None]
+    cos, sin = np.cos(apart), np.sin(apart)
     counts = [np.bincount(each.owners) for each in (first, second)]
     number = counts[0][:, None] * counts[1][None]
     weights = np.minimum(np.sqrt(number), _MOST_LOOKS) / number
@@ -231,7 +232,8 @@ def _look_ratios(first: FramedThings, second: FramedThings) -> Floats:
     table, other_run = LookRatios(EvidenceConstants()), np.ones((1, 1), np.bool_)
     found = np.empty((TURNS, len(first.xy), len(second.xy)))
     for turn in range(TURNS):
-        sides = np.cos(apart - math.tau * turn / TURNS)
+        angle = math.tau * turn / TURNS
+        sides = cos * math.cos(angle) + sin * math.sin(angle)
         ratios = table.ratios(likeness, sides, other_run, agree)
         ratios = np.minimum(np.maximum(ratios, -_MOST_RATIO), _MOST_RATIO)
         sums = np.add.reduceat(np.add.reduceat(ratios, begins[0], 0), begins[1], 1)
