@@ -13,13 +13,13 @@ from tests.support.servers import NoDebianPackages, debian_server
 
 TESTS = Path(__file__).resolve().parents[1] / "integration"
 MODULES = (
+    "test_asked_maps.py",
     "test_candidates_follow_the_map.py",
     "test_database_commands.py",
     "test_db_check.py",
     "test_floors_in_databases.py",
     "test_maps_in_databases.py",
     "test_projections.py",
-    "test_query_command.py",
     "test_refold.py",
     "test_relocalize_databases.py",
     "test_replay_workers.py",
