@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import typer
 
@@ -20,7 +21,14 @@ from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, No
 from .options import Databases, JsonOption
 from .terminal import display, emit, say
 
-GoalForm = Literal["json", "yaml", "ros2"]
+
+class GoalForm(StrEnum):
+    """How a goal is printed."""
+
+    JSON = "json"
+    YAML = "yaml"
+    ROS2 = "ros2"
+
 
 GoalOption = Annotated[
     GoalForm | None,
@@ -241,10 +249,10 @@ _MOST_IN_ROOM: Final = 10
 
 
 def _print_goal(found: GoalPose, form: GoalForm) -> None:
-    if form == "json":
+    if form is GoalForm.JSON:
         emit(found.document())
     else:
-        display(found.pose_stamped() if form == "yaml" else found.topic_pub())
+        display(found.pose_stamped() if form is GoalForm.YAML else found.topic_pub())
 
 
 def _room_text(found: Room, most: int | None) -> str:

@@ -163,36 +163,39 @@ class Editor:
         raising."""
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
-        make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments))
+        maps: list[MapToEdit] = []
+        make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments), maps)
         if asked.kind not in NEEDS_NO_REASON and not asked.reason.strip() and not asked.dry_run:
             raise MisuseError("the reason is missing: say why, for later readers of the log")
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
         notes: list[str] = []
-        if asked.dry_run:
-            with PrefixReader(self._opened.log, go_on=go_on) as reader:
-                made = make_command(reader, make_, stamp, self._opened.settings, notes.append)
-                return self._document(through, asked, made, notes)
-        made = record_command(
-            self._opened.log, make_, stamp, self._opened.settings, self._open_session, notes.append
-        )
+        log, settings = self._opened.log, self._opened.settings
+        try:
+            if asked.dry_run:
+                with PrefixReader(log, go_on=go_on) as reader:
+                    made = make_command(reader, make_, stamp, settings, notes.append)
+                    return self._document(through, asked, made, notes)
+            made = record_command(log, make_, stamp, settings, self._open_session, notes.append)
+        except MisuseError as error:
+            if maps:  # ids are as short as the command prints them
+                error.args = (maps[-1].shortened(str(error)),)
+            raise
         effect = made.outcome.effect
         if effect is not None and made.offset == made.current.end:
             cache_effect(made.current, made.command, effect)
         return self._document(through, asked, made, notes)
 
-    def _checked(self, make_: MakeCommand) -> MakeCommand:
-        """``make_``, refusing a log other than the one that the page shows."""
+    def _checked(self, make_: MakeCommand, maps: list[MapToEdit]) -> MakeCommand:
+        """``make_``, refusing a log other than the one that the page shows; adds to ``maps`` those
+        that it is made from."""
 
         def checked(current: MapToEdit, stamp: Stamp) -> Command:
             if current.reader.log_id != self._log_id:
                 raise LogError(
                     f"there is another log at {self._opened.log} now; start mapfold ui again"
                 )
-            try:
-                return make_(current, stamp)
-            except MisuseError as error:
-                error.args = (current.shortened(str(error)),)  # as the command prints it
-                raise
+            maps.append(current)
+            return make_(current, stamp)
 
         return checked
 
