@@ -59,7 +59,7 @@ def check(programs: Path, folder: Path) -> None:
     mapfold("replay", SAMPLE, *ROOMS)
     mapfold("simulate", "--run", "b", "--out", "b.jsonl")
     (folder / "question.json").write_text((folder / "b.jsonl").read_text().splitlines()[36])
-    assert mapfold("relocalize", "question.json").startswith("sim-7-a_p0 (confidence")
+    assert mapfold("relocalize", "question.json").startswith("p0 (confidence")
     mapfold("import", "mine", "b.jsonl")
     mapfold("tail", SAMPLE, "--once", *ROOMS)
     mapfold("db", "check", SAMPLE, *ROOMS)
