@@ -24,7 +24,7 @@ HERE: Frame = (0.0, 0.0, 0.0)
 
 
 def in_frame(envelope: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    """An envelope whose pose is told in another frame."""
+    """The envelope with its pose in another map frame."""
     ((x, y),) = moved(np.array([[envelope["map_x"], envelope["map_y"]]]), frame).tolist()
     yaw = math.remainder(envelope["map_yaw"] + frame[2], math.tau)
     return envelope | {"map_x": x, "map_y": y, "map_yaw": yaw}

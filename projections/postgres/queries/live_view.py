@@ -1,7 +1,7 @@
 """The map of the databases as a `MapView`, so that it is asked as a map folded from a log is.
 
 It has what the graph has: all but embeddings, detections, corrections and what the log rejected.
-Places and Objects that were absorbed are not in the graph, so the rest is numbered anew, in the
+Places and Objects that were absorbed are not in the graph: the others get new ordinals, in the
 same order.
 """
 

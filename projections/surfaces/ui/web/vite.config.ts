@@ -4,7 +4,12 @@ import { type Plugin, defineConfig } from "vite";
 const NO_ANIMATION = new URL("src/map/no_animation.ts", import.meta.url).pathname;
 
 /** What uPlot offers at its end and the timeline does not use: a tenth of it. */
-const UNUSED = ["uPlot.join = join;", "(paths.bars    = bars);", "(paths.spline  = monotoneCubic);"];
+const UNUSED = [
+  "uPlot.join = join;", "(paths.bars    = bars);", "(paths.spline  = monotoneCubic);", "(paths.linear  = linear);",
+  "uPlot.fmtNum = fmtNum;", "uPlot.rangeNum = rangeNum;", "uPlot.rangeLog = rangeLog;", "uPlot.rangeAsinh = rangeAsinh;",
+  "uPlot.orient   = orient;", "uPlot.fmtDate = fmtDate;", "uPlot.tzDate  = tzDate;", "uPlot.sync = _sync;",
+  "uPlot.assign = assign;", "uPlot.addGap = addGap;", "uPlot.clipGaps = clipGaps;",
+];
 
 /** Leaves it out, and says so when another version of uPlot is written differently. */
 function withoutUnused(): Plugin {
@@ -29,7 +34,7 @@ function smaller(): Plugin {
     async generateBundle(_, bundle) {
       for (const each of Object.values(bundle)) {
         if (each.type !== "chunk") continue;
-        each.code = (await minify(each.code, { module: true, ecma: 2020, compress: { passes: 3 } })).code ?? each.code;
+        each.code = (await minify(each.code, { module: true, ecma: 2020, compress: { passes: 3, unsafe_arrows: true, unsafe_methods: true, keep_fargs: false } })).code ?? each.code;
       }
     },
   };

@@ -73,34 +73,32 @@ async function refused(response: Response): Promise<ApiError> {
 
 let unanswered = 0;
 
-/** Counts the questions whose answers the page has not taken in yet, as `data-unanswered` of the
- * document: at 0 what is shown is whole. */
-async function counted<T>(answer: Promise<T>): Promise<T> {
-  const count = (by: number) => (document.documentElement.dataset.unanswered = String((unanswered += by)));
+function count(by: number) {
+  document.documentElement.dataset.unanswered = String((unanswered += by));
+}
+
+/** Reads an answer. Questions whose answers the page has not taken in yet are counted as
+ * `data-unanswered` of the document: at 0 what is shown is whole. */
+async function answer<T>(as: "json" | "arrayBuffer", path: string, init: RequestInit): Promise<T> {
   count(1);
   try {
-    return await answer;
+    return (await (await ask(path, init))[as]()) as T;
   } finally {
-    setTimeout(() => count(-1)); // whoever awaits the answer goes first
+    setTimeout(count, 0, -1); // whoever awaits the answer goes first
   }
 }
 
-export function getJson<T>(path: string, signal?: AbortSignal): Promise<T> {
-  return counted(ask(path, { signal: signal ?? null }).then((got) => got.json() as Promise<T>));
+export function getJson<T>(path: string, signal: AbortSignal | null = null): Promise<T> {
+  return answer("json", path, { signal });
 }
 
-export function getBinary(path: string, signal?: AbortSignal): Promise<ArrayBuffer> {
-  return counted(ask(path, { signal: signal ?? null }).then((got) => got.arrayBuffer()));
+export function getBinary(path: string, signal: AbortSignal | null = null): Promise<ArrayBuffer> {
+  return answer("arrayBuffer", path, { signal });
 }
 
-export function postJson<T>(path: string, body: unknown, signal?: AbortSignal): Promise<T> {
-  const init = {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify(body),
-    signal: signal ?? null,
-  };
-  return counted(ask(path, init).then((got) => got.json() as Promise<T>));
+export function postJson<T>(path: string, body: unknown, signal: AbortSignal | null = null): Promise<T> {
+  const headers = { "Content-Type": "application/json" };
+  return answer("json", path, { method: "POST", headers, body: JSON.stringify(body), signal });
 }
 
 /** Server-sent events, one after the other until the server ends or is silent for long, which it

@@ -77,7 +77,10 @@ export function ringsOf(geometry: Geometry, [ox, oy]: readonly [number, number])
 
 /** `floors` is the free floor of places that have one. */
 export function regionsOf(history: History, map: MapState, grid: Grid, floors: ReadonlyMap<number, Float32Array[]>): Regions {
-  const known = map.places.flatMap((place) => (floors.has(place) ? { place, loops: floors.get(place) as Float32Array[] } : []));
+  const known = map.places.flatMap((place) => {
+    const loops = floors.get(place);
+    return loops ? { place, loops } : [];
+  });
   const near = known.length === map.places.length ? null : nearRegions(history, map, grid);
   return {
     regions: [...known, ...(near?.regions ?? []).filter(({ place }) => !floors.has(place))],
@@ -94,11 +97,10 @@ export function regionsOf(history: History, map: MapState, grid: Grid, floors: R
 function isInside(loops: Float32Array[], x: number, y: number): boolean {
   let inside = false;
   for (const loop of loops) {
-    let [x0, y0] = loop.subarray(-2);
     for (let i = 0; i < loop.length; i += 2) {
-      const [x1, y1] = [loop[i], loop[i + 1]];
+      const [x0, y0] = loop.subarray(i - 2); // of the first point the last one
+      const [x1, y1] = loop.subarray(i);
       if (y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0)) inside = !inside;
-      [x0, y0] = [x1, y1];
     }
   }
   return inside;

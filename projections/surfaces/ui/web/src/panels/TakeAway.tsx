@@ -78,7 +78,7 @@ function savePng(): Promise<void> {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
   return new Promise((resolve) => {
     canvas?.toBlob((blob) => {
-      if (blob === null) showNotice("The browser makes no picture of a map of this size; make the window smaller, or take the SVG.");
+      if (blob === null) showNotice("Too large for a PNG; take the SVG.");
       else save(blob, "png");
       resolve();
     }, "image/png");
@@ -112,7 +112,7 @@ export function copyCommand(): Promise<void> {
   const shown = store.stateCommand.value;
   const state = shown?.at === store.at.value ? shown.command : null;
   if (answer === undefined && state === null) {
-    showNotice("The server has not sent the command of this moment yet; try again.");
+    showNotice("The command of this moment is not here yet; try again.");
     return Promise.resolve();
   }
   return copy(answer ?? state ?? "", "the command line");

@@ -77,7 +77,7 @@ function Banner() {
   if (problems.length === 0 && !lost && refused === null) return null;
   return (
     <div class="banner" role="alert">
-      {lost && <p>The server does not answer. The map stays as it was; why, compare and find need the server. Is mapfold ui still running?</p>}
+      {lost && <p>The server does not answer. The map stays as it was. Is mapfold ui still running?</p>}
       {refused !== null && <p>{refused}</p>}
       {problems.map((problem) => (
         <p key={problem}>{problem}</p>
