@@ -10,16 +10,19 @@ import math
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from eventsrc.envelope.commands import UseSettings
+from projections.fold.map_errors import ProjectionMismatch
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.python import Map, Timeline, fold
 from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.asked import ChangesQuery, NotInMapError, ServedLog
 from tests.support.commands import Commands
 from tests.support.logs import append_command, command, write_log
 from tests.support.serve_questions import DEADLINE_S, http_at
@@ -53,8 +56,9 @@ def house(log: Path) -> Map:
 @pytest.fixture(scope="module")
 def http(log: Path, module_database: Targets) -> Iterator[str]:
     rebuild(log, module_database, SETTINGS)
-    with Pools(module_database, 2) as pools, FairQueue(2) as queue:
-        answerer = Answerer(pools, per_second=1000.0)
+    with Pools(module_database, 2) as pools, FairQueue(2) as queue, ExitStack() as stack:
+        beside = stack.enter_context(closing(ServedLog(log)))
+        answerer = Answerer(pools, per_second=1000.0, log=beside)
         with http_at(answerer, queue) as port:
             yield f"http://127.0.0.1:{port}"
 
@@ -176,7 +180,7 @@ QUESTIONS: list[Question] = [
         "what changed since then?",
         ("changes", "--since", "b"),
         lambda _: None,
-        None,
+        "/changes?since=b",
         lambda d: (
             [(c["kind"], c["class_name"]) for c in d["changes"]]
             == [("moved", "chair"), ("missing", "plant"), ("new", "bed")]
@@ -219,6 +223,8 @@ def test_each_is_answered_rightly_and_alike_everywhere(
         ("/objects/obj-000000", "no object 'obj-000000'"),
         ("/path?from=0,0&to=nan,1", "no place or object 'nan,1'"),
         ("/find?seen_since=yesterday", "'yesterday' is no time"),
+        ("/changes?since=yesterday", "no run 'yesterday'"),
+        ("/changes?until=999", "999"),
     ],
 )
 def test_what_the_map_does_not_have_is_refused_in_one_form(http: str, path: str, said: str) -> None:
@@ -227,6 +233,35 @@ def test_what_the_map_does_not_have_is_refused_in_one_form(http: str, path: str,
     error = json.loads(refused.value.read())["error"]
     assert (refused.value.code, error["kind"]) == (404, "bad_question")
     assert said in error["message"]
+
+
+def test_changes_come_in_pages(http: str) -> None:
+    pages, cursor = list[Any](), "0"
+    while cursor:
+        url = f"{http}/changes?since=b&limit=2&cursor={cursor}"
+        with urllib.request.urlopen(url, timeout=DEADLINE_S) as answer:
+            pages.append(json.loads(answer.read()))
+        cursor = pages[-1].get("next", "")
+    assert [[c["class_name"] for c in page["changes"]] for page in pages] == [
+        ["chair", "plant"],
+        ["bed"],
+    ]
+    assert {page["counts"]["moved"] for page in pages} == {1}
+
+
+def test_without_the_log_the_databases_do_not_know_what_changed(
+    http: str, module_database: Targets, tmp_path: Path
+) -> None:
+    with Pools(module_database, 1) as pools:
+        with pytest.raises(NotInMapError, match="start the service with --log LOG"):
+            Answerer(pools, per_second=1000.0).changes(ChangesQuery())
+        other = write_log(tmp_path / "other", run("a", ROOM))
+        with closing(ServedLog(other)) as beside:
+            with pytest.raises(ProjectionMismatch, match="give that log"):
+                beside.refuse_other(pools.view())
+            strange = Answerer(pools, per_second=1000.0, log=beside)
+            with pytest.raises(ProjectionMismatch, match="give that log"):
+                strange.changes(ChangesQuery())
 
 
 def test_pages_follow_each_other(http: str, house: Map) -> None:

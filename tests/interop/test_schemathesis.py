@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "0123456789abcdef-not-a-secret"
 PROGRAM = Path(sys.executable).with_name("schemathesis")
-OPERATIONS = 8
+OPERATIONS = 9
 ARGS = ("--no-zenoh", "--http", "127.0.0.1:0", "--rate", "100000")
 
 

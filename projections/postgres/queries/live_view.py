@@ -44,11 +44,12 @@ _UM2_PER_M2 = 1e12
 
 
 class LiveView(MapView):
-    """A map read from the graph's database. Its Objects have no observations: `sightings` gives
-    their keyframes."""
+    """A map read from the graph's database, made from the log ``log_id``. Its Objects have no
+    observations: `sightings` gives their keyframes."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings, keep_embeddings=False)
+        self.log_id: str | None = None
         self.seen_in: dict[int, list[KeyframeRecord]] = {}
 
     def sightings(self, found: ObjectRecord) -> list[KeyframeRecord]:
@@ -75,6 +76,7 @@ def read_view(connection: Connection) -> LiveView:
         for floor, given in map_table.read_with_key(connection)[1].items():
             view.maps[floor] = MapGiven(Offset(0), given)
     if kept is not None:
+        view.log_id = kept.log_id
         view.advance(kept.next_offset)
     try:
         _fill(view, rows)

@@ -19,6 +19,7 @@ from eventsrc.base.errors import MisuseError, TransportError
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
+from projections.surfaces.serve.asked import ServedLog
 
 from .options import CameraOptions, Databases, ZenohPeer
 from .signals import stop_on_signals
@@ -181,6 +182,14 @@ def serve(
             "--max-bytes", metavar="BYTES", min=1000, help="Longer questions are refused."
         ),
     ] = DEFAULT_MAX_BYTES,
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log",
+            metavar="LOG",
+            help="The log that the databases were made from; HTTP's /changes needs it.",
+        ),
+    ] = None,
     camera: CameraOptions,
     databases: Databases,
 ) -> None:
@@ -204,7 +213,18 @@ def serve(
         stop = stack.enter_context(stop_on_signals())
         targets = stack.enter_context(databases.opened())
         pools = stack.enter_context(Pools(targets, workers, lambda what: say(f"mapfold: {what}")))
-        answerer = Answerer(pools, per_second=rate, max_bytes=max_bytes, camera=asked_by, note=say)
+        beside = None
+        if log is not None:
+            beside = stack.enter_context(closing(ServedLog(log, say)))
+            beside.refuse_other(pools.view())
+        answerer = Answerer(
+            pools,
+            per_second=rate,
+            max_bytes=max_bytes,
+            camera=asked_by,
+            log=beside,
+            note=say,
+        )
         session = None
         if zenoh:
             patient = endpoint is not None

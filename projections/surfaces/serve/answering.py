@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple, cast, get_args
 
-from eventsrc.base.errors import MapfoldError
+from eventsrc.base.errors import LogError, MapfoldError
 from projections.fold.map_errors import (
     DatabaseError,
     DatabaseUnavailable,
+    FoldError,
     ProjectionMismatch,
     ProjectionMissing,
     QuestionError,
@@ -35,8 +36,9 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.question import Movement
 from projections.localize.relocalize.track import Track, movement_of
+from projections.postgres.queries.live_view import LiveView
 
-from .asked import MapQuestion, NotInMapError, asked
+from .asked import NO_LOG, ChangesQuery, MapQuestion, NotInMapError, ServedLog, asked
 from .pools import Pools
 from .states import refuse_unknown, state_read
 
@@ -172,7 +174,12 @@ _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (NotInMapError, "bad_question", 404, None),
     (QuestionError, "bad_question", 400, None),
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
-    (ProjectionMismatch, "database", 503, "graph and vectors are not of one map"),
+    (
+        ProjectionMismatch,
+        "database",
+        503,
+        "what is served is not of one map; see its stderr",
+    ),
     (DatabaseUnavailable, "database", 503, "the database does not answer; ask again later"),
     (DatabaseError, "database", 503, "the database cannot be queried; see the service's stderr"),
     (MapfoldError, "failed", 500, "failed; see the service's stderr"),
@@ -184,7 +191,8 @@ databases and paths go only to the service's stderr (`Answerer`)."""
 class Answerer:
     """Answers questions from the live databases; safe to use from many threads.
 
-    ``note`` gets a line for people when a question fails because of the database.
+    ``note`` gets a line for people when a question fails because of the database. Without a ``log``
+    beside them, `changes` is refused.
     """
 
     def __init__(
@@ -194,11 +202,12 @@ class Answerer:
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
         camera: CameraConstants | None = None,
+        log: ServedLog | None = None,
         note: Callable[[str], None] = lambda _: None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._pools, self._bucket, self._camera = pools, TokenBucket(per_second, now), camera
-        self._note = RepeatFilter(note)
+        self._log, self._note = log, RepeatFilter(note)
         self._now, self._checking = now, threading.Lock()
         self._checked_s = -math.inf
         self._unhealthy: DatabaseError | None = None
@@ -244,10 +253,24 @@ class Answerer:
 
     def ask(self, question: MapQuestion) -> dict[str, Any]:
         """The answer to a question of the map. Raises NotInMapError."""
+        return asked(question, self._view())
+
+    def changes(self, query: ChangesQuery) -> dict[str, Any]:
+        """A page of what changed in the building. Raises NotInMapError."""
+        if self._log is None:
+            raise NotInMapError(NO_LOG)
+        view = self._view()
+        with self._reporting_errors():
+            try:
+                return self._log.changes(view, query)
+            except (FoldError, LogError) as error:
+                self._note(f"mapfold: {error}")
+                raise
+
+    def _view(self) -> LiveView:
         with self._reporting_errors():
             self._bucket.take_token()
-            view = self._pools.view()
-        return asked(question, view)
+            return self._pools.view()
 
     @property
     def session_count(self) -> int:

@@ -2,28 +2,34 @@
 model of `projections.ask`.
 
 The map is read from the databases whole and kept until their checkpoint moves, so a question of a
-map that does not change reads one row.
+map that does not change reads one row. They have that one map: what changed since another moment
+is asked of the log (`ServedLog`).
 """
 
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NotRequired
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import advised
 from projections.ask.driven_ground import CLEARANCE_M
-from projections.ask.find import FoundObject, Wanted, answer_of, find, robot_seconds
+from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find, robot_seconds
 from projections.ask.room_and_path import path, room
+from projections.ask.what_changed import ChangeKind
 from projections.fold.deltas import ObjectOrdinal
-from projections.fold.map_errors import QuestionError
+from projections.fold.map_errors import LogPointError, ProjectionMismatch, QuestionError
+from projections.fold.settings import Settings
+from projections.history import LogTimeline
 from projections.localize.relocalize import describe_value
 from projections.map.naming import thing_called, things_of
 from projections.map.view import MapView
 from projections.postgres import checkpoints
 from projections.postgres.connection import Connection
-from projections.postgres.queries.live_view import read_view
+from projections.postgres.queries.live_view import LiveView, read_view
 
 from .states import CURSOR, MAX_PAGE
 
@@ -43,9 +49,9 @@ class MapMemory:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._kept: tuple[object, MapView] | None = None
+        self._kept: tuple[object, LiveView] | None = None
 
-    def view(self, connection: Connection) -> MapView:
+    def view(self, connection: Connection) -> LiveView:
         """The map; ``connection`` was set up by `prepare_graph`. Not to be changed."""
         at = checkpoints.load(connection, "graph")
         with self._lock:
@@ -118,6 +124,70 @@ class FindQuery(BaseModel):
 FIND_NAMES: Final = tuple(field.alias or name for name, field in FindQuery.model_fields.items())
 
 
+class ChangesQuery(BaseModel):
+    """Parameters of `changes`, with the names of the command's options."""
+
+    since: _Text | None = Field(
+        None, description="A point, day or run from its start; of the last run if not given."
+    )
+    until: _Text | None = Field(
+        None, description="A point, day or run to its end; the map of the databases if not given."
+    )
+    limit: Annotated[int, Field(ge=1, le=MAX_PAGE)] = Field(100, description="Most changes.")
+    cursor: Annotated[str, Field(pattern=CURSOR)] = Field(
+        "0", description="`next` of the page before."
+    )
+
+
+class ServedLog:
+    """The log beside the databases, for questions of several moments; for any thread. Past maps are
+    folded with the settings of the databases' map, and their history is kept beside the log."""
+
+    def __init__(self, log: Path, note: Callable[[str], None] = lambda _: None) -> None:
+        self._lock, self._settings = threading.Lock(), Settings()
+        self._timeline = LogTimeline(log, lambda _: self._settings, note=note, histories=1)
+
+    def close(self) -> None:
+        """Close the log."""
+        with self._lock:
+            self._timeline.reader.close()
+
+    def refuse_other(self, view: LiveView) -> None:
+        """Raise ProjectionMismatch unless the databases' map was made from this log."""
+        reader = self._timeline.reader
+        if view.log_id != reader.log_id:
+            raise ProjectionMismatch(
+                f"--log {reader.path} is log {reader.log_id}, but the databases were made from"
+                f" {view.log_id}; give that log, or run `{advised('replay', reader.path)}`"
+            )
+
+    def changes(self, view: LiveView, asked: ChangesQuery) -> dict[str, Any]:
+        """A page of what changed. Raises NotInMapError, and ProjectionMismatch."""
+        with self._lock:
+            self.refuse_other(view)
+            self._settings = view.settings
+            self._timeline.refresh()
+            try:
+                end, start = view.next_offset, None
+                if asked.until is not None:
+                    end = self._timeline.moment(asked.until, is_end=True)
+                if asked.since is not None:
+                    start = self._timeline.moment(asked.since, is_end=False)
+                found = self._timeline.changes(start, end)
+            except (MisuseError, LogPointError) as error:
+                raise NotInMapError(str(error)) from None
+        first, until = int(asked.cursor), int(asked.cursor) + asked.limit
+        more = {"next": str(until)} if len(found.changes) > until else {}
+        document = found.document()
+        return {**document, "changes": document["changes"][first:until], **more}
+
+
+NO_LOG: Final = (
+    "the databases have one map, and only the log knows what changed since another; start the"
+    " service with --log LOG, or run `mapfold changes LOG`"
+)
+
+
 def room_question(name: str) -> MapQuestion:
     """What a Place is and holds."""
     return lambda view: room(view, name).document()
@@ -143,6 +213,41 @@ def _seconds(time: str | None) -> float | None:
     return None if time is None else robot_seconds(time)
 
 
+_Place = Annotated[str | None, Field(description="Where it is, or, missing, was.")]
+_Spot = Annotated[tuple[float, float] | None, Field(description="Metres in the map's frame.")]
+ChangeShape = TypedDict(
+    "ChangeShape",
+    {
+        "kind": ChangeKind,
+        "object_id": str,
+        "class_name": str,
+        "place_id": _Place,
+        "place_name": _Place,
+        "place_type": _Place,
+        "from": _Spot,
+        "to": _Spot,
+        "moved_m": float | None,
+        "error_m": float | None,
+        "obs_count": int,
+        "seen": SeenAt,
+        "sentence": str,
+    },
+)
+"""What became of an Object."""
+
+
+class ChangesPageShape(TypedDict):
+    """What changed for sure between the maps after ``since`` and ``until`` events, the largest
+    first; ``next`` is there when more come."""
+
+    since: Annotated[int, Field(ge=0)]
+    until: Annotated[int, Field(ge=0)]
+    counts: dict[ChangeKind, int]
+    unsure: Annotated[int, Field(ge=0, description="Changes that are not sure.")]
+    changes: list[ChangeShape]
+    next: NotRequired[Annotated[str, Field(description="The cursor of the next page.")]]
+
+
 class FoundPageShape(TypedDict):
     """Objects that answer a question, best first; ``next`` is there when more come."""
 
@@ -154,4 +259,5 @@ class FoundPageShape(TypedDict):
     next: NotRequired[Annotated[str, Field(description="The cursor of the next page.")]]
 
 
-FoundPageShape.__name__ = FoundPageShape.__qualname__ = "FoundPage"
+for _shape in (ChangeShape, ChangesPageShape, FoundPageShape):
+    _shape.__name__ = _shape.__qualname__ = _shape.__name__.removesuffix("Shape")

@@ -31,6 +31,8 @@ from .answering import MAX_NAME, MAX_TOP, OPTIONS, Answerer, TooMuchError, encod
 from .asked import (
     FIND_NAMES,
     MOST_TEXT,
+    ChangesPageShape,
+    ChangesQuery,
     FindQuery,
     FoundPageShape,
     object_question,
@@ -48,7 +50,8 @@ _DRAIN_FACTOR: Final = 8
 _NAME: Final = Path(min_length=1, max_length=MOST_TEXT)
 _END: Final = "X,Y in metres, a Place or an Object; the way to an Object ends at its goal."
 _RETRY_AFTER: Final = {"Retry-After": "1"}
-_ABOUT: Final = """Answers come from the map as it is in the databases when they are asked.
+_ABOUT: Final = """Answers come from the map as it is in the databases when they are asked; what
+changed since another moment, from the log beside them.
 
 Every refusal is `{"error": {"kind", "message"}}`. HEAD is answered like GET, without the body. A
 parameter that a path does not have, that is empty or that is given twice is refused with 400,
@@ -186,6 +189,16 @@ def create_app(
     ) -> Response:
         question = path_question(start, end, clearance)
         return await answered(request, "path", lambda: answerer.ask(question))
+
+    @app.get(
+        "/changes",
+        summary="What changed in the building between two moments, by pages; needs --log",
+        response_model=ChangesPageShape,
+        responses=refusals(asking=True),
+        dependencies=[only(*ChangesQuery.model_fields)],
+    )
+    async def changes(request: Request, wanted: Annotated[ChangesQuery, Query()]) -> Response:
+        return await answered(request, "changes", lambda: answerer.changes(wanted))
 
     @app.get(
         "/health",

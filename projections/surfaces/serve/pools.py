@@ -16,7 +16,6 @@ from psycopg_pool import ConnectionPool, PoolTimeout
 from eventsrc.base.text import advised
 from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import MapCandidates, QuestionCrop
-from projections.map.view import MapView
 from projections.postgres import checkpoints
 from projections.postgres.connection import (
     Connection,
@@ -33,6 +32,7 @@ from projections.postgres.queries.candidate_search import (
     prepare_graph,
     prepare_vectors,
 )
+from projections.postgres.queries.live_view import LiveView
 
 from .asked import MapMemory
 
@@ -138,7 +138,7 @@ class Pools:
 
         return self._ask(once)
 
-    def view(self) -> MapView:
+    def view(self) -> LiveView:
         """The map of the graph's database, not to be changed."""
         return self.on_graph(self._map.view)
 
