@@ -32,6 +32,8 @@ def before_call(
         case.path_parameters["name"] = OBJECT
     if case.operation.path == "/path":
         case.query |= {"from": "bath", "to": OBJECT}
+    if case.operation.path == "/changes":
+        case.query |= {"since": "0", "until": "end"}
 
 
 def _fit(question: Any) -> None:

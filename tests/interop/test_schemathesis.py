@@ -12,7 +12,7 @@ import pytest
 
 from projections.postgres.connection import Targets
 from tests.support.http_attacks import served
-from tests.support.services import MODEL
+from tests.support.services import MODEL, build
 
 pytestmark = pytest.mark.slow
 
@@ -49,16 +49,23 @@ def found(port: int, folder: Path, *options: str) -> str:
     return done.stdout
 
 
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Path:
+    return build(tmp_path_factory.mktemp("described"), module_database)
+
+
 @pytest.mark.timeout(900)
-def test_all_checks_of_all_phases(described_map: Targets, tmp_path: Path) -> None:
-    with served(*ARGS, "--db", described_map.graph_url) as service:
+def test_all_checks_of_all_phases(log: Path, module_database: Targets, tmp_path: Path) -> None:
+    with served(*ARGS, "--log", str(log), "--db", module_database.graph_url) as service:
         said = found(service.port, tmp_path, "--seed", "1", "-n", "150")
     for phase in ("Examples", "Coverage", "Fuzzing"):
         assert f"✅ {phase}" in said
 
 
 @pytest.mark.timeout(900)
-def test_with_a_token(described_map: Targets, tmp_path: Path) -> None:
-    with served(*ARGS, "--db", described_map.graph_url, MAPFOLD_TOKEN=TOKEN) as service:
+def test_with_a_token(log: Path, module_database: Targets, tmp_path: Path) -> None:
+    with served(
+        *ARGS, "--log", str(log), "--db", module_database.graph_url, MAPFOLD_TOKEN=TOKEN
+    ) as service:
         bearer = f"Authorization: Bearer {TOKEN}"
         found(service.port, tmp_path, "--seed", "3", "-n", "20", "-H", bearer)
