@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.envelope.commands import InvalidCommand, Reembed, encode_command, parse_command
-from eventsrc.envelope.crops import CROP_SCHEMA, Crop, InvalidCrop, decode_crop
+from eventsrc.envelope.crops import CROP_SCHEMA, CROPS_TOPIC, Crop, InvalidCrop, decode_crop
 from eventsrc.envelope.embeddings import InvalidEmbeddings, NewVectors, decode_embeddings, is_usable
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
@@ -27,7 +27,6 @@ from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAX_REEMBEDDED
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 
-DEFAULT_TOPIC: Final = "tb/crops"
 DEFAULT_BATCH: Final = 64
 _MOST_VALUES: Final = 1_000_000
 """Bound of the numbers in the vectors of one event."""
@@ -94,7 +93,7 @@ def reembed(
     log: Path,
     encoder: CropEncoder,
     *,
-    topics: Collection[str] = (DEFAULT_TOPIC,),
+    topics: Collection[str] = (CROPS_TOPIC,),
     batch: int = DEFAULT_BATCH,
     issued_by: str,
     reason: str = "",

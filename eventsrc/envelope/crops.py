@@ -14,6 +14,8 @@ from eventsrc.base.text import visible
 from .cdr import CdrFault, CdrFields
 from .model import MAX_ID_LENGTH, DetId
 
+CROPS_TOPIC: Final = "tb/crops"
+"""The topic of crops, unless another is chosen."""
 CROP_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 CROP_ENCODING: Final = "cdr"
 CROP_SCHEMA_ENCODING: Final = "ros2msg"

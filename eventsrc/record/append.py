@@ -10,11 +10,17 @@ which has the same cells in a hundredth of the bytes.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
 from eventsrc.envelope.cdr import is_cdr
+from eventsrc.envelope.crops import (
+    CROP_ENCODING,
+    CROP_SCHEMA,
+    CROP_SCHEMA_ENCODING,
+    CROP_SCHEMA_TEXT,
+)
 from eventsrc.envelope.forms import PendingEvent, check_envelopes, detect_version
 from eventsrc.envelope.grid_messages import (
     NO_GRID,
@@ -31,9 +37,14 @@ from eventsrc.envelope.ingest import (
 from eventsrc.envelope.model import Offset, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
-from eventsrc.log import LogWriter, NewEvent
+from eventsrc.log import LogWriter, MessageFormat, NewEvent
 
 from .transport.config import key_fault
+
+CROP_FORMAT: Final = MessageFormat(
+    CROP_ENCODING, CROP_SCHEMA, CROP_SCHEMA_ENCODING, CROP_SCHEMA_TEXT
+)
+"""The format of crops of detections in a log."""
 
 
 class NewMap(NamedTuple):

@@ -9,11 +9,13 @@ make equal envelopes.
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
+
+from eventsrc.envelope.crops import Crop
 
 from .messages import (
     CAMERA_INFO,
@@ -32,6 +34,7 @@ from .messages import (
     read,
 )
 from .named_classes import ClassNames
+from .pictures import CutCrops, Jpegs, StreamPictures
 from .stream import Counts, PicturePose, PoseSource, Stream
 from .transforms import TransformBuffer
 
@@ -45,7 +48,8 @@ Item = TypeVar("Item")
 
 class RosMessage(NamedTuple):
     """A decoded message. ``type_name`` is such as ``tf2_msgs/msg/TFMessage``; ``received_ns`` is
-    the time of receipt, in a bag its log time; ``content`` has the attributes of the type."""
+    the time of receipt, in a bag its log time; ``content`` has the attributes of the type. Of a
+    picture it is the bytes of the message."""
 
     topic: str
     type_name: str
@@ -54,12 +58,14 @@ class RosMessage(NamedTuple):
 
 
 class Assembled(NamedTuple):
-    """The JSON of an envelope. ``topic`` and ``received_ns`` are those of its detections."""
+    """The JSON of an envelope, and the crops of its detections if they are kept. ``topic`` and
+    ``received_ns`` are those of its detections."""
 
     topic: str
     received_ns: int
     stamp_ns: int
     payload: bytes
+    crops: Sequence[Crop] = ()
 
 
 @dataclass(slots=True)
@@ -73,6 +79,8 @@ class _Picture:
     pose: PicturePose | None = None
     checked_at: int = -1
     """`PoseSource.received` when the pose was looked up last."""
+    jpegs: Jpegs | None = None
+    """The crop of each detection; None without a picture so far."""
 
 
 @dataclass(slots=True)
@@ -85,9 +93,11 @@ class _Passed(Generic[Item]):
 
 class Assembler(Generic[Item]):
     """Makes envelopes of messages. An ``Item`` given to `put` is returned unchanged, in its place
-    in the order."""
+    in the order. Crops of detections are made by ``cut``, without it none."""
 
-    def __init__(self, streams: Iterable[Stream]) -> None:
+    def __init__(self, streams: Iterable[Stream], cut: CutCrops | None = None) -> None:
+        self.pictures: frozenset[str] = frozenset()
+        """The topics of pictures."""
         self._queue: deque[_Picture | _Passed[Item]] = deque()
         self._states: dict[str, _StreamState] = {}
         self._handlers: dict[str, list[_Handler]] = {}
@@ -97,7 +107,9 @@ class Assembler(Generic[Item]):
             key = stream.tf, stream.tf_static, stream.max_gap_ns
             is_first = key not in buffers
             buffer = buffers.setdefault(key, TransformBuffer(stream.max_gap_ns))
-            state = _StreamState(stream, buffer, shares_transforms=not is_first)
+            state = _StreamState(stream, buffer, cut, shares_transforms=not is_first)
+            if cut is not None and stream.images is not None:
+                self.pictures |= {stream.images}
             self._states[stream.detections] = state
             for topic, handler in state.handlers(with_transforms=is_first).items():
                 self._handlers.setdefault(topic, []).append(handler)
@@ -174,10 +186,20 @@ _Handler = Callable[[str, str, Any], None]
 class _StreamState:
     """The state of one stream."""
 
-    def __init__(self, stream: Stream, buffer: TransformBuffer, *, shares_transforms: bool) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        buffer: TransformBuffer,
+        cut: CutCrops | None,
+        *,
+        shares_transforms: bool,
+    ) -> None:
         self.stream = stream
         self._shares_transforms = shares_transforms
         self.counts = Counts()
+        self._pictures: StreamPictures | None = None
+        if cut is not None and stream.images is not None:
+            self._pictures = StreamPictures(stream, cut, self.counts)
         self.poses = PoseSource(stream, buffer, self.counts)
         self._lens: Lens | None = None
         self._names = ClassNames()
@@ -194,6 +216,8 @@ class _StreamState:
         handlers |= dict.fromkeys((stream.pose, stream.covariance), self.poses.add_pose)
         handlers |= {stream.camera: self._set_lens, stream.embeddings: self._keep_embeddings}
         handlers |= dict.fromkeys(stream.classes, self._add_names)
+        if self._pictures is not None:
+            handlers[stream.images] = self._pictures.add
         return {
             topic: self._counting(handler)
             for topic, handler in handlers.items()
@@ -217,7 +241,8 @@ class _StreamState:
             raise BadMessage(f"it is {type_name:.80}, not {DETECTIONS}")
         detected = read(detections_of, content)
         self._next += 1
-        return _Picture(received_ns, self, detected, self._next - 1)
+        jpegs = None if self._pictures is None else self._pictures.cut(detected)
+        return _Picture(received_ns, self, detected, self._next - 1, jpegs=jpegs)
 
     def has_all(self, picture: _Picture) -> bool:
         """Whether everything that the stream has topics for is there; looks up the pose."""
@@ -264,8 +289,10 @@ class _StreamState:
         self._name_classes(detected)
         self._attach_embeddings(detected)
         document["detections"] = detected.detections
-        payload = _encode(document)
-        return Assembled(stream.detections, picture.received_ns, detected.stamp_ns, payload)
+        made = stream.detections, picture.received_ns, detected.stamp_ns, _encode(document)
+        if self._pictures is None:
+            return Assembled(*made)
+        return Assembled(*made, self._pictures.crops(picture.keyframe_id, detected, picture.jpegs))
 
     def _pose_fields(self, pose: PicturePose) -> dict[str, Any]:
         counts = self.counts

@@ -28,13 +28,14 @@ answers queries::
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Final, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
+from eventsrc.envelope.crops import Crop
 from eventsrc.envelope.grid_messages import GRID_SCHEMA, read_grid_message
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import MAP_KEY
@@ -42,6 +43,7 @@ from eventsrc.envelope.system_events import MAP_KEY
 from .assembler import Assembled, Assembler, RosMessage
 from .library import MessageTypes, Undecodable
 from .messages import BadMessage
+from .pictures import CutCrops
 from .stream import Counts, Stream
 
 CDR: Final = "cdr"
@@ -78,20 +80,25 @@ def read_recording(payload: bytes) -> RosRecording:
 
 class Derived(NamedTuple):
     """An event made of messages: the JSON of an envelope, or with ``key`` ``mapfold/map`` of a map.
-    ``stamp_ns`` is the stamp of the detections; None for a map."""
+    ``stamp_ns`` is the stamp of the detections; None for a map. ``crops`` are theirs, if they are
+    kept."""
 
     key: str
     stamp_ns: int | None
     payload: bytes
+    crops: Sequence[Crop] = ()
 
 
 class Derivation:
-    """Makes the envelopes and maps of one recording from its messages, in the order of the log."""
+    """Makes the envelopes and maps of one recording from its messages, in the order of the log, and
+    crops of detections with ``cut``."""
 
-    def __init__(self, recording: RosRecording, types: MessageTypes) -> None:
+    def __init__(
+        self, recording: RosRecording, types: MessageTypes, cut: CutCrops | None = None
+    ) -> None:
         self._key = recording.key
         self._grids = frozenset(recording.grids)
-        self._assembler: Assembler[Derived] = Assembler(recording.streams)
+        self._assembler: Assembler[Derived] = Assembler(recording.streams, cut)
         self._types = types
         self._defined: dict[str, str] = {}
         self.refused: dict[str, int] = {}
@@ -103,6 +110,15 @@ class Derivation:
     def topics(self) -> frozenset[str]:
         """The topics whose messages are used."""
         return self._assembler.topics | self._grids
+
+    @property
+    def pictures(self) -> frozenset[str]:
+        """The topics of pictures, whose messages go to `add_picture`."""
+        return self._assembler.pictures
+
+    def add_picture(self, topic: str, logged_ns: int, payload: bytes) -> list[Derived]:
+        """Add a picture in CDR; return the envelopes and maps that are ready."""
+        return self._finished(self._assembler.add(RosMessage(topic, "", logged_ns, payload)))
 
     @property
     def counts(self) -> dict[str, Counts]:
@@ -151,7 +167,9 @@ class Derivation:
 
     def _finished(self, ready: Iterable[Assembled | Derived]) -> list[Derived]:
         return [
-            each if isinstance(each, Derived) else Derived(self._key, each.stamp_ns, each.payload)
+            each
+            if isinstance(each, Derived)
+            else Derived(self._key, each.stamp_ns, each.payload, each.crops)
             for each in ready
         ]
 

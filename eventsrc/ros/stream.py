@@ -40,7 +40,7 @@ class Stream:
     topics of `eventsrc.ros.named_classes`; ``labels`` names classes by id itself, and counts before
     what they say. ``heights`` says whether ``map_z`` is stated. ``wait_ns`` and ``max_waiting``
     bound how long detections wait for the rest, ``max_gap_ns`` between which two samples a pose is
-    interpolated.
+    interpolated. ``images`` is the topic of the pictures that crops are cut from.
     """
 
     detections: str
@@ -61,6 +61,7 @@ class Stream:
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
     max_waiting: int = MAX_WAITING
     classes: tuple[str, ...] = ()
+    images: str | None = None
 
     @property
     def has_poses(self) -> bool:
@@ -89,6 +90,12 @@ class Counts:
     """Detections without a hypothesis."""
     numbered: int = 0
     """Detections whose class is a number, which nothing names."""
+    crops: int = 0
+    """Detections of which a crop is kept."""
+    without_picture: int = 0
+    """Keyframes with detections, but without their picture, where crops are kept."""
+    outside: int = 0
+    """Detections whose box has no pixel of the picture."""
     unused: dict[str, int] = field(default_factory=dict)
     """Number of messages, or transforms in them, that could not be used, by topic."""
     reasons: dict[str, str] = field(default_factory=dict)

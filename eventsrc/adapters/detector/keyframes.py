@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
+from eventsrc.ros.messages import BadMessage
+from eventsrc.ros.pictures import Boxes
 
 from .picture import Picture, PictureError, Pixels
-from .poses import Poses, RobotPose
+from .picture_sources import picture_of
+from .poses import MessageError, Poses, RobotPose
 from .vision import encode_jpeg, shrunk
 from .vision_models import Encoder, Finder, Found
 
@@ -254,6 +257,26 @@ def _pose_fields(pose: RobotPose | None) -> dict[str, float]:
         return {}
     yaw = math.remainder(pose.yaw, math.tau)
     return {"map_x": round(pose.x, 6), "map_y": round(pose.y, 6), "map_yaw": round(yaw, 6)}
+
+
+def crops_of_message(payload: bytes, boxes: Boxes) -> list[bytes | None]:
+    """The JPEGs of boxes in the picture of a CompressedImage or Image in CDR, None for one without
+    a pixel of it, and for all if one is no box. Raises BadMessage if the picture cannot be read."""
+    edges = np.array(boxes, np.float64).reshape(-1, 4)
+    if not np.isfinite(edges).all():  # validation will refuse the envelope
+        return [None] * len(edges)
+    try:
+        pixels = picture_of(payload, "", 0.0).pixels()
+        height, width = pixels.shape[:2]
+        inside = np.clip(edges, 0.0, (width, height) * 2)
+        return [
+            encode_jpeg(shrunk(_cut_out(pixels, box), CROP_SIDE))
+            if (box[2:] - box[:2]).min() > 0.0
+            else None
+            for box in inside
+        ]
+    except (MessageError, PictureError) as error:
+        raise BadMessage(str(error)) from None
 
 
 def _cut_out(pixels: Pixels, box: NDArray[np.float64]) -> Pixels:

@@ -24,7 +24,6 @@ from .keyframes import CropJpeg, DetectedKeyframe, Keyframes, PictureCounts
 from .picture import Picture
 from .picture_sources import LivePictures
 
-CROPS_KEY: Final = "tb/crops"
 _SLICE_S: Final = 0.25
 _LAST_CHANCE_S: Final = 2.0
 

@@ -20,7 +20,9 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import visible
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
+from eventsrc.ros import messages as ros
 from eventsrc.ros.library import BadBag, BagTopic, SqliteBag
+from eventsrc.ros.pictures import IMAGES
 
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 SQLITE_MAGIC: Final = b"SQLite format 3\0"
@@ -59,6 +61,29 @@ class BagMessage(NamedTuple):
                 refused=f"a compressed message that holds more than {MAX_KEPT_BYTES:,} bytes"
             )
         return self._replace(payload=plain)
+
+
+_FIRST_TRANSFORMS: Final = 300
+_EVERY_TRANSFORM: Final = 101
+_LAST_TRANSFORM: Final = 100_000
+_FIRST_PARAMETERS: Final = 10_000
+_FIRST_WANTED: Final = (
+    *(ros.DETECTIONS, ros.LABELS, ros.VISION_INFO, ros.CAMERA_INFO),
+    *(ros.POSE, ros.ODOMETRY),
+    *IMAGES,
+)
+
+
+def sampled(type_name: str, number: int) -> bool:
+    """Whether the choice of topics needs the message of a type with this number on its topic. Of
+    transforms it needs later ones too: a localiser publishes the map frame only once it is
+    localised. All nodes announce their parameters on one topic, before they do anything else."""
+    if type_name == ros.TF:
+        few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
+        return few or number < _FIRST_TRANSFORMS
+    if type_name == ros.PARAMETERS:
+        return number < _FIRST_PARAMETERS
+    return number == 0 and type_name in _FIRST_WANTED
 
 
 Sampled = Callable[[str, int], bool]

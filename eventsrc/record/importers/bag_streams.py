@@ -16,6 +16,7 @@ from eventsrc.ros import messages as ros
 from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.named_classes import CLASS_TYPES, ClassNames, nearest
+from eventsrc.ros.pictures import IMAGES, CutCrops
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.transforms import TransformBuffer
 
@@ -27,15 +28,7 @@ NONE: Final = "none"
 """The value of an option that switches its kind of topic off."""
 _BASES: Final = ("base_link", "base_footprint")
 _MAP: Final = "map"
-_FIRST_TRANSFORMS: Final = 300
-_EVERY_TRANSFORM: Final = 101
-_LAST_TRANSFORM: Final = 100_000
-_FIRST_PARAMETERS: Final = 10_000
 _POSE_TYPES: Final = (ros.POSE, ros.ODOMETRY)
-_FIRST_WANTED: Final = (
-    *(ros.DETECTIONS, ros.LABELS, ros.VISION_INFO, ros.CAMERA_INFO),
-    *_POSE_TYPES,
-)
 _MOST_NAME: Final = 100
 _NS: Final = 1_000_000_000
 
@@ -60,6 +53,9 @@ class BagOptions:
     labels: Mapping[str, str] = field(default_factory=dict)
     heights: bool = False
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
+    images: str | None = None
+    cut: CutCrops | None = None
+    """Cuts crops of detections, to keep them; None to keep none."""
 
 
 @dataclass
@@ -80,18 +76,6 @@ class Choice:
                 self.uses[topic] = what
             elif what not in uses.split(", "):
                 self.uses[topic] = f"{uses}, {what}"
-
-
-def sampled(type_name: str, number: int) -> bool:
-    """Whether `Chooser` needs the message of a type with this number on its topic. Of transforms it
-    needs later ones too: a localiser publishes the map frame only once it is localised. All nodes
-    announce their parameters on one topic, before they do anything else."""
-    if type_name == ros.TF:
-        few = number % _EVERY_TRANSFORM == 0 and number < _LAST_TRANSFORM
-        return few or number < _FIRST_TRANSFORMS
-    if type_name == ros.PARAMETERS:
-        return number < _FIRST_PARAMETERS
-    return number == 0 and type_name in _FIRST_WANTED
 
 
 class Chooser:
@@ -146,6 +130,7 @@ class Chooser:
         covariance = self._covariance(topic, map_frame) if by_transforms else None
         embeddings = self._embeddings(topic)
         camera = self._camera(topic, camera_frame)
+        images = None if options.cut is None else self._images(topic, camera_frame)
         told = self._class_names(topic)
         topics = tf, tf_static, None if by_transforms else pose, covariance, embeddings, camera
         made.streams.append(
@@ -155,6 +140,7 @@ class Chooser:
                 embedding_model=options.embedding_model,
                 heights=options.heights,
                 max_gap_ns=options.max_gap_ns,
+                images=images,
             )
         )
         made.use(topic, f"keyframes of run {run_id}")
@@ -182,6 +168,7 @@ class Chooser:
         made.use(covariance, "errors of poses")
         made.use(embeddings, "embeddings")
         made.use(camera, "camera")
+        made.use(images, "crops")
         if embeddings is None and options.embeddings != NONE:
             made.notes.append(
                 f"{topic}: no topic has embeddings, so Objects go by class and box alone; "
@@ -252,6 +239,19 @@ class Chooser:
         there = self._of_type(ros.CAMERA_INFO)
         same = [each for each in there if frame and self._frames.get(each) == frame]
         return self._nearest(topic, same or there, "cameras", "--camera")
+
+    def _images(self, topic: str, frame: str) -> str | None:
+        """The topic of the pictures that crops are cut from."""
+        if (given := self._given("--images", *IMAGES)) is not None:
+            return _unless_none(given)
+        there = [each for each in self._of_type(*IMAGES) if "depth" not in each.lower()]
+        same = [each for each in there if frame and self._frames.get(each) == frame]
+        found = self._nearest(topic, same or there, "pictures", "--images")
+        if not there:
+            self._made.notes.append(
+                f"{topic}: no topic has pictures, so there are no crops to keep"
+            )
+        return found
 
     def _class_names(self, topic: str) -> Mapping[str, str]:
         """The names of classes that messages tell, by id."""

@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.envelope.crops import CROPS_TOPIC, encode_crop
 from eventsrc.envelope.grid_messages import read_grid_message
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import Excerpt
+from eventsrc.record.append import CROP_FORMAT
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.messages import DETECTIONS, FLOATS, TEXT, BadMessage
 from eventsrc.ros.stream import Counts
 
-from .bag_files import Bag, BagContents, bag_name
-from .bag_streams import BagOptions, Choice, Chooser, sampled
+from .bag_files import Bag, BagContents, BagMessage, bag_name, sampled
+from .bag_streams import BagOptions, Choice, Chooser
 from .sources import ImportedMessage, Source
 
 
@@ -75,7 +77,7 @@ class RosBag(Source):
         choice = Chooser(name, contents, self._types, self._options).choose()
         report = self.report = _report(self.name, contents, choice)
         report.notes = [*notes, *report.notes]
-        assembler: Assembler[ImportedMessage] = Assembler(choice.streams)
+        assembler: Assembler[ImportedMessage] = Assembler(choice.streams, self._options.cut)
         report.streams = assembler.counts
         wanted = {topic for topic in choice.uses if topic in contents.topics}
         self.skipped = contents.count - sum(contents.topics[topic].count for topic in wanted)
@@ -85,7 +87,7 @@ class RosBag(Source):
         except MapfoldError as error:
             damage = error
         for each in assembler.finish():
-            yield self._imported(each)
+            yield from self._imported(each)
         report.frames = assembler.frames()
         if damage is not None:
             raise damage
@@ -101,7 +103,9 @@ class RosBag(Source):
         detections = assembler.counts.keys()
         for number, message in enumerate(self._bag.messages(wanted), 1):
             topic, type_name, received_ns, payload, refused = message
-            if isinstance(payload, Excerpt) or refused is not None:
+            if topic in assembler.pictures:
+                ready = self._picture(assembler, message, report)
+            elif isinstance(payload, Excerpt) or refused is not None:
                 self._numbers.append(number)
                 ready = put(_refused(payload, topic, received_ns, refused or ""), received_ns)
             elif topic in grids:
@@ -120,14 +124,32 @@ class RosBag(Source):
                     self._numbers.append(number)
                     ready = put(_refused(payload, topic, received_ns, str(error)), received_ns)
             for each in ready:
-                yield self._imported(each)
+                yield from self._imported(each)
 
-    def _imported(self, each: Assembled | ImportedMessage) -> ImportedMessage:
-        """An output of the assembler as a message; sets `at` to the number of its source."""
+    def _imported(self, each: Assembled | ImportedMessage) -> Iterator[ImportedMessage]:
+        """An output of the assembler as a message, behind it those of its crops; sets `at` to the
+        number of its source."""
         self.at = self._numbers.popleft()
         if isinstance(each, ImportedMessage):
-            return each
-        return ImportedMessage(each.payload, None, each.received_ns)
+            yield each
+            return
+        yield ImportedMessage(each.payload, None, each.received_ns)
+        for crop in each.crops:
+            kept = encode_crop(crop, each.stamp_ns)
+            yield ImportedMessage(
+                kept, CROPS_TOPIC, each.received_ns, each.stamp_ns, form=CROP_FORMAT
+            )
+
+    def _picture(
+        self, assembler: Assembler[ImportedMessage], message: BagMessage, report: BagReport
+    ) -> list[Assembled | ImportedMessage]:
+        """Add a picture; one that is too large is counted."""
+        topic, type_name, received_ns, payload, refused = message
+        if not isinstance(payload, Excerpt) and refused is None:
+            return assembler.add(RosMessage(topic, type_name, received_ns, payload))
+        for counts in report.streams.values():
+            counts.refuse(topic, refused or "it is too large")
+        return []
 
     def _grid(
         self, topic: str, received_ns: int, payload: bytes, report: BagReport

@@ -17,7 +17,7 @@ nothing to do. A recording that has lost events to damage is left as it is.
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -25,10 +25,11 @@ import msgspec
 from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged
+from eventsrc.envelope.crops import CROPS_TOPIC, encode_crop
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
-from eventsrc.record.append import append_payload, map_event
+from eventsrc.record.append import CROP_FORMAT, append_payload, map_event
 from eventsrc.record.gap_history import keyframe_of, loss_of
 from eventsrc.record.transport.session import Received
 from eventsrc.ros.derivation import (
@@ -42,6 +43,7 @@ from eventsrc.ros.derivation import (
     type_of_token,
 )
 from eventsrc.ros.library import MessageTypes, Undecodable
+from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import Counts
 
 from .checking import CheckedMessage
@@ -65,15 +67,23 @@ class Bridge:
     """The topics of a bridge that are recorded, with the types and held messages of each.
 
     Only the writer thread changes it, except by `note_token`. ``topics`` are all that are recorded,
-    also those from which ``recording`` makes no envelope.
+    also those from which ``recording`` makes no envelope. ``cut`` cuts the crops of detections that
+    are kept, None for none; pictures are kept only of ``topics``.
     """
 
-    def __init__(self, recording: RosRecording, topics: Iterable[str], types: MessageTypes) -> None:
+    def __init__(
+        self,
+        recording: RosRecording,
+        topics: Collection[str],
+        types: MessageTypes,
+        cut: CutCrops | None = None,
+    ) -> None:
         self.recording = recording
-        self.topics = tuple(topics)
+        self.derivation = Derivation(recording, types, cut)
+        self._kept = frozenset(topics)
+        self.topics = tuple(dict.fromkeys([*topics, *sorted(self.derivation.pictures)]))
         self.keys = tuple(map(key_of, self.topics))
         self._topics = dict(zip(self.keys, self.topics, strict=True))
-        self.derivation = Derivation(recording, types)
         self._types = types
         self._lock = threading.Lock()
         self._new_types: dict[str, str] = {}
@@ -108,9 +118,9 @@ class Bridge:
 
     @property
     def latched_keys(self) -> tuple[str, ...]:
-        """Keys whose last messages a bridge may cache for late subscribers. Without detections and
-        their embeddings: cached ones are older than this recording."""
-        live = {t for s in self.recording.streams for t in (s.detections, s.embeddings)}
+        """Keys whose last messages a bridge may cache for late subscribers. Without detections,
+        their embeddings and pictures: cached ones are older than this recording."""
+        live = {t for s in self.recording.streams for t in (s.detections, s.embeddings, s.images)}
         return tuple(key for key, topic in self._topics.items() if topic not in live)
 
     @property
@@ -138,6 +148,11 @@ class Bridge:
             if key not in self._topics:  # a key expression that a publisher made up
                 self.unknown_keys += 1
                 continue
+            if self._topics[key] in self.derivation.pictures:
+                for derived in self.derivation.add_picture(self._topics[key], logged_ns, payload):
+                    taken += _checked(derived, check)
+                if self._topics[key] not in self._kept:
+                    continue
             if key in self._formats and key not in waiting:
                 taken += self._appended(key, payload, logged_ns, check)
             else:
@@ -201,7 +216,9 @@ class Bridge:
     ) -> Iterator[CheckedMessage]:
         topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
         yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
-        if form.schema:  # without a known definition no envelope is made, which is counted
+        if (
+            form.schema and topic not in self.derivation.pictures
+        ):  # without a known definition no envelope is made, which is counted
             definition = form.schema_text.decode()
             made = self.derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:
@@ -209,12 +226,16 @@ class Bridge:
 
 
 def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]:
+    """The messages of an event: an envelope and its crops, or a map."""
     if derived.key == MAP_KEY:
         yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
     else:
         for message in check([Received(derived.key, derived.payload)]):
             # no robot sent it, so none is answered
             yield msgspec.structs.replace(message, sha256="")
+        for crop in derived.crops:
+            kept = encode_crop(crop, derived.stamp_ns or 0)
+            yield CheckedMessage(CROPS_TOPIC, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
 
 
 def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:

@@ -11,29 +11,18 @@ from typing import Final
 
 import msgspec
 
-from eventsrc.envelope.crops import (
-    CROP_ENCODING,
-    CROP_SCHEMA,
-    CROP_SCHEMA_ENCODING,
-    CROP_SCHEMA_TEXT,
-    InvalidCrop,
-    encode_crop,
-    received_crop,
-)
+from eventsrc.envelope.crops import InvalidCrop, encode_crop, received_crop
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.envelope.model import ENVELOPE_VERSION, KeyframeId, RunId, has_keyframe_id
 from eventsrc.envelope.system_events import MAP_KEY, Excerpt
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
-from eventsrc.record.append import NewMap, check_payloads, map_event, rejected_event
+from eventsrc.record.append import CROP_FORMAT, NewMap, check_payloads, map_event, rejected_event
 from eventsrc.record.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
 from eventsrc.record.transport.session import Received
 
 from .edits import EditRequest
 from .queue import MAX_BATCH_BYTES, BridgedMessage, CropMessage, MessageQueue
 
-CROP_FORMAT: Final = MessageFormat(
-    CROP_ENCODING, CROP_SCHEMA, CROP_SCHEMA_ENCODING, CROP_SCHEMA_TEXT
-)
 _BATCH: Final = 256
 _CHECKED_TOGETHER: Final = 16
 """Messages checked at a time: enough to save time, few enough to fit the processor's cache."""

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Final
 
 from eventsrc.base.errors import TransportError
+from eventsrc.envelope.crops import CROPS_TOPIC
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
@@ -27,7 +28,7 @@ from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
 DEFAULT_KEYS: Final = ("tb/detections",)
-DEFAULT_CROPS: Final = ("tb/crops/*",)
+DEFAULT_CROPS: Final = (f"{CROPS_TOPIC}/*",)
 _CACHE_TIMEOUT_S: Final = 2.0
 _MAX_CACHED: Final = 1_000
 """Limit for the messages fetched from a bridge's cache of one topic."""

@@ -34,6 +34,7 @@ from eventsrc.envelope.gaps import Gap, GapLedger, Source
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.envelope.system_events import LOSS_KEY, ROS_KEY, Loss
 from eventsrc.log import LogWriter
+from eventsrc.record.append import CROP_FORMAT
 from eventsrc.record.gap_history import delete_ledger, save_ledger
 from eventsrc.record.robot.acks import (
     MAX_PER_ACK,
@@ -49,7 +50,7 @@ from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.stream import Counts
 
 from .bridged import Bridge
-from .checking import CROP_FORMAT, Batch, CheckedMessage, Checker
+from .checking import Batch, CheckedMessage, Checker
 from .edits import EditRequest, Edits
 from .queue import MessageQueue
 

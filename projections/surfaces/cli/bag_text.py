@@ -9,11 +9,14 @@ from typing import Annotated, Final
 
 import typer
 
+from eventsrc.adapters.detector.keyframes import crops_of_message
+from eventsrc.adapters.detector.vision import check_installed
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.label_files import read_labels
 from eventsrc.record.importers.ros_bags import BagReport
+from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
 _PANEL: Final = "Bags of ROS 2"
@@ -52,6 +55,26 @@ def heights_option(panel: str) -> typer.models.OptionInfo:
         rich_help_panel=panel,
     )
     return option
+
+
+def keep_crops_option(panel: str) -> typer.models.OptionInfo:
+    """``--keep-crops``."""
+    option: typer.models.OptionInfo = typer.Option(
+        "--keep-crops",
+        help="Keep the crop of each detection, cut from its picture; needs mapfold[detector].",
+        rich_help_panel=panel,
+    )
+    return option
+
+
+def crop_cutter(keep: bool, images: str | None) -> CutCrops | None:
+    """What cuts crops for ``--keep-crops``; None without it. Raises MisuseError."""
+    if not keep:
+        if images is not None:
+            raise MisuseError(f"--images {visible(images)} is for crops; give --keep-crops too")
+        return None
+    check_installed()
+    return crops_of_message
 
 
 def max_gap_option(panel: str) -> typer.models.OptionInfo:
@@ -138,6 +161,11 @@ class BagChoice:
     labels: Annotated[Path | None, labels_option(_PANEL)] = None
     embedding_model: Annotated[str | None, model_option(_PANEL)] = None
     heights: Annotated[bool, heights_option(_PANEL)] = False
+    keep_crops: Annotated[bool, keep_crops_option(_PANEL)] = False
+    images: Annotated[
+        str | None,
+        _topic("--images", "Topic of the pictures for --keep-crops. Default: the nearest."),
+    ] = None
     max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
 
     def options(self) -> BagOptions:
@@ -157,6 +185,8 @@ class BagChoice:
             {} if self.labels is None else read_labels(self.labels),
             self.heights,
             max_gap_ns(self.max_gap),
+            self.images,
+            crop_cutter(self.keep_crops, self.images),
         )
 
 
@@ -225,6 +255,12 @@ def _keyframes(counts: Counts) -> str:
     parts = [f"{number:,} {what}" for number, what in lacks if number]
     seen = counted(counts.detections, "detection")
     parts.append(f"{seen}, {counts.with_embedding:,} with an embedding")
+    if counts.crops or counts.without_picture or counts.outside:
+        parts.append(counted(counts.crops, "crop"))
+    if counts.without_picture:
+        parts.append(f"{counted(counts.without_picture, 'keyframe')} without a picture of its time")
+    if counts.outside:
+        parts.append(f"{counted(counts.outside, 'box')} outside the picture")
     if counts.numbered:
         parts.append(f"{counts.numbered:,} with a number as the class")
     if counts.unclassified:

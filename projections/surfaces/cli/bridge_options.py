@@ -24,7 +24,9 @@ from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 
 from .bag_text import (
     check_run_id,
+    crop_cutter,
     heights_option,
+    keep_crops_option,
     labels_option,
     max_gap_ns,
     max_gap_option,
@@ -115,6 +117,11 @@ class BridgeChoice:
     labels: Annotated[Path | None, labels_option(_PANEL)] = None
     embedding_model: Annotated[str | None, model_option(_PANEL)] = None
     heights: Annotated[bool, heights_option(_PANEL)] = False
+    keep_crops: Annotated[bool, keep_crops_option(_PANEL)] = False
+    images: Annotated[
+        str | None,
+        _option("--images", "TOPIC", "Topic of the pictures for --keep-crops, which needs it."),
+    ] = None
     max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
     topic: Annotated[
         list[str] | None,
@@ -136,6 +143,7 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
     left out. Raises MisuseError for an invalid topic, MapfoldError without rosbags."""
     types = MessageTypes()
     recording, topics = recording_of(choice, writer.now_ns(), ledger)
+    cut = crop_cutter(choice.keep_crops, choice.images)
     try:
         with LogReader(writer.path) as reader:
             made = append_missing(reader, writer, types)
@@ -147,13 +155,16 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
                 f"{writer.path}: the last recording of ROS did not finish; made "
                 f"{counted(made, 'event')} from its messages"
             )
-    return Bridge(recording, topics, types)
+    return Bridge(recording, topics, types, cut)
 
 
 def recording_of(
     choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
 ) -> tuple[RosRecording, tuple[str, ...]]:
-    """The topics and settings from which envelopes are made, and all topics that are kept."""
+    """The topics and settings from which envelopes are made, and all topics that are kept. Raises
+    MisuseError."""
+    if choice.keep_crops and choice.images is None:
+        raise MisuseError("--keep-crops needs the pictures; give --images TOPIC too")
 
     def full(topic: str, option: str) -> str:
         return topic_of(choice.namespace, topic, option)
@@ -190,6 +201,7 @@ def recording_of(
                 max_gap_ns=gap_ns,
                 first_keyframe=0 if highest is None else highest + 1,
                 classes=tuple(full(t, "--classes") for t in choice.classes or () if t != NONE),
+                images=given(choice.images, "--images"),
             )
         )
     grid = given(choice.grid, "--grid")

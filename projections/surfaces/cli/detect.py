@@ -21,7 +21,6 @@ from eventsrc.adapters.detector.picture import Picture
 from eventsrc.adapters.detector.picture_sources import QUEUE, LivePictures, open_images
 from eventsrc.adapters.detector.poses import Poses, PoseTrack, poses_of_file
 from eventsrc.adapters.detector.service import (
-    CROPS_KEY,
     CropSender,
     DetectionRun,
     FileOutput,
@@ -42,6 +41,7 @@ from eventsrc.adapters.detector.vision_models import (
 )
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
+from eventsrc.envelope.crops import CROPS_TOPIC
 from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.config import check_key, parse_address
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
@@ -270,7 +270,7 @@ def detect(
     keep_crops: Annotated[
         bool,
         typer.Option(
-            "--keep-crops", help=f"Publish each crop as JPEG too, under {CROPS_KEY}/<det_id>."
+            "--keep-crops", help=f"Publish each crop as JPEG too, under {CROPS_TOPIC}/<det_id>."
         ),
     ] = False,
     spool: Annotated[
@@ -392,7 +392,7 @@ def _output(
         stack.callback(file.close, 0.0)
         return file
     publisher = stack.enter_context(EnvelopePublisher(options, spool, key))
-    sender = None if crops is None else CropSender(crops, CROPS_KEY, _note)
+    sender = None if crops is None else CropSender(crops, CROPS_TOPIC, _note)
     return ZenohOutput(publisher, sender, stop, patient=patient, note=_note)
 
 

@@ -23,7 +23,7 @@ from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes
 from projections.fold.corrections import check_settings
 
-from .bag_text import stream_lines
+from .bag_text import crop_cutter, stream_lines
 from .bridge_options import (
     BridgeChoice,
     Ros2ddsOption,
@@ -130,6 +130,7 @@ def record(
     if ros2dds:
         MessageTypes()
         recording_of(choice, 0, None)
+        crop_cutter(choice.keep_crops, choice.images)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
         RecorderSummary(log, json=json) as summary,

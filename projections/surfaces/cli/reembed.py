@@ -14,9 +14,10 @@ from eventsrc.adapters.detector.onnx_model import Device, OnnxModel
 from eventsrc.adapters.detector.picture import PictureError, Pixels
 from eventsrc.adapters.detector.vision import check_installed, decode
 from eventsrc.adapters.detector.vision_models import Encoder, read_preparation
-from eventsrc.adapters.reembedding import DEFAULT_BATCH, DEFAULT_TOPIC, Reembedding, Vector, reembed
+from eventsrc.adapters.reembedding import DEFAULT_BATCH, Reembedding, Vector, reembed
 from eventsrc.base.text import advised, counted, visible
 from eventsrc.base.user_files import open_file
+from eventsrc.envelope.crops import CROPS_TOPIC
 from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
 from .detect_checks import device_of
@@ -95,7 +96,7 @@ def reembed_log(
         typer.Option(
             "--crops",
             metavar="TOPIC",
-            help=f"Where the log keeps crops; may be repeated. [default: {DEFAULT_TOPIC}]",
+            help=f"Where the log keeps crops; may be repeated. [default: {CROPS_TOPIC}]",
         ),
     ] = None,
     device: Annotated[str, typer.Option(metavar="cpu|cuda", help="What the model runs on.")] = (
@@ -119,7 +120,7 @@ def reembed_log(
         done = reembed(
             log,
             model,
-            topics=tuple(crops or (DEFAULT_TOPIC,)),
+            topics=tuple(crops or (CROPS_TOPIC,)),
             batch=batch,
             issued_by=user_at_host(),
             reason=reason,
