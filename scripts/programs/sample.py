@@ -14,7 +14,7 @@ from eventsrc.adapters.sim import DEFAULT_SEED, simulate_run
 from eventsrc.adapters.sim.simulation import EXPLORER, start_of
 from eventsrc.log import LogWriter
 from eventsrc.record.append import append_payload
-from projections.surfaces.demo.acts import begin_log
+from projections.surfaces.demo.recorded_run import begin_log
 
 LOG = Path("logs/sample")
 KEY = "tb/detections"

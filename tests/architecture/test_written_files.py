@@ -21,8 +21,7 @@ OWN_WAY = {
     "projections/postgres/embedded.py": "locks and the server's log",
     "projections/postgres/server_user.py": "renamed when it is whole",
     "projections/surfaces/cli/program.py": "/dev/null",
-    "projections/surfaces/demo/play.py": "the lock of the demo's folder",
-    "projections/surfaces/demo/recorded_run.py": "what a running child process says",
+    "projections/surfaces/demo/recorded_run.py": "a lock, and what a running child process says",
 }
 """Modules that write otherwise, and what."""
 _WRITERS = {"write_text", "write_bytes", "savefig", "imwrite", "tofile", "save", "savez"}

@@ -67,13 +67,13 @@ def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
     with Children() as children:
         children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
         children.wait_for_output("router", "tcp/127.0.0.1")
-        with pytest.raises(MapfoldError, match=r"mapfold router made no progress for 0\.3 s; see"):
-            children.wait(stalled_s=0.3)
+        with pytest.raises(MapfoldError, match=r"no progress for 0\.3 s by mapfold router; see"):
+            children.wait(lambda: False, stalled_s=0.3)
         children.start("record", ("record", str(tmp_path / "log")), tmp_path / "other")
         *_, (process, _) = children._all.values()
         process.send_signal(signal.SIGSTOP)
         try:
-            with pytest.raises(MapfoldError, match=r"and record made no progress for 0\.3 s"):
+            with pytest.raises(MapfoldError, match=r"0\.3 s by mapfold router and record; see"):
                 children.wait_for_output("record", "recording", stalled_s=0.3)
         finally:
             process.send_signal(signal.SIGCONT)
@@ -95,5 +95,10 @@ def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:
                 process.terminate()
             return next(seen)
 
-        children.wait(observe=observe, stalled_s=0.1)
+        children.wait(lambda: not children.running, observe=observe, stalled_s=0.1)
     assert ended.is_set()
+
+
+def test_what_is_waited_for_last_is_named_when_no_child_runs(tmp_path: Path) -> None:
+    with Children() as children, pytest.raises(MapfoldError, match=r"0\.1 s by the databases$"):
+        children.wait(lambda: False, stalled_s=0.1, at_last="the databases")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.base.errors import MisuseError
-from projections.surfaces.demo.play import fresh_folder
+from projections.surfaces.demo.recorded_run import fresh_folder
 
 
 def test_a_second_demo_in_the_same_folder_is_refused(tmp_path: Path) -> None:
