@@ -99,7 +99,7 @@ class Door:
 class DrivenPath:
     """A way over driven ground: its length and way points, the Places on it and the passages from
     one to the next. ``start`` and ``end`` are what was asked for; ``goal`` is the pose at the end
-    of a way to an Object."""
+    of a way to an Object. ``offsets`` are the events of the poses that it goes over."""
 
     start: str
     end: str
@@ -108,6 +108,7 @@ class DrivenPath:
     doors: tuple[Door, ...]
     way_points: tuple[Spot, ...]
     goal: GoalPose | None
+    offsets: tuple[int, ...]
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
@@ -149,6 +150,7 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
         tuple(doors),
         tuple(spots),
         goal,
+        tuple(sorted({ground.nodes[node].offset for node in nodes})),
     )
 
 

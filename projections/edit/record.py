@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from itertools import combinations
 from math import sqrt
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from eventsrc.base.errors import LogBusy, LogError, MapfoldError, TransportError
 from eventsrc.base.text import advised, visible
@@ -297,6 +297,20 @@ def record_command(
             except _LogFree:
                 last = LogBusy(f"{log} is written by one writer after another; try again")
     raise last
+
+
+def recorded_document(made: Made) -> dict[str, Any]:
+    """JSON of a recorded command: its offset and its effect."""
+    effect = made.outcome.effect
+    document = {
+        "offset": made.offset,
+        "command_id": made.command.command_id,
+        "repeated": made.repeated,
+        "effect": None if effect is None else effect.document(),
+    }
+    if effect is None:
+        document["effect_unknown"] = made.outcome.unknown
+    return document
 
 
 def _append(log: Path, made: Made, open_session: OpenSession) -> Offset:

@@ -36,6 +36,7 @@ WITHOUT = {
     "reembed": "has a bar of its own",
     "ui": "shows its progress in the page",
     "serve": "asks the databases, until Ctrl-C",
+    "mcp": "answers agents, until the end of stdin or Ctrl-C",
     "status": "reads indexes only",
     "replay": "has a bar of its own",
     "tail": "has a bar of its own",

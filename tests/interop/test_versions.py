@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = sample_drive()
 ROOMS = ("--set", "eps_m=0.75", "--set", "min_samples=8")
 DIGEST = "83caf24df6303ddf85522676f0ae726b671725573c6044e0743eb7af2691aab1"
-EXTRAS = "serve,ui,foxglove,detector,ros,cluster"
+EXTRAS = "serve,ui,foxglove,detector,ros,cluster,align,mcp"
 UV = Path(sys.executable).with_name("uv")
 
 pytestmark = pytest.mark.slow

@@ -55,14 +55,14 @@ _LIMITED = """
 import resource, sys
 if limit := sys.argv.pop(1):
     resource.setrlimit(resource.RLIMIT_NOFILE, (int(limit), int(limit)))
-sys.argv.insert(1, "serve")
+sys.argv[1:1] = [] if sys.argv[1:2] == ["mcp"] else ["serve"]
 from projections.surfaces.cli import main
 main()
 """
 
 
 class Served(ReadyProgram):
-    """``mapfold serve --http`` in a process of its own."""
+    """``mapfold serve --http``, or ``mapfold mcp --http``, in a process of its own."""
 
     def __init__(self, *args: str, open_files: int | None = None, **env: str) -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("MAPFOLD_")}

@@ -45,6 +45,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
     "Find a robot": {
         "relocalize": "relocalize:relocalize",
         "serve": "serve:serve",
+        "mcp": "mcp_command:mcp",
     },
     "Travel in time": {
         "merges": "time_travel:merges",

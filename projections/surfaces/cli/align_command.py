@@ -13,12 +13,12 @@ from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.make import Stamp
-from projections.edit.record import Made, record_command
+from projections.edit.record import Made, record_command, recorded_document
 from projections.map.own_events import read_corrections
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 
-from .edit_command import recorded_document, recorded_text
+from .edit_command import recorded_text
 from .folded_log import CachedLog, OpenLog, settings_from
 from .options import JsonOption, ZenohClient, check_picture, user_at_host
 from .terminal import display, emit, finish, say

@@ -14,14 +14,14 @@ from eventsrc.log import LogReader
 from projections.edit import make
 from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
-from projections.edit.record import record_command
+from projections.edit.record import record_command, recorded_document
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.localize.calibrate.report import document, text
 from projections.localize.calibrate.rounds import Calibration, calibrate
 from projections.map.own_events import read_corrections
 
-from .edit_command import keep_effect, recorded_document, recorded_text
+from .edit_command import keep_effect, recorded_text
 from .folded_log import LogSettings
 from .options import JsonOption, ZenohClient, user_at_host
 from .terminal import Bar, display, emit, say

@@ -3,7 +3,7 @@
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,7 +14,14 @@ from eventsrc.log import LogReader
 from projections.edit.current import MapToEdit
 from projections.edit.effect import cache_effect
 from projections.edit.make import Stamp
-from projections.edit.record import Made, MakeCommand, make_command, record_command, void_text
+from projections.edit.record import (
+    Made,
+    MakeCommand,
+    make_command,
+    record_command,
+    recorded_document,
+    void_text,
+)
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.settings import Settings
 from projections.history.diff_rendering import difference_text
@@ -127,20 +134,6 @@ def keep_effect(made: Made) -> None:
     if outcome.effect is not None and made.offset == made.current.end:
         cache_effect(made.current, made.command, outcome.effect)
     _say_side_effects(made)
-
-
-def recorded_document(made: Made) -> dict[str, Any]:
-    """JSON of a recorded command: its offset and its effect."""
-    effect = made.outcome.effect
-    document = {
-        "offset": made.offset,
-        "command_id": made.command.command_id,
-        "repeated": made.repeated,
-        "effect": None if effect is None else effect.document(),
-    }
-    if effect is None:
-        document["effect_unknown"] = made.outcome.unknown
-    return document
 
 
 def recorded_text(made: Made) -> str:

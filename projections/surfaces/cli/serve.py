@@ -28,6 +28,9 @@ from .terminal import say
 if TYPE_CHECKING:  # modules that need the extra [serve] are imported when they are used
     import socket
     import ssl
+    from collections.abc import Callable
+
+    from starlette.types import ASGIApp
 
     from projections.surfaces.serve.service_metrics import ServiceMetrics
 
@@ -136,15 +139,24 @@ class HttpEndpoint:
         self, answerer: Answerer, queue: FairQueue, metrics: "ServiceMetrics"
     ) -> Iterator[str]:
         """Serve until the end of the block; yields the URL."""
-        from projections.surfaces.serve.guard import Guard, SafeHeaders
         from projections.surfaces.serve.http import create_app
-        from projections.surfaces.serve.listening import serving
         from projections.surfaces.serve.service_metrics import CountedResponses
 
         app = create_app(answerer, queue, metrics, secured=self.token is not None)
+        with self.serving_app(app, lambda guarded: CountedResponses(guarded, metrics)) as url:
+            yield url
+
+    @contextmanager
+    def serving_app(
+        self, app: "ASGIApp", around: "Callable[[ASGIApp], ASGIApp]" = lambda guarded: guarded
+    ) -> Iterator[str]:
+        """Serve an application behind the access control until the end of the block; yields the
+        URL."""
+        from projections.surfaces.serve.guard import Guard, SafeHeaders
+        from projections.surfaces.serve.listening import serving
+
         guarded = Guard(app, self.token, (self.host, *self.hosts), self.origins)
-        counted = CountedResponses(SafeHeaders(guarded), metrics)
-        with serving(counted, self.listener, self.tls, say) as port:
+        with serving(around(SafeHeaders(guarded)), self.listener, self.tls, say) as port:
             shown = f"[{self.host}]" if ":" in self.host else self.host
             yield f"{'http' if self.tls is None else 'https'}://{shown}:{port}"
 

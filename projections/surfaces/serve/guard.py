@@ -120,7 +120,10 @@ class Guard:
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or refuse it."""
+        """Pass the request on, or refuse it; the start and end of the server are passed on."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
         await self._chosen(scope)(scope, receive, _varied(send) if self._origins else send)
 
     def _chosen(self, scope: Scope) -> ASGIApp:

@@ -90,6 +90,7 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         self.servers = []
+        await self.lifespan.startup()
         self._loop = asyncio.get_running_loop()
         for listener in sockets or ():
             self._loop.add_reader(listener, self._accept, listener)
@@ -160,7 +161,7 @@ def serving(
         loop="asyncio",
         http=Connection,
         ws="none",
-        lifespan="off",
+        lifespan="auto",
         log_level="error",
         access_log=False,
         proxy_headers=False,
