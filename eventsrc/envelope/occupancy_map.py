@@ -9,16 +9,16 @@ import hashlib
 import json
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import pybase64
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from .grey_images import BadImage, decode_grey_png, encode_png
-from .model import describe_error
-from .system_events import MAX_MAP_SIDE, OccupancyMapEvent
+from .model import Floor, Position, Text, describe_error
 
 MAX_MAP_CELLS = 16_000_000
 """Bound of the cells of a map: 16 MB in memory, and twice that beside it while it is read."""
@@ -28,6 +28,35 @@ UNKNOWN = 255
 OCCUPIED = 100
 MIN_WALL = 65
 """Percent from which a cell counts as occupied, the default of map servers."""
+
+MAX_MAP_SIDE = 10_000
+"""Bound of a map's width and height in cells."""
+Resolution = Annotated[float, Field(ge=0.001, le=10.0)]
+"""The side of a map's cell in metres."""
+MapYaw = Annotated[float, Field(ge=-7.0, le=7.0)]
+
+
+class OccupancyMapEvent(BaseModel):
+    """The content of a ``mapfold/map`` event: an occupancy grid, as nav_msgs/OccupancyGrid has it.
+
+    ``resolution`` is the side of a cell in metres, ``origin`` x, y and yaw of the outer corner of
+    the grid's first cell in the map frame. ``png`` is base64 of an 8-bit grey PNG of ``width`` by
+    ``height`` cells, its last row the one of the first cell: 0 is free, 100 occupied, between them
+    how likely occupied in percent, 255 unknown. ``source`` is the file or key that it came from.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="ignore", allow_inf_nan=False)
+
+    map_id: Text | None = None
+    resolution: Resolution
+    origin: tuple[Position, Position, MapYaw]
+    width: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
+    height: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
+    png: str
+    source: Text
+    floor: Floor = None
+    """The floor that it is of; without it the one that the log is of first."""
+
 
 Cells = NDArray[np.uint8]
 

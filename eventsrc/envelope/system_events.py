@@ -20,7 +20,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 import pybase64
 from pydantic import BaseModel, ConfigDict, Field
 
-from .model import MAX_DIMENSION, Floor, Position, Text
+from .model import MAX_DIMENSION, Text
 
 RESERVED_PREFIX = "mapfold/"
 REJECTED_KEY = "mapfold/rejected"
@@ -116,35 +116,6 @@ class Loss(_Model):
     last: int | None = None
     count: Annotated[int, Field(ge=1)]
     cause: Literal["keyframe_gap", "queue_full", "too_large", "transport_miss", "rot"]
-
-
-MAX_MAP_SIDE = 10_000
-"""Bound of a map's width and height in cells."""
-Resolution = Annotated[float, Field(ge=0.001, le=10.0)]
-"""The side of a map's cell in metres."""
-MapYaw = Annotated[float, Field(ge=-7.0, le=7.0)]
-
-
-class OccupancyMapEvent(BaseModel):
-    """The content of a ``mapfold/map`` event: an occupancy grid, as nav_msgs/OccupancyGrid has it.
-
-    ``resolution`` is the side of a cell in metres, ``origin`` x, y and yaw of the outer corner of
-    the grid's first cell in the map frame. ``png`` is base64 of an 8-bit grey PNG of ``width`` by
-    ``height`` cells, its last row the one of the first cell: 0 is free, 100 occupied, between them
-    how likely occupied in percent, 255 unknown. ``source`` is the file or key that it came from.
-    """
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="ignore", allow_inf_nan=False)
-
-    map_id: Text | None = None
-    resolution: Resolution
-    origin: tuple[Position, Position, MapYaw]
-    width: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
-    height: Annotated[int, Field(ge=1, le=MAX_MAP_SIDE)]
-    png: str
-    source: Text
-    floor: Floor = None
-    """The floor that it is of; without it the one that the log is of first."""
 
 
 MAX_REEMBEDDED = 4_096

@@ -30,6 +30,7 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.base.text import advised
 from eventsrc.envelope.commands import COMMAND
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.occupancy_map import OccupancyMapEvent
 from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.envelope.system_events import (
     COMMAND_KEY,
@@ -39,7 +40,6 @@ from eventsrc.envelope.system_events import (
     REJECTED_KEY,
     Embeddings,
     Loss,
-    OccupancyMapEvent,
     RejectedPayload,
     is_system_key,
 )

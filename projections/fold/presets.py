@@ -4,10 +4,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from .map_errors import SettingsError
-
-_MAX_SHOWN: Final = 80
-
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "classic": (
@@ -19,12 +15,4 @@ PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Settings by name, as assignments: each names the rules of places and of fusion."""
-_OLD_NAMES: Final = {"page": "classic"}
-
-
-def preset_assignments(name: str) -> tuple[str, ...]:
-    """The assignments of a preset, also by its old name. Raises SettingsError."""
-    found = PRESETS.get(_OLD_NAMES.get(name, name))
-    if found is None:
-        raise SettingsError(f"no preset {name[:_MAX_SHOWN]!r}; there are {', '.join(PRESETS)}")
-    return found
+OLD_NAMES: Final = {"page": "classic"}

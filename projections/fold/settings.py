@@ -26,7 +26,7 @@ from eventsrc.envelope.model import ANGLE_RAD, HFOV_DEG, PIXELS, Text, describe_
 
 from .evidence import EvidenceConstants
 from .map_errors import SettingsError
-from .presets import preset_assignments
+from .presets import OLD_NAMES, PRESETS
 
 _MAX_SHOWN = 80
 _MOST_CONSTANTS = 4
@@ -286,7 +286,6 @@ def _rule(error: ErrorDetails) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value's repr, cut to 80 characters."""
     text = repr(value)
     return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
@@ -297,7 +296,6 @@ def _plain(text: str) -> str:
 
 
 def _dotted(error: ErrorDetails) -> str:
-    """The name of the setting that an error is about."""
     return ".".join(str(part) for part in error["loc"] if part != "[key]")
 
 
@@ -351,6 +349,14 @@ _EXAMPLES = {
     "evidence": "evidence.range_m=1.3",
     "evidence.sizes_m": f"{_SIZES}chair=0.9",
 }
+
+
+def preset_assignments(name: str) -> tuple[str, ...]:
+    """The assignments of a preset, also by its old name. Raises SettingsError."""
+    found = PRESETS.get(OLD_NAMES.get(name, name))
+    if found is None:
+        raise SettingsError(f"no preset {name[:_MAX_SHOWN]!r}; there are {', '.join(PRESETS)}")
+    return found
 
 
 def _split(text: str) -> tuple[str, str]:

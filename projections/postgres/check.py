@@ -35,6 +35,7 @@ from .connection import (
     database_errors,
     describe_target,
     pin_session_settings,
+    statements,
 )
 from .cypher import PARENTS, refuse_without_age
 from .graph_rows import Row, expected_rows
@@ -44,7 +45,6 @@ from .live_fold import LiveFold, batches
 from .map_table import MapRow, map_of, map_rows
 from .origin import command_for, refuse_mismatch, rows_dropped
 from .sink import Checkpoint
-from .statements import statements
 from .vector_rows import VectorRow, new_rows
 from .vector_sink import refuse_older_vectors
 

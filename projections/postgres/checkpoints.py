@@ -13,10 +13,9 @@ from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
 from projections.fold.map_errors import CheckpointMoved, DatabaseError, ProjectionBusy
 
-from .connection import Connection, describe_connection
+from .connection import Connection, describe_connection, statements
 from .labels import SINKS, SinkName
 from .sink import Checkpoint
-from .statements import statements
 
 _COMMENT_PREFIX: Final = "mapfold"
 LOCK_GRACE_S: Final = 1.0

@@ -5,6 +5,10 @@ The graph and the vectors share one database (the default) or have one each. The
 vectors go into the graph's database unless an option says otherwise.
 
 Messages show host, port and database, never a password, and no part of a URL that cannot be parsed.
+
+SQL statements are in ``sql/*.sql``. A file holds several, each under a line ``-- name: …``.
+``{braces}`` are identifiers that `psycopg.sql` quotes, ``%(name)s`` are bind parameters; no value
+gets in otherwise.
 """
 
 import contextlib
@@ -14,7 +18,9 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final, LiteralString
+from functools import cache
+from importlib.resources import files
+from typing import Final, LiteralString, cast
 from urllib.parse import unquote
 
 import psycopg
@@ -27,7 +33,7 @@ from projections.fold.map_errors import DatabaseError, DatabaseUnavailable, Exte
 
 from .data_folder import SUPERUSER, reset_advice
 from .embedded import EmbeddedServer, embedded_log
-from .labels import SinkName
+from .labels import GRAPH, LABELS, SinkName
 
 Connection = psycopg.Connection[TupleRow]
 
@@ -305,3 +311,25 @@ def _without_values(text: str, url: str) -> str:
     for value in set(parts.values()) - public:
         text = text.replace(f'"{value}"', '"…"')
     return text
+
+
+_NAME = re.compile(r"^-- name: (\w+)$", re.MULTILINE)
+
+
+@cache
+def statements(file: str) -> dict[str, sql.SQL]:
+    """The statements of ``sql/<file>.sql`` by name."""
+    text = files("projections.postgres").joinpath("sql", f"{file}.sql").read_text("utf-8")
+    parts = _NAME.split(text)[1:]
+    # The files are part of the program, so their text is as literal as a string here.
+    bodies = {
+        name: cast("LiteralString", body.strip())
+        for name, body in zip(parts[::2], parts[1::2], strict=True)
+    }
+    return {name: sql.SQL(body) for name, body in bodies.items()}
+
+
+@cache
+def tables() -> dict[str, sql.Identifier]:
+    """Identifiers of the label tables by label in lower case, for the ``{braces}``."""
+    return {label.lower(): sql.Identifier(GRAPH, label) for label in LABELS}

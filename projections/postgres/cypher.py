@@ -30,9 +30,8 @@ from psycopg import sql
 from eventsrc.base.text import advised
 from projections.fold.map_errors import ExtensionMissing
 
-from .connection import Connection, connect, describe_connection, extension_version
+from .connection import Connection, connect, describe_connection, extension_version, statements
 from .labels import GRAPH, LABELS
-from .statements import statements
 
 FIRST_ENFORCING_VERSION: Final = (1, 7)
 """The first version of AGE that applies row-level security to what ``cypher()`` writes."""

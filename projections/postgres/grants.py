@@ -5,10 +5,9 @@ from typing import Final
 
 from psycopg import sql
 
-from .connection import Connection
+from .connection import Connection, statements
 from .cypher import FIRST_ENFORCING_VERSION
 from .labels import SINKS, Label
-from .statements import statements
 
 _PRIVILEGES: Final = {
     "SELECT": sql.SQL("SELECT"),

@@ -21,7 +21,7 @@ from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
 from . import map_table, replaced_tables
-from .connection import Connection, describe_connection, ensure_extension
+from .connection import Connection, describe_connection, ensure_extension, statements
 from .cypher import PARENTS, add_policies, policies_apply
 from .grants import copy_privileges
 from .graph_rows import GraphRows, Row, changed_rows, changing_rows, fixed_rows
@@ -45,7 +45,6 @@ from .loader import Load, LoaderName, graph_statement, load_of_graph, unnest_col
 from .map_table import MapRow, map_rows
 from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
 from .sink import PreparedWrite
-from .statements import statements
 
 EARLY: Final[frozenset[Label]] = frozenset({"Observation"})
 """Labels that a rebuild indexes before it writes them. That costs the server more than indexing

@@ -36,7 +36,7 @@ from projections.store.history_recorder import HistoryRecorder, resumed_under_ot
 from projections.store.timeline_cache import TimelineCache
 
 from . import checkpoints
-from .batch_writer import AWAY, Backoff, LostCommits, Writer
+from .batch_writer import AWAY, Backoff, LostCommits, TailPlan, TailProgress, TailReport, Writer
 from .checkpoints import DeadLetter, dead_letter
 from .connection import Targets, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
@@ -48,7 +48,6 @@ from .origin import is_under_other_corrections, replay_advice, rows_dropped
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
 from .sink import Checkpoint
 from .stores import DatabaseSink, Only, Store, open_stores
-from .tail_progress import TailPlan, TailProgress, TailReport
 
 BATCH_EVENTS: Final = 500
 """The most events in one transaction: about half a second of work when behind."""

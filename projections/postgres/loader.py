@@ -34,10 +34,9 @@ from projections.fold.deltas import ObservationAdded
 from projections.fold.exact import to_float32
 from projections.localize.relocalize.camera import CameraValues
 
-from .connection import Connection
+from .connection import Connection, statements
 from .graph_rows import Row
 from .labels import EDGE_LABELS, Label
-from .statements import statements
 from .vector_rows import VectorRow
 
 COPIED: Final = (

@@ -19,10 +19,9 @@ from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.map.view import MapView
 
-from .connection import Connection, describe_connection
+from .connection import Connection, describe_connection, statements
 from .grants import copy_table_privileges
 from .labels import MAP_TABLE
-from .statements import statements
 
 
 class MapRow(NamedTuple):

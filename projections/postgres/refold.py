@@ -34,13 +34,12 @@ from projections.map.view import MapView
 
 from . import checkpoints
 from .checkpoints import DeadLetter, dead_letter
-from .connection import Connection, database_errors, describe_connection
+from .connection import Connection, database_errors, describe_connection, statements
 from .inputs import LogInputs, MapInputs, commands_between
 from .labels import SINKS, TABLE, SinkName
 from .live_fold import LiveFold, batches
 from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, swap_in_new_map
 from .sink import Checkpoint, Shadow
-from .statements import statements
 from .stores import DatabaseSink, Store
 from .vector_sink import READERS, count_vectors, has_hnsw
 

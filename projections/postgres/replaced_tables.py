@@ -19,9 +19,8 @@ from typing import Final
 
 from psycopg import sql
 
-from .connection import Connection
+from .connection import Connection, statements
 from .labels import SINKS, SinkName
-from .statements import statements
 
 WAIT_SECONDS: Final = 10.0
 POLL_SECONDS: Final = 0.01

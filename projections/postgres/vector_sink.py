@@ -29,13 +29,18 @@ from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
 from . import replaced_tables
-from .connection import Connection, describe_connection, ensure_extension, extension_version
+from .connection import (
+    Connection,
+    describe_connection,
+    ensure_extension,
+    extension_version,
+    statements,
+)
 from .grants import copy_privileges
 from .labels import TABLE, SinkName
 from .loader import Load, LoaderName, load_of_vectors
 from .replaced_tables import try_drop_lock, wait_for_drop
 from .sink import PreparedWrite
-from .statements import statements
 from .vector_rows import VectorRow, new_rows
 
 READERS: Final = "public"

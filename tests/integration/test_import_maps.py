@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from eventsrc.envelope.occupancy_map import decode_map
-from eventsrc.envelope.system_events import (
-    MAP_KEY,
-    REJECTED_KEY,
-    OccupancyMapEvent,
-    RejectedPayload,
-)
+from eventsrc.envelope.occupancy_map import OccupancyMapEvent, decode_map
+from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import LogWriter
 from eventsrc.log.flat_schema import flat_schema
 from eventsrc.record.transport.session import Session

@@ -12,8 +12,7 @@ from eventsrc.envelope.model import Offset
 from projections.fold.map_errors import DatabaseError, FoldError, ImpossibleCommand
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
-from projections.postgres.connection import Targets
-from projections.postgres.statements import statements
+from projections.postgres.connection import Targets, statements
 from projections.postgres.status import projection_status
 from tests.support.logs import (
     append_command,

@@ -16,10 +16,10 @@ from eventsrc.record.append import append_payload
 from projections.fold.map_errors import ProjectionBusy, ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, TailProgress, TailReport, rebuild, tail
+from projections.postgres.batch_writer import serving_tail_metrics
 from projections.postgres.connection import Targets
 from projections.postgres.rebuild import retry
 from projections.postgres.status import projection_status
-from projections.postgres.tail_progress import serving_tail_metrics
 from tests.support.envelopes import envelope, payload
 from tests.support.logs import append_raw, bridge, walk, write_log
 from tests.support.rows import all_rows

@@ -11,12 +11,12 @@ from eventsrc.envelope.grey_images import encode_png
 from eventsrc.envelope.occupancy_map import (
     MAX_MAP_BYTES,
     MAX_MAP_CELLS,
+    MAX_MAP_SIDE,
     InvalidMap,
     OccupancyMap,
     decode_map,
     read_map_head,
 )
-from eventsrc.envelope.system_events import MAX_MAP_SIDE
 from tests.support.maps import drawn_map
 
 HOUSE = drawn_map("##### #..?# #...#", 0.05, (-1.0, 2.5, 0.3), "house")

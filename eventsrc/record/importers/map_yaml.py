@@ -34,12 +34,14 @@ from eventsrc.envelope.ingest import abbreviate
 from eventsrc.envelope.model import Position, describe_error
 from eventsrc.envelope.occupancy_map import (
     MAX_MAP_CELLS,
+    MAX_MAP_SIDE,
     OCCUPIED,
     UNKNOWN,
     InvalidMap,
+    MapYaw,
     OccupancyMap,
+    Resolution,
 )
-from eventsrc.envelope.system_events import MAX_MAP_SIDE, MapYaw, Resolution
 
 MAX_YAML_BYTES = 64 * 1024
 MAX_IMAGE_BYTES = 128 * 1024 * 1024

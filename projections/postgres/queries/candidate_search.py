@@ -51,12 +51,13 @@ from projections.postgres.connection import (
     database_errors,
     describe_connection,
     describe_target,
+    statements,
+    tables,
 )
 from projections.postgres.cypher import refuse_without_age
 from projections.postgres.graph_rows import text
 from projections.postgres.labels import LABEL_IDS
 from projections.postgres.map_table import read_with_key
-from projections.postgres.statements import statements, tables
 
 from .candidate_rows import (
     NO_LINKS,

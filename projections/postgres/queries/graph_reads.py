@@ -15,9 +15,14 @@ from eventsrc.base.text import advised
 from projections.fold.map_errors import ProjectionMissing
 from projections.map.naming import ShortIds
 from projections.map.phrases import seen_times
-from projections.postgres.connection import Connection, database_errors, describe_target
+from projections.postgres.connection import (
+    Connection,
+    database_errors,
+    describe_target,
+    statements,
+    tables,
+)
 from projections.postgres.labels import graphid_base, number_of
-from projections.postgres.statements import statements, tables
 
 
 def _read_square(connection: Connection, kind: str, x: float, y: float, r: float) -> list[Any]:

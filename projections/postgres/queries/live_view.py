@@ -35,8 +35,7 @@ from projections.map.records import (
 )
 from projections.map.view import MapView
 from projections.postgres import checkpoints, map_table
-from projections.postgres.connection import Connection, describe_connection
-from projections.postgres.statements import statements, tables
+from projections.postgres.connection import Connection, describe_connection, statements, tables
 
 from .graph_reads import map_errors
 

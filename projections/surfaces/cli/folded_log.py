@@ -20,8 +20,8 @@ from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.map_errors import SettingsError
-from projections.fold.presets import PRESETS, preset_assignments
-from projections.fold.settings import Settings, read_settings
+from projections.fold.presets import PRESETS
+from projections.fold.settings import Settings, preset_assignments, read_settings
 from projections.map.own_events import read_corrections
 
 from .terminal import say

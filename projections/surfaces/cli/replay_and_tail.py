@@ -29,10 +29,10 @@ from projections.postgres import (
     rebuild,
     tail,
 )
+from projections.postgres.batch_writer import serving_tail_metrics
 from projections.postgres.labels import SinkName
 from projections.postgres.loader import LoaderName
 from projections.postgres.origin import command_line
-from projections.postgres.tail_progress import serving_tail_metrics
 
 from .folded_log import LogSettings, W
 from .options import Databases, JsonOption

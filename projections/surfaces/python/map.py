@@ -21,8 +21,7 @@ from projections.ask.what_changed import MapChanges, map_changes
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
-from projections.fold.presets import preset_assignments
-from projections.fold.settings import CameraConstants, Settings, read_settings
+from projections.fold.settings import CameraConstants, Settings, preset_assignments, read_settings
 from projections.localize.relocalize import (
     Answer,
     ExactIndex,
