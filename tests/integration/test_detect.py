@@ -25,7 +25,6 @@ from eventsrc.adapters.detector.vision_models import (
     read_preparation,
 )
 from eventsrc.adapters.sim import build_house
-from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
 from eventsrc.envelope.crops import MAX_CROP_BYTES, decode_crop
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.envelope.model import RunId
@@ -35,6 +34,7 @@ from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from tests.support.commands import Commands
+from tests.support.drawn_pictures import camera_pictures, publish_pictures, write_pictures
 from tests.support.fixtures_zenoh import DEADLINE_S, Program
 from tests.support.models import MODEL_NAME, fixed_answer, models_for
 from tests.support.scenes import truth_of
@@ -146,7 +146,11 @@ def test_over_zenoh_into_a_map(
 
 
 def test_a_camera_over_zenoh(
-    stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]
+    stage: Stage,
+    tmp_path: Path,
+    endpoint: str,
+    start: Callable[..., Program],
+    connected: Callable[[], Session],
 ) -> None:
     """Each picture sent was looked at or counted as dropped; keyframes have their poses."""
     out = tmp_path / "live.jsonl"
@@ -156,11 +160,7 @@ def test_a_camera_over_zenoh(
         *("--queue", "1000", "--out", str(out), "--json"),
     )
     detect.wait_for("detecting in robot/image")
-    robot = start(
-        "simulate", *keys, "--fps", "0.1", "--speed", "0", "--connect", endpoint, "--json"
-    )
-    assert robot.wait() == 0, robot.lines
-    sent = json.loads(robot.output())["pictures"]
+    sent = publish_pictures(connected(), camera_pictures(per_s=0.1), *keys[1::2])
     code = detect.end(signal.SIGINT)
     said = json.loads(detect.output())
     assert said["pictures"] + said["dropped"] == sent

@@ -1,12 +1,14 @@
 """The map made from drawn pictures is as right as that of the simulator's own detector."""
 
 import json
+import threading
 from pathlib import Path
 
 import pytest
 
 from eventsrc.adapters.sim import build_house
 from tests.support.commands import Commands
+from tests.support.drawn_pictures import camera_pictures, write_pictures
 from tests.support.models import models_for
 from tests.support.scenes import truth_of
 
@@ -18,7 +20,7 @@ def test_objects_and_rooms_are_as_with_the_built_in_detector(tmp_path: Path, run
     """V against the truth within 0.05, of objects under the default rule and of places as rooms."""
     mapfold = Commands.in_folder(tmp_path)
     detector, encoder = models_for(build_house(7), tmp_path)
-    mapfold("simulate", "--run", run, "--camera", "camera")
+    write_pictures(camera_pictures(run=run), tmp_path / "camera", threading.Event())
     mapfold(
         *("detect", "--images", "camera", "--poses", "camera/poses.csv", "--out", "seen.jsonl"),
         *("--detector", detector, "--encoder", encoder, "--threads", "1"),

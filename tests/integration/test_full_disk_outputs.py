@@ -26,7 +26,6 @@ COMMANDS = {
     "draw pdf": ("draw", "log", "--out", "out/m.pdf"),
     "whatif": ("whatif", "log", "--set", "eps_m=1", "--picture", "out/m.svg"),
     "simulate": ("simulate", "--out", "out/run.jsonl"),
-    "camera": ("simulate", "--fps", "0.01", "--camera", "out"),
 }
 OLD = b"what was there before\n"
 
@@ -61,7 +60,7 @@ def written_on_full_disk(mapfold: Commands, arguments: tuple[str, ...]) -> str:
 def test_a_limit_of_size(mapfold: Commands, name: str) -> None:
     arguments, out = COMMANDS[name], mapfold.folder / "out"
     out.mkdir()
-    if name not in ("--csv", "camera", "simulate"):
+    if name not in ("--csv", "simulate"):
         (mapfold.folder / arguments[-1]).write_bytes(OLD)
     said = written_on_full_disk(mapfold, arguments)
     failure = [line for line in said.splitlines() if "could not be written" in line]
@@ -89,7 +88,7 @@ def small_disk(mapfold: Commands) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("--layout", "camera")])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "--layout"])
 def test_a_full_file_system(mapfold: Commands, small_disk: Path, name: str) -> None:
     fill = small_disk / "fill"
     with fill.open("wb", buffering=0) as file:

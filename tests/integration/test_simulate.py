@@ -73,16 +73,3 @@ def test_an_unwritable_place_is_one_clear_line(tmp_path: Path) -> None:
     assert done.code == 2
     assert len(done.err.strip().splitlines()) == 1
     assert "cannot be written" in done.err
-
-
-def test_a_camera_instead_of_a_detector(tmp_path: Path) -> None:
-    done = _mapfold("simulate", "--camera", str(tmp_path / "c"), "--fps", "0.05", "--json")
-    numbers = json.loads(done.out)
-    assert numbers["pictures"] == len(list((tmp_path / "c").glob("*.jpg"))) > 5
-    assert f"{numbers['pictures']} pictures to {tmp_path / 'c'}" in done.err
-    both = _mapfold("simulate", "--camera", str(tmp_path / "d"), "--out", str(tmp_path / "o"))
-    assert both.code == 2
-    assert "give one of them" in both.err
-    again = _mapfold("simulate", "--camera", str(tmp_path / "c"))
-    assert again.code == 2
-    assert "this folder is not empty" in again.err

@@ -13,8 +13,8 @@ from eventsrc.adapters.detector.picture import PictureError, check_picture, spli
 from eventsrc.adapters.detector.picture_sources import picture_of
 from eventsrc.adapters.detector.poses import MessageError, pose_of
 from eventsrc.adapters.detector.vision import encode_jpeg
-from eventsrc.adapters.sim.pictures import compressed_image
 from eventsrc.envelope.grey_images import encode_png
+from tests.support.drawn_pictures import compressed_image
 
 _PIXELS = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8)
 JPEG, PNG = encode_jpeg(_PIXELS), encode_png(_PIXELS[:, :, 0])

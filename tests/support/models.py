@@ -1,6 +1,6 @@
 """ONNX models with known weights: a detector that finds coloured boxes, an encoder of mean colours.
 
-They are made for the pictures of `eventsrc.adapters.sim.pictures`, whose colours lie on a lattice
+They are made for the pictures of `tests.support.drawn_pictures`, whose colours lie on a lattice
 of five levels a channel, and they are real models: onnxruntime runs them as it runs any other.
 
 Logs that keep crops, and encoders of them whose vectors a test can work out.
@@ -20,7 +20,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from eventsrc.adapters.reembedding import Vector
 from eventsrc.adapters.sim.house import House
-from eventsrc.adapters.sim.pictures import Colour, thing_colours
 from eventsrc.envelope.crops import (
     CROP_ENCODING,
     CROP_SCHEMA,
@@ -32,6 +31,7 @@ from eventsrc.envelope.crops import (
 from eventsrc.envelope.model import DetId
 from eventsrc.log import NEVER, LogWriter, MessageFormat
 from eventsrc.record.append import append_payload
+from tests.support.drawn_pictures import Colour, thing_colours
 from tests.support.envelopes import detection, embedding, envelope, payload
 
 OPSET = 17

@@ -22,9 +22,9 @@ from eventsrc.adapters.detector.poses import (
     poses_of_file,
 )
 from eventsrc.adapters.detector.vision import encode_jpeg
-from eventsrc.adapters.sim.pictures import compressed_image
 from eventsrc.base.errors import MisuseError
 from eventsrc.record.transport.session import Received
+from tests.support.drawn_pictures import compressed_image
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 JPEG = encode_jpeg(PIXELS)

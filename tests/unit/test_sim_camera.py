@@ -21,15 +21,15 @@ from eventsrc.adapters.sim.detector import (
 )
 from eventsrc.adapters.sim.drive import TruePose, drive
 from eventsrc.adapters.sim.house import House
-from eventsrc.adapters.sim.pictures import (
+from eventsrc.adapters.sim.simulation import plan_tour
+from eventsrc.base.errors import MisuseError
+from tests.support.drawn_pictures import (
     Camera,
     CameraPicture,
     camera_pictures,
     thing_colours,
     write_pictures,
 )
-from eventsrc.adapters.sim.simulation import plan_tour
-from eventsrc.base.errors import MisuseError
 from tests.support.thorough import mostly_slow
 
 STEP_M = 0.004

@@ -1,31 +1,22 @@
-"""`mapfold simulate`: a simulated robot, its detector or its camera."""
+"""`mapfold simulate`: a simulated robot and its detector."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
 from eventsrc.adapters.sim import DEFAULT_SEED, SimulatedRun, simulate_run
-from eventsrc.adapters.sim.pictures import (
-    PER_S,
-    CameraPicture,
-    camera_pictures,
-    publish_pictures,
-    write_pictures,
-)
 from eventsrc.adapters.sim.simulation import publish_run, write_run
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
 from eventsrc.record.transport.config import check_key
-from eventsrc.record.transport.session import ZenohOptions, check_keys, open_session
+from eventsrc.record.transport.session import ZenohOptions, open_session
 
 from .new_log import NewLogOptions
 from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
-_CAMERA: Final = "Camera"
 _MAX_NAME: Final = 100
 
 
@@ -48,37 +39,6 @@ def simulate(
     speed: Annotated[
         float, typer.Option(metavar="X", help="Times real time; 0: without waiting.", min=0.0)
     ] = 10.0,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Draw what the robot sees: write pictures, poses.csv and truth.jsonl there, for"
-            " `mapfold detect`; publish nothing.",
-            rich_help_panel=_CAMERA,
-        ),
-    ] = None,
-    zenoh_image: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KEY",
-            help="Publish drawn pictures there, and poses under --zenoh-pose, instead of"
-            " keyframes.",
-            rich_help_panel=_CAMERA,
-        ),
-    ] = None,
-    zenoh_pose: Annotated[
-        str, typer.Option(metavar="KEY", help="Key of the poses.", rich_help_panel=_CAMERA)
-    ] = "tb/pose",
-    fps: Annotated[
-        float,
-        typer.Option(
-            metavar="N",
-            min=0.0,
-            max=20.0,
-            help="Pictures a second of driving; 0: one for each keyframe.",
-            rich_help_panel=_CAMERA,
-        ),
-    ] = PER_S,
     new_log: NewLogOptions,
     wait: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
@@ -90,8 +50,7 @@ def simulate(
 
     A robot drives through a house generated from a seed; its keyframes are published or written to
     a file. The ground truth (room and instance) goes to a file beside --out, never into the
-    messages. With --camera or --zenoh-image it has a camera instead of a detector: pictures of
-    coloured boxes, for `mapfold detect`.
+    messages.
     """
     if not run.isprintable() or not 1 <= len(run) <= _MAX_NAME:
         raise MisuseError(f"--run {run!r}: give a name of 1 to {_MAX_NAME} printable characters")
@@ -99,21 +58,6 @@ def simulate(
     settings = new_log.for_file(out)
     if settings is not None:  # the same file each time
         settings = settings.model_copy(update={"command_id": f"sim-{seed}-{run}-settings"})
-    if camera is not None or zenoh_image is not None:
-        if out is not None or (camera is not None and zenoh_image is not None):
-            raise MisuseError("--out, --camera and --zenoh-image: give one of them")
-        pictures = camera_pictures(seed, run, per_s=fps)
-        if camera is not None:
-            taken, where = _write_pictures(pictures, camera), str(camera)
-        else:
-            keys = (zenoh_image or "", zenoh_pose)
-            check_keys(keys)
-            taken = _publish_pictures(pictures, peer.zenoh, keys, speed, wait)
-            where = keys[0]
-        say(f"sim-{seed}-{run}: {counted(taken, 'picture')} to {where}")
-        if json_:
-            emit({"run_id": f"sim-{seed}-{run}", "pictures": taken, "to": where})
-        return
     simulated = simulate_run(seed, run)
     document = _numbers(simulated)
     if out is not None:
@@ -134,22 +78,6 @@ def _publish(
 ) -> int:
     with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
         return publish_run(session, simulated, key, speed=speed, wait_s=wait_s, stop=stop)
-
-
-def _write_pictures(pictures: Iterator[CameraPicture], folder: Path) -> int:
-    with stop_on_signals() as stop:
-        return write_pictures(pictures, folder, stop)
-
-
-def _publish_pictures(
-    pictures: Iterator[CameraPicture],
-    options: ZenohOptions,
-    keys: tuple[str, str],
-    speed: float,
-    wait_s: float,
-) -> int:
-    with stop_on_signals() as stop, open_session(options, mode=options.mode) as session:
-        return publish_pictures(session, pictures, *keys, speed=speed, wait_s=wait_s, stop=stop)
 
 
 def _numbers(simulated: SimulatedRun) -> dict[str, Any]:

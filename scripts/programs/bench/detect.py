@@ -29,8 +29,8 @@ from eventsrc.adapters.detector.vision_models import (
     read_preparation,
 )
 from eventsrc.adapters.sim import build_house
-from eventsrc.adapters.sim.pictures import camera_pictures, write_pictures
 from eventsrc.envelope.model import RunId
+from tests.support.drawn_pictures import camera_pictures, write_pictures
 from tests.support.models import models_for
 
 MOST_ADDED_MS = 8.0

@@ -1,5 +1,5 @@
 """Draw the pictures of the simulated robot's camera along a drive, with poses and truth, and write
-them to a folder or publish them over Zenoh.
+them to a folder.
 
 For each column of a picture a ray is cast over the floor plan; walls and things are upright, so a
 hit is a stretch of that column. Nearer surfaces hide farther ones, pixel by pixel. Colours are
@@ -9,8 +9,7 @@ one class apart. Things of one class have hues as different as possible.
 
 A folder gets a JPEG for each picture, named by the time it was taken, ``poses.csv`` with a pose of
 the localisation for each, and ``truth.jsonl`` with the things that each shows; `mapfold detect`
-reads the first two. Over Zenoh a picture is sensor_msgs/CompressedImage in CDR, as a bridge of
-ROS 2 sends it, preceded by its pose in JSON.
+reads the first two.
 """
 
 import itertools
@@ -26,28 +25,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.adapters.detector.vision import encode_jpeg
-from eventsrc.base.errors import MisuseError
-from eventsrc.base.progress import reported
-from eventsrc.base.text import advised
-from eventsrc.base.user_files import write_files, written_whole
-from eventsrc.envelope.model import RunId
-from eventsrc.record.transport.session import Session
-
-from .detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, Box
-from .drive import TruePose, drive, keyframes
-from .floorplan import Rect
-from .house import House, build_house
-from .random_streams import stream
-from .simulation import (
+from eventsrc.adapters.sim.detector import CAMERA_HEIGHT_M, FOCAL_PX, HEIGHT_PX, WIDTH_PX, Box
+from eventsrc.adapters.sim.drive import TruePose, drive, keyframes
+from eventsrc.adapters.sim.floorplan import Rect
+from eventsrc.adapters.sim.house import House, build_house
+from eventsrc.adapters.sim.random_streams import stream
+from eventsrc.adapters.sim.simulation import (
     DEFAULT_SEED,
     EXPLORER,
     encode,
     noisy_pose,
-    paced,
     plan_tour,
     start_of,
     subscribed,
 )
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.progress import reported
+from eventsrc.base.user_files import write_files, written_whole
+from eventsrc.envelope.model import RunId
+from eventsrc.record.transport.session import Session
 
 Colour = tuple[int, int, int]
 """Red, green and blue."""
@@ -302,10 +298,10 @@ def write_pictures(pictures: Iterator[CameraPicture], folder: Path, stop: thread
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise MisuseError(f"--camera {folder}: this folder is not empty; choose another")
+            raise MisuseError(f"{folder}: this folder is not empty; choose another")
     except OSError as error:
         raise MisuseError(
-            f"--camera {folder}: cannot be written: {error.strerror}; choose another"
+            f"{folder}: cannot be written: {error.strerror}; choose another"
         ) from None
     with (
         written_whole(folder / "poses.csv") as poses,
@@ -325,23 +321,13 @@ def write_pictures(pictures: Iterator[CameraPicture], folder: Path, stop: thread
 
 
 def publish_pictures(
-    session: Session,
-    pictures: Iterator[CameraPicture],
-    image_key: str,
-    pose_key: str,
-    *,
-    speed: float,
-    wait_s: float,
-    stop: threading.Event,
+    session: Session, pictures: Iterator[CameraPicture], image_key: str, pose_key: str
 ) -> int:
-    """Publish pictures and poses, ``speed`` times as fast as the robot drove (0: unpaced), until
-    ``stop`` is set; return the number of pictures. Raises TransportError if there is no subscriber
-    within ``wait_s`` seconds."""
+    """Publish pictures and poses to a subscriber; return the number of pictures."""
     poses = session.publisher(pose_key)
-    command = advised("detect", "--zenoh-image", image_key)
-    images = subscribed(session, image_key, wait_s, command)
+    images = subscribed(session, image_key, 30.0, "mapfold detect")
     sent = 0
-    for picture in paced(((each, each.time_s) for each in pictures), speed, stop):
+    for picture in pictures:
         poses.put(encode({"stamp": picture.stamp_s, **picture.pose}))
         images.put(compressed_image(picture.stamp_s, picture.jpeg))
         sent += 1
