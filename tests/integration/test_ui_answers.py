@@ -211,6 +211,22 @@ def test_search(server: UiServer) -> None:
     assert server.api("search", q="no such thing")["found"] == []
 
 
+def test_find_is_that_of_the_command(server: UiServer, mapfold: Commands) -> None:
+    for query in (
+        {"what": "chairs"},
+        {"in": "p3", "top": 3, "all": 1, "at": 300, "set": WIDE},
+        {"what": "chair", "near": "0,0", "set": WIDE},
+    ):
+        answer = server.api("find", **query)
+        assert answer["answers"]
+        printed = json.loads(run(mapfold, answer["command"], "--json"))
+        assert {name: answer[name] for name in printed} == printed
+    refused = server.ask("/api/find", what="unicorn")
+    assert refused.status == 400
+    assert "no class like 'unicorn'" in refused.error[2]
+    assert server.ask("/api/find", what="chair", top=0).status == 400
+
+
 @pytest.mark.parametrize(
     ("path", "status", "kind", "said"),
     [

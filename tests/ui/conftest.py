@@ -6,12 +6,13 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from shutil import copytree
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.support import logs
 from tests.support.commands import Commands
-from tests.support.logs import sample_drive
 from tests.support.shared_data import ROOT
 from tests.support.ui_page import UiServer, showing
 
@@ -30,7 +31,7 @@ else:
     collect_ignore_glob = ["test_*.py"]
 
 WIDE = ("--set", "eps_m=1.0", "--set", "min_samples=8")
-SAMPLE = sample_drive()
+SAMPLE = logs.sample_drive()
 Visit = Callable[..., "Page"]
 
 
@@ -49,6 +50,15 @@ def mapfold(tmp_path_factory: pytest.TempPathFactory) -> Commands:
 def sample(mapfold: Commands) -> Iterator[UiServer]:
     """The sample log under the settings of docs/time-travel.md."""
     with showing(mapfold, SAMPLE, *WIDE) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def rooms(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Iterator[UiServer]:
+    """A copy of logs/sample under its own settings: walls, and rooms with types."""
+    with showing(
+        mapfold, copytree(logs.SAMPLE, tmp_path_factory.mktemp("rooms") / "sample")
+    ) as server:
         yield server
 
 

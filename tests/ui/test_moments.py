@@ -59,6 +59,34 @@ def test_the_map_at_a_moment_is_that_of_state(
     expect(page.get_by_role("option").first).to_contain_text("bathtub")
 
 
+def test_search_is_find_and_its_answers_are_walked_on_the_map(
+    rooms: UiServer, visit: Visit
+) -> None:
+    answers = rooms.api("find", what="chairs", top=20)["answers"]
+    assert len(answers) >= 3
+    page = visit(rooms)
+    plain = pixels(page)
+    search = page.get_by_label("Search places")
+    search.fill("chairs")
+    shown = page.get_by_role("option")
+    expect(shown.first).to_contain_text(answers[0]["object_id"][:10])
+    for option, answer in zip(shown.all(), answers, strict=False):
+        expect(option).to_contain_text(f"seen {answer['obs_count']} times")
+        expect(option).to_contain_text(answer["last_seen"]["iso"][:16].replace("T", " "))
+        expect(option).to_contain_text(answer["place_type"] or answer["place_id"])
+    first = other_pixels(page, plain)  # all of them marked
+    search.press("ArrowDown")
+    expect(shown.nth(1)).to_have_attribute("aria-selected", "true")
+    other_pixels(page, first)
+    search.press("Enter")
+    expect(page).to_have_url(re.compile(f"select=object%3A{answers[1]['object_id']}"))
+    search.fill("kitchen")
+    expect(shown.first).to_contain_text("kitchen")
+    expect(shown.first).to_contain_text("place")
+    search.fill("unicorn")
+    expect(shown.first).to_contain_text("no class like 'unicorn'")
+
+
 def test_hovering_tells_what_is_there_and_a_click_selects_it(
     sample: UiServer, visit: Visit
 ) -> None:

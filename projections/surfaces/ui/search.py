@@ -1,4 +1,5 @@
-"""Search by name: places, objects (also by class), detections, keyframes and runs."""
+"""Objects as `projections.ask` finds them, and things by name: places, objects (also by class),
+detections, keyframes and runs."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
@@ -7,6 +8,7 @@ from typing import Any, Final
 from starlette.datastructures import QueryParams
 
 from eventsrc.envelope.model import Offset
+from projections.ask.find import Wanted, find
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, ObservationOrdinal
 from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
@@ -16,7 +18,7 @@ from projections.map.records import ObservationRecord
 from projections.store.history import History
 
 from .log_map import LogMap
-from .requests import AskedPoint, text_of
+from .requests import AskedPoint, number_of, text_of
 
 MOST_FOUND: Final = 50
 _MOST_TEXT: Final = 300
@@ -124,6 +126,24 @@ def search_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         **asked.document(),
         "found": [each for _, _, each in found[:MOST_FOUND]],
         "more": max(0, len(found) - MOST_FOUND),
+    }
+
+
+def find_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """What ``mapfold find WHAT --json`` answers."""
+    asked = AskedPoint.of(shown, query)
+    what, place, near = (query.get(name) or None for name in ("what", "in", "near"))
+    top, every = number_of(query, "top", Wanted.top), number_of(query, "all", 0) > 0
+    if top == 0:
+        raise QuestionError("top is 0; give how many answers there may be")
+    wanted = Wanted(what=what, room=place, near=near, top=top, every=every)
+    words = [] if what is None else [what]
+    words += [w for name in ("in", "near") if query.get(name) for w in (f"--{name}", query[name])]
+    words += ["--top", str(top), *(["--all"] if every else [])]
+    return {
+        **asked.document(),
+        **find(asked.known.at(asked.end), wanted).document(),
+        "command": asked.command("find", *words),
     }
 
 

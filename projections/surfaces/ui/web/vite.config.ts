@@ -3,29 +3,6 @@ import { type Plugin, defineConfig } from "vite";
 
 const NO_ANIMATION = new URL("src/map/no_animation.ts", import.meta.url).pathname;
 
-/** What uPlot offers at its end and the timeline does not use: a tenth of it. */
-const UNUSED = [
-  "uPlot.join = join;", "(paths.bars    = bars);", "(paths.spline  = monotoneCubic);", "(paths.linear  = linear);",
-  "uPlot.fmtNum = fmtNum;", "uPlot.rangeNum = rangeNum;", "uPlot.rangeLog = rangeLog;", "uPlot.rangeAsinh = rangeAsinh;",
-  "uPlot.orient   = orient;", "uPlot.fmtDate = fmtDate;", "uPlot.tzDate  = tzDate;", "uPlot.sync = _sync;",
-  "uPlot.assign = assign;", "uPlot.addGap = addGap;", "uPlot.clipGaps = clipGaps;",
-];
-
-/** Leaves it out, and says so when another version of uPlot is written differently. */
-function withoutUnused(): Plugin {
-  return {
-    name: "without-unused",
-    transform(code, id) {
-      if (!id.endsWith("/uPlot.esm.js")) return null;
-      for (const line of UNUSED) {
-        if (!code.includes(line)) throw new Error(`${id} has no line ${line}`);
-        code = code.replace(line, "");
-      }
-      return { code, map: null };
-    },
-  };
-}
-
 /** Minifies again what Vite has minified: a hundredth less. */
 function smaller(): Plugin {
   return {
@@ -44,7 +21,7 @@ function smaller(): Plugin {
 // Content-Security-Policy, and continuous integration compares the bytes of a new build.
 export default defineConfig({
   base: "./",
-  plugins: [withoutUnused(), smaller()],
+  plugins: [smaller()],
   resolve: { alias: { "d3-transition": NO_ANIMATION, "d3-interpolate": NO_ANIMATION } },
   build: {
     outDir: "../static",

@@ -1,4 +1,3 @@
-import "uplot/dist/uPlot.min.css";
 import "./styles/base.css";
 import "./styles/layout.css";
 import "./styles/panels.css";

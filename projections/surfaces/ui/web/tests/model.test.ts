@@ -5,8 +5,8 @@ import { placeColours } from "../src/model/colours";
 import { compareMoments } from "../src/model/compare";
 import { mapAt, shownObjects } from "../src/model/map_at";
 import { Stamps, momentsOf, neighbour, playedTo } from "../src/model/moments";
-import { findKeyframe, keyframeId, label } from "../src/model/names";
-import { searchLocally } from "../src/model/search";
+import { findKeyframe, keyframeId, label, shortPlace } from "../src/model/names";
+import { foundHit, searchLocally } from "../src/model/search";
 import { completions, quoted } from "../src/panels/completion";
 import { objectsText } from "../src/ui/summary";
 import { encoded, randomTables } from "./histories";
@@ -113,12 +113,24 @@ describe("names", () => {
     expect(label("a\u0000b\nc")).toBe("a\ufffdb\ufffdc");
     expect(label("x".repeat(256)).length).toBe(28);
   });
-  it("searches places, objects and keyframes", () => {
+  it("searches places, also by their type of room, and keyframes", () => {
     const map = mapAt(history, history.through);
-    expect(searchLocally(history, map, "p0")[0].thing).toEqual({ kind: "place", id: "r_p0" });
-    expect(searchLocally(history, map, "OBJ-1")[0].thing.kind).toBe("object");
-    expect(searchLocally(history, map, keyframeId(history, 3))[0].thing).toEqual({ kind: "keyframe", id: keyframeId(history, 3) });
-    expect(searchLocally(history, map, "  ")).toEqual([]);
+    const types = new Map([[history.placeIds[map.places[1]], { place_id: "", type: "kitchen", probability: 0.9, candidates: [] }]]);
+    const found = (typed: string) => searchLocally(history, map, types, typed).map(({ thing }) => thing);
+    expect(found("p0")[0]).toEqual({ kind: "place", id: "r_p0" });
+    expect(found("Kitchen")).toEqual([{ kind: "place", id: history.placeIds[map.places[1]] }]);
+    expect(found(keyframeId(history, 3))[0]).toEqual({ kind: "keyframe", id: keyframeId(history, 3) });
+    expect(found("  ")).toEqual([]);
+  });
+  it("tells answers apart by room, count, time and id", () => {
+    const map = mapAt(history, history.through);
+    const found = { object_id: "obj-0123456789", class_name: "chair", place_id: history.placeIds[map.places[0]], place_name: null, place_type: "kitchen", obs_count: 12, last_seen: { iso: "2026-03-24T13:05:09Z" }, missing_in: "r" };
+    expect(foundHit(history, found)).toEqual({
+      thing: { kind: "object", id: "obj-0123456789" },
+      title: "chair",
+      more: `kitchen ${shortPlace(history, map.places[0])} · missing in r · seen 12 times · last 2026-03-24 13:05 · obj-012345`,
+      from: null,
+    });
   });
 });
 

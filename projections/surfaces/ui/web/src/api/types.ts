@@ -51,6 +51,36 @@ export interface PlaceType {
   candidates: [string, number][];
 }
 
+/** An Object that `mapfold find --json` answers with; docs/find.md has all of it. */
+export interface FoundObject {
+  object_id: string;
+  class_name: string;
+  place_id: string | null;
+  place_name: string | null;
+  place_type: string | null;
+  obs_count: number;
+  last_seen: { iso: string };
+  missing_in: string | null;
+}
+
+export interface FoundObjects {
+  match: string;
+  classes: string[];
+  count: number;
+  unconfirmed: number;
+  answers: FoundObject[];
+}
+
+/** A thing whose name has a text. `number` is its row, that of the keyframe for a detection. */
+export interface NamedThing {
+  kind: string;
+  id: string;
+  number: number;
+  text: string;
+  offset: number;
+  stands: boolean;
+}
+
 /** A GeoJSON geometry in metres of the map frame; rings are closed. */
 export type Geometry =
   | { type: "Polygon"; coordinates: number[][][] }

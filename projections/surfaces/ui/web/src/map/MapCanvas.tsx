@@ -134,7 +134,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
 /** The signals that a drawing depends on; the map itself is computed once a frame, in it. */
 function inputs(side: Side) {
   return [
-    store.at, store.view, store.layers, store.selection, store.hovered, store.dark, store.log,
+    store.at, store.view, store.layers, store.selection, store.hovered, store.found, store.dark, store.log,
     side === "main" ? store.history : store.otherHistory,
     store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.mapFacts, walls,
   ];

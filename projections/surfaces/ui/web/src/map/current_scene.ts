@@ -4,6 +4,7 @@ import { difference, shownBridge, shownLost } from "../state/overlays";
 import { differenceOn } from "../model/floors";
 import { walls } from "../state/walls";
 import * as store from "../state/store";
+import { litObject } from "./lit";
 import { DARK, LIGHT } from "./palette";
 import type { Scene } from "./scene";
 
@@ -29,6 +30,7 @@ export function currentScene(side: Side, width: number, height: number): Scene |
     types: main ? store.types.value : new Map(),
     selection: store.selection.value,
     hovered: store.hovered.value,
+    found: new Set(store.found.value.map((thing) => litObject(shown, thing))),
     difference: compared === null ? null : { ...compared, difference: differenceOn(history, compared.difference, floor) },
     bridge: main ? shownBridge.value : null,
     lost: main ? shownLost.value : null,

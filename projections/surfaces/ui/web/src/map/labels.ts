@@ -99,8 +99,8 @@ function objectLabels(scene: Scene): Wanted[] {
   if (!scene.layers.objects) return [];
   const lit = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
   const { x, y, count, missing, confirmed } = history.changes;
-  const isShown = (object: number) => scene.layers.once || confirmed[map.objectRow[object]] === 1 || lit.includes(object);
-  const rank = (object: number) => (lit.includes(object) ? 1e9 : 0) + count[map.objectRow[object]];
+  const isShown = (object: number) => scene.layers.once || confirmed[map.objectRow[object]] === 1 || lit.includes(object) || scene.found.has(object);
+  const rank = (object: number) => (lit.includes(object) ? 1e9 : scene.found.has(object) ? 1e8 : 0) + count[map.objectRow[object]];
   return map.objects
     .filter(isShown)
     .sort((a, b) => rank(b) - rank(a))
@@ -113,7 +113,7 @@ function objectLabels(scene: Scene): Wanted[] {
         away: objectRadius(view.k) + 4,
         text: missing[row] ? `${name} missing` : name,
         font: lit.includes(object) ? LIT_FONT : SMALL_FONT,
-        colour: lit.includes(object) ? palette.accent : missing[row] ? palette.removed : palette.dim,
+        colour: lit.includes(object) || scene.found.has(object) ? palette.accent : missing[row] ? palette.removed : palette.dim,
         always: lit.includes(object),
       };
     });

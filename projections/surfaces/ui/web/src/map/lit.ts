@@ -16,7 +16,7 @@ export function isPlaceLit(scene: Scene, place: number): boolean {
   );
 }
 
-export function litObject(scene: Scene, thing: Thing | null): number {
+export function litObject(scene: Pick<Scene, "history" | "map">, thing: Thing | null): number {
   if (thing?.kind !== "object") return -1;
   const object = findObject(scene.history, thing.id);
   return object < 0 ? -1 : scene.map.objectStandsAs[object];

@@ -41,6 +41,8 @@ export interface Scene {
   types: ReadonlyMap<string, PlaceType>;
   selection: Thing | null;
   hovered: Thing | null;
+  /** Objects that the search found. */
+  found: ReadonlySet<number>;
   difference: { before: MapState; difference: MapDifference } | null;
   bridge: Bridge | null;
   lost: LostOverlay | null;

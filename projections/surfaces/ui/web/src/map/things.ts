@@ -36,7 +36,7 @@ export function drawObjects(on: Surface, scene: Scene) {
   const [selected, hovered] = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
   for (const object of map.objects) {
     const row = map.objectRow[object];
-    const lit = object === selected || object === hovered;
+    const lit = object === selected || object === hovered || scene.found.has(object);
     if (!lit && !scene.layers.once && confirmed[row] === 0) continue;
     const [x, y] = [screenX(view, xs[row]), screenY(view, ys[row])];
     if (!(x > -50 && y > -50 && x < width + 50 && y < height + 50)) continue;
@@ -57,7 +57,7 @@ export function drawObjects(on: Surface, scene: Scene) {
     }
     on.fill();
     on.stroke();
-    if (object === selected || object === hovered) {
+    if (lit) {
       on.beginPath();
       on.arc(x, y, size + 6, 0, 2 * Math.PI);
       on.strokeStyle = palette.accent;

@@ -37,19 +37,23 @@ function numberOf(cache: WeakMap<History, Map<string, number>>, history: History
 export const findPlace = (history: History, id: string) => numberOf(placeNumbers, history, history.placeIds, id);
 export const findObject = (history: History, id: string) => numberOf(objectNumbers, history, history.objectIds, id);
 
-const commonRun = new WeakMap<History, string | null>();
+const shortPlaces = new WeakMap<History, string[]>();
 
-/** `p7` where one run founded every place, else the whole id. */
+/** `p7` where no other place has this number, else the whole id. */
 export function shortPlace(history: History, place: number): string {
-  let run = commonRun.get(history);
-  if (run === undefined) {
-    const prefixes = new Set(history.placeIds.map((id) => id.replace(/_p\d+$/, "")));
-    run = prefixes.size === 1 ? [...prefixes][0] : null;
-    commonRun.set(history, run);
+  let found = shortPlaces.get(history);
+  if (found === undefined) {
+    const numbers = history.placeIds.map((id) => /_(p\d+)$/.exec(id)?.[1] ?? id);
+    const used = new Map<string, number>();
+    for (const each of numbers) used.set(each, (used.get(each) ?? 0) + 1);
+    found = numbers.map((each, number) => (used.get(each) === 1 ? each : history.placeIds[number]));
+    shortPlaces.set(history, found);
   }
-  const id = history.placeIds[place];
-  return run !== null && id.startsWith(`${run}_`) ? id.slice(run.length + 1) : id;
+  return found[place];
 }
+
+/** `obj-` and six digits, as in commands. */
+export const shortObject = (id: string) => id.slice(0, 10);
 
 /** What a place is called, or its short id. */
 export function placeTitle(history: History, map: MapState, place: number): string {

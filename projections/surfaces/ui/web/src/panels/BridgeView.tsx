@@ -125,6 +125,7 @@ function miniScene({ history, map }: Shown, merge: MergeStory, width: number, he
     types: store.types.peek(),
     selection: null,
     hovered: null,
+    found: new Set(),
     difference: null,
     bridge,
     lost: null,

@@ -71,6 +71,8 @@ export const live = signal(false);
 
 export const selection = signal<Thing | null>(null);
 export const hovered = signal<Thing | null>(null);
+/** What the search found, as long as its list is open. */
+export const found = signal<readonly Thing[]>([]);
 export const panel = signal<PanelName | null>("why");
 export const compareMode = signal<CompareMode>("moments");
 /** The other moment of a comparison; null until one is chosen. */

@@ -108,7 +108,8 @@ function TrackView() {
       if (history === null || moments === null || stamps === null) return;
       const palette = store.dark.value ? DARK : LIGHT;
       const byTime = store.byTime.value && stamps.any;
-      track.show({ history, moments, stamps, byTime, palette, found: store.foundAt.value }, () => untracked(place));
+      track.show({ history, moments, stamps, byTime, palette, found: store.foundAt.value });
+      untracked(place);
     };
     const stops = [effect(show), effect(place)];
     const observer = new ResizeObserver(show);

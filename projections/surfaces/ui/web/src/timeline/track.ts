@@ -1,16 +1,15 @@
-/** The density of events with its axis (uPlot), marks above it, and the line at W. */
+/** The density of events with its axis, and marks above it. */
 
-import uPlot from "uplot";
 import type { History } from "../history/types";
 import type { Palette } from "../map/palette";
 import type { Mark, Moments, Stamps } from "../model/moments";
-import { when } from "../ui/summary";
-import { densityOf } from "./density";
+import { densityOf, ticks } from "./density";
 import { ROWS_HEIGHT, ROW_HEIGHT, drawMark, rowOf } from "./marks";
 
 const SIDE = 28;
 const BIN_PIXELS = 4;
 const HIT_PIXELS = 7;
+const AXIS_HEIGHT = 22;
 
 export interface TrackData {
   history: History;
@@ -21,96 +20,51 @@ export interface TrackData {
   found: readonly { offset: number; becomes: boolean }[];
 }
 
-/** Times of ticks in UTC, with the day where they span several. */
-function timeTexts(stamps: number[]): string[] {
-  const days = (stamps[stamps.length - 1] ?? 0) - (stamps[0] ?? 0) > 86_400;
-  return stamps.map((stamp) => when(stamp).slice(days ? 5 : 11, days ? 16 : 19));
-}
-
 export class Track {
-  private plot: uPlot | null = null;
   private data: TrackData | null = null;
-  private readonly host = document.createElement("div");
+  private first = 0;
+  private last = 1;
   private readonly marks = document.createElement("canvas");
 
   constructor(private readonly root: HTMLElement) {
     this.marks.className = "marks";
-    root.append(this.host, this.marks);
+    root.append(this.marks);
   }
 
-  /** Draws; `ready` is called when positions can be asked for. */
-  show(data: TrackData, ready: () => void) {
+  /** Draws; afterwards positions can be asked for. */
+  show(data: TrackData) {
     const [width, height] = [this.root.clientWidth, this.root.clientHeight];
     if (width < 40 || height < 40) return;
     this.data = data;
-    this.plot?.destroy();
-    const { history, stamps, byTime, palette } = data;
-    const bins = Math.max(10, Math.min(history.through || 1, Math.floor((width - 2 * SIDE) / BIN_PIXELS)));
-    const density = densityOf(history, stamps, byTime, bins);
-    const range: [number, number] = byTime ? [stamps.first, stamps.last] : [0, Math.max(1, history.through)];
-    this.plot = new uPlot(
-      {
-        width,
-        height,
-        padding: [ROWS_HEIGHT + 2, SIDE, 0, SIDE],
-        cursor: { show: false },
-        hooks: {
-          ready: [
-            (plot) => {
-              if (plot !== this.plot) return;
-              this.drawMarks();
-              ready();
-            },
-          ],
-        },
-        legend: { show: false },
-        scales: { x: { time: byTime, range }, y: { range: (_, __, most) => [0, Math.max(1, most)] } },
-        axes: [
-          {
-            size: 22,
-            gap: 3,
-            font: "11px system-ui, sans-serif",
-            stroke: palette.dim,
-            grid: { show: false },
-            ...(byTime ? { space: 76, values: (_: uPlot, at: number[]) => timeTexts(at) } : { values: (_: uPlot, at: number[]) => at.map((each) => (each % 1 === 0 ? each.toLocaleString("en") : "")) }),
-            ticks: { stroke: palette.faint, size: 4, width: 1 },
-          },
-          { show: false },
-        ],
-        series: [
-          {},
-          {
-            stroke: palette.faint,
-            fill: palette.dark ? "#2b3138" : "#e3e6ea",
-            width: 1,
-            points: { show: false },
-            paths: uPlot.paths.stepped?.({ align: 1 }),
-          },
-        ],
-      },
-      [density.x, density.count],
-      this.host,
-    );
+    const { history, stamps, byTime } = data;
+    this.first = byTime ? stamps.first : 0;
+    this.last = byTime ? Math.max(stamps.last, stamps.first + 1) : Math.max(1, history.through);
+    const ratio = window.devicePixelRatio || 1;
+    this.marks.width = width * ratio;
+    this.marks.height = height * ratio;
+    const on = this.marks.getContext("2d") as CanvasRenderingContext2D;
+    on.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.drawDensity(on, data, width, height - AXIS_HEIGHT);
+    this.drawAxis(on, data, width, height - AXIS_HEIGHT);
+    this.drawMarks(on, data, height);
   }
 
   destroy() {
-    this.plot?.destroy();
-    this.host.remove();
     this.marks.remove();
   }
 
   /** Where W is, in pixels from the left of the track. */
   xOf(at: number): number {
-    if (this.plot === null || this.data === null) return 0;
+    if (this.data === null) return 0;
     const { stamps, byTime } = this.data;
     return this.xOfValue(byTime ? stamps.of(at) : at);
   }
 
   /** W at a position. */
   atOf(x: number): number {
-    if (this.plot === null || this.data === null) return 0;
+    if (this.data === null) return 0;
     const { stamps, byTime, history } = this.data;
-    const value = this.plot.posToVal(x - SIDE, "x");
+    const value = this.first + ((x - SIDE) / this.width) * (this.last - this.first);
     return byTime ? stamps.at(value) : Math.max(0, Math.min(history.through, Math.round(value)));
   }
 
@@ -124,8 +78,12 @@ export class Track {
     return near.sort((a, b) => Math.abs(this.xOfMark(a) - x) - Math.abs(this.xOfMark(b) - x));
   }
 
+  private get width(): number {
+    return Math.max(1, this.root.clientWidth - 2 * SIDE);
+  }
+
   private xOfValue(value: number): number {
-    return SIDE + (this.plot?.valToPos(value, "x") ?? 0);
+    return SIDE + ((value - this.first) / (this.last - this.first)) * this.width;
   }
 
   private xOfMark(mark: { offset: number; stamp?: number }): number {
@@ -133,15 +91,43 @@ export class Track {
     return this.xOfValue(mark.offset + 1);
   }
 
-  private drawMarks() {
-    if (this.data === null) return;
-    const { moments, palette, found } = this.data;
-    const ratio = window.devicePixelRatio || 1;
-    const [width, height] = [this.root.clientWidth, this.root.clientHeight];
-    this.marks.width = width * ratio;
-    this.marks.height = height * ratio;
-    const on = this.marks.getContext("2d") as CanvasRenderingContext2D;
-    on.setTransform(ratio, 0, 0, ratio, 0, 0);
+  private drawDensity(on: CanvasRenderingContext2D, data: TrackData, width: number, bottom: number) {
+    const bins = Math.max(10, Math.min(data.history.through || 1, Math.floor((width - 2 * SIDE) / BIN_PIXELS)));
+    const counts = densityOf(data.history, this.first, this.last, data.byTime, bins);
+    const most = Math.max(1, ...counts);
+    const bin = this.width / bins;
+    on.beginPath();
+    on.moveTo(SIDE, bottom);
+    counts.forEach((count, number) => {
+      const y = bottom - (count / most) * (bottom - ROWS_HEIGHT - 2);
+      on.lineTo(SIDE + number * bin, y);
+      on.lineTo(SIDE + (number + 1) * bin, y);
+    });
+    on.lineTo(width - SIDE, bottom);
+    on.fillStyle = data.palette.dark ? "#2b3138" : "#e3e6ea";
+    on.fill();
+    on.strokeStyle = data.palette.faint;
+    on.lineWidth = 1;
+    on.stroke();
+  }
+
+  private drawAxis(on: CanvasRenderingContext2D, { byTime, palette }: TrackData, width: number, bottom: number) {
+    on.font = "11px system-ui, sans-serif";
+    on.textAlign = "center";
+    on.textBaseline = "top";
+    on.fillStyle = palette.dim;
+    for (const { value, text } of ticks(this.first, this.last, this.width / (byTime ? 76 : 50), byTime)) {
+      const x = this.xOfValue(value);
+      on.fillText(text, Math.min(x, width - 2 - on.measureText(text).width / 2), bottom + 7);
+      on.beginPath();
+      on.moveTo(x, bottom);
+      on.lineTo(x, bottom + 4);
+      on.strokeStyle = palette.faint;
+      on.stroke();
+    }
+  }
+
+  private drawMarks(on: CanvasRenderingContext2D, { moments, palette, found }: TrackData, height: number) {
     const taken = new Set<string>();
     for (const mark of moments.marks) {
       const x = this.xOfMark(mark);

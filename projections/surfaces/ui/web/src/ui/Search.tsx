@@ -1,11 +1,13 @@
-/** Finds a place, object, class, detection or keyframe; `/` comes here. */
+/** Finds a place, object, class, detection or keyframe; `/` comes here. Objects are what `mapfold
+ * find` answers. What is found is marked on the map, arrow keys go through it. */
 
-import { signal } from "@preact/signals";
+import { batch, effect, signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
-import { address, getJson } from "../api/client";
+import { ApiError, address, getJson } from "../api/client";
+import type { FoundObjects, NamedThing } from "../api/types";
 import { bringIntoView } from "../map/MapCanvas";
-import { keyframeId } from "../model/names";
-import { type Hit, searchLocally } from "../model/search";
+import { label } from "../model/names";
+import { type Hit, foundHit, namedHit, searchLocally } from "../model/search";
 import { goTo, positionOf, select } from "../state/actions";
 import * as store from "../state/store";
 import { Icon } from "./icons";
@@ -14,8 +16,14 @@ const text = signal("");
 const hits = signal<Hit[]>([]);
 const active = signal(0);
 const open = signal(false);
+/** What the server says about the answers, or why there are none. */
+const remark = signal<string | null>(null);
 const ASK_AFTER_MS = 180;
+const MOST_OBJECTS = 20;
+const MOST_NAMED = 12;
 let asking = new AbortController();
+/** Whether Enter was pressed before there was something to choose. */
+let chosenEarly = false;
 
 export function focusSearch() {
   document.querySelector<HTMLInputElement>("#search")?.focus();
@@ -24,31 +32,38 @@ export function focusSearch() {
 export function Search() {
   const timer = useRef(0);
   useEffect(() => () => clearTimeout(timer.current), []);
+  useEffect(
+    () =>
+      effect(() => {
+        const listed = open.value ? hits.value : [];
+        const marked = store.found.peek().length > 0;
+        store.found.value = listed.map(({ thing }) => thing);
+        if (marked || listed.length > 0) store.hovered.value = listed[active.value]?.thing ?? null;
+      }),
+    [],
+  );
   const change = (value: string) => {
-    text.value = value;
-    open.value = true;
-    active.value = 0;
     const [history, map] = [store.history.value, store.map.value];
-    hits.value = history === null || map === null ? [] : searchLocally(history, map, value);
+    asking.abort();
     clearTimeout(timer.current);
+    chosenEarly = false;
+    batch(() => {
+      text.value = value;
+      open.value = true;
+      active.value = 0;
+      remark.value = value.trim() === "" ? null : "…";
+      hits.value = history === null || map === null ? [] : searchLocally(history, map, store.types.value, value);
+    });
     if (value.trim() !== "") timer.current = window.setTimeout(() => void askServer(value), ASK_AFTER_MS);
   };
-  const choose = (hit: Hit | undefined) => {
-    if (hit === undefined) return;
-    open.value = false;
-    if (hit.from !== null && store.at.value <= hit.from) goTo(hit.from + 1);
-    select(hit.thing, true);
-    const at = positionOf(hit.thing);
-    if (at !== null) bringIntoView(...at);
-    document.querySelector<HTMLInputElement>("#search")?.blur();
-  };
   const key = (event: KeyboardEvent) => {
-    const most = Math.max(0, hits.value.length - 1);
-    if (event.key === "ArrowDown") active.value = Math.min(most, active.value + 1);
-    else if (event.key === "ArrowUp") active.value = Math.max(0, active.value - 1);
-    else if (event.key === "Enter") choose(hits.value[active.value]);
-    else if (event.key === "Escape") {
-      open.value = false;
+    if (event.key === "ArrowDown") walk(1);
+    else if (event.key === "ArrowUp") walk(-1);
+    else if (event.key === "Enter") {
+      chosenEarly = hits.value.length === 0;
+      choose(hits.value[active.value]);
+    } else if (event.key === "Escape") {
+      close();
       (event.currentTarget as HTMLInputElement).blur();
     } else return;
     event.preventDefault();
@@ -73,7 +88,7 @@ export function Search() {
         value={text.value}
         onInput={(event) => change(event.currentTarget.value)}
         onFocus={() => (open.value = true)}
-        onBlur={() => (open.value = false)}
+        onBlur={close}
         onKeyDown={key}
       />
       <kbd aria-hidden="true">/</kbd>
@@ -94,38 +109,74 @@ export function Search() {
             <bdi class="more">{hit.more}</bdi>
           </li>
         ))}
-        {hits.value.length === 0 && <li class="none" role="option" aria-selected={false}>Nothing in this log has such a name.</li>}
+        {remark.value !== null && <li class="none" role="option" aria-selected={false}>{remark.value}</li>}
       </ul>
     </div>
   );
 }
 
-interface ServerHit {
-  kind: string;
-  id: string;
-  /** The row of the keyframe, for a detection. */
-  number: number;
-  text: string;
-  offset: number;
+function close() {
+  open.value = false;
 }
 
-/** The server knows what the page does not: det_ids. */
+function choose(hit: Hit | undefined) {
+  if (hit === undefined) return;
+  close();
+  if (hit.from !== null && store.at.value <= hit.from) goTo(hit.from + 1);
+  select(hit.thing, true);
+  show(hit);
+  document.querySelector<HTMLInputElement>("#search")?.blur();
+}
+
+function show({ thing }: Hit) {
+  const at = positionOf(thing);
+  if (at !== null) bringIntoView(...at);
+}
+
+/** To the next or the last one before, which the map then shows. */
+function walk(step: 1 | -1) {
+  const next = Math.max(0, Math.min(hits.value.length - 1, active.value + step));
+  active.value = next;
+  const hit = hits.value[next];
+  if (hit !== undefined) show(hit);
+  document.querySelector(`#hit-${next}`)?.scrollIntoView({ block: "nearest" });
+}
+
+/** What the page does not know: the Objects that are meant, things that are not there yet, det_ids. */
 async function askServer(value: string) {
-  asking.abort();
   asking = new AbortController();
-  const [history, map] = [store.history.value, store.map.value];
+  const { signal: left } = asking;
+  const [history, map, at] = [store.history.value, store.map.value, store.at.value];
   if (history === null || map === null) return;
-  try {
-    const answer = await getJson<{ found: ServerHit[] }>(address("/api/search", { q: value, kind: "detection", known_at: history.knownAt }), asking.signal);
-    if (text.value !== value) return;
-    const more = answer.found.map(({ id, number, text: says, offset }): Hit => ({
-      thing: { kind: "keyframe", id: keyframeId(history, number) },
-      title: id,
-      more: says,
-      from: number < map.keyframeCount ? null : offset,
-    }));
-    hits.value = [...hits.value, ...more].slice(0, 12);
-  } catch {
-    // The hits that the page found itself stay; the banner reports a lost server.
+  const moment = { at, known_at: store.knownAt(at) };
+  const [objects, named] = await Promise.allSettled([
+    getJson<FoundObjects>(address("/api/find", { what: value.trim(), top: MOST_OBJECTS, ...moment }), left),
+    getJson<{ found: NamedThing[] }>(address("/api/search", { q: value, ...moment }), left),
+  ]);
+  if (left.aborted) return;
+  const local = searchLocally(history, map, store.types.value, value);
+  const answers = objects.status === "fulfilled" ? objects.value.answers.map((each) => foundHit(history, each)) : [];
+  const unfound = named.status === "rejected" ? [] : named.value.found.filter(({ kind, stands }) => kind !== "object" || !stands || answers.length === 0);
+  const others = unfound.map((each) => namedHit(history, map, each));
+  const listed = [...local, ...answers];
+  const key = ({ thing: { kind, id }, title }: Hit) => (kind === "keyframe" ? title : `${kind} ${id}`);
+  const known = new Set(listed.map(key));
+  const more = others.filter((each) => each !== null).filter((each) => !known.has(key(each)));
+  batch(() => {
+    hits.value = [...listed, ...more.slice(0, MOST_NAMED)];
+    remark.value = remarkOn(value, objects, hits.value.length);
+  });
+  if (chosenEarly) choose(hits.value[0]);
+}
+
+function remarkOn(value: string, objects: PromiseSettledResult<FoundObjects>, count: number): string | null {
+  if (objects.status === "rejected") {
+    const refused = objects.reason instanceof ApiError && objects.reason.kind === "bad_question";
+    return refused && count > 0 ? null : `${objects.reason instanceof Error ? objects.reason.message : objects.reason}`;
   }
+  const { match, classes, count: all, answers, unconfirmed } = objects.value;
+  const said = match === "words" || match === "spelling" ? [`no class “${value.trim()}”; found ${classes.map((each) => label(each)).join(", ")}`] : [];
+  if (all > answers.length) said.push(`${(all - answers.length).toLocaleString("en")} more`);
+  if (unconfirmed > 0) said.push(`+ ${unconfirmed.toLocaleString("en")} seen once`);
+  return said.length === 0 ? null : said.join(" · ");
 }
