@@ -50,6 +50,9 @@ _LINE: Final = "=" * 80 + "\n"
 _IDL_MARK: Final = f"{_LINE}IDL: "
 
 
+_HASHED: Final = "RIHS01_"
+
+
 class NoRosbags(MapfoldError):
     """rosbags is not installed."""
 
@@ -140,12 +143,23 @@ class MessageTypes:
             types.update(self._parse_idl(part.partition("\n")[2]))
         return types
 
-    def definition(self, type_name: str) -> str:
-        """The text that defines a type and all types in it, as bags keep it. Raises Undecodable."""
+    def definition(self, type_name: str, type_hash: str | None = None) -> str:
+        """The text that defines a type and all types in it, as bags keep it.
+
+        ``type_hash`` is what the publisher says of its own definition: ``RIHS01_…``, or another
+        text where it has no hash, as in Humble, which is ignored. Raises Undecodable, also for the
+        hash of another definition.
+        """
         try:
             text, _ = self._store.generate_msgdef(type_name, ros_version=2)
+            known = self._store.hash_rihs01(type_name)
         except self._faults as error:
             raise Undecodable(f"{type_name:.80}: no such type is known ({error})") from None
+        if type_hash is not None and type_hash.startswith(_HASHED) and type_hash != known:
+            raise Undecodable(
+                f"{type_name:.80}: its publisher has another definition than ROS 2 Jazzy: its hash "
+                f"is {type_hash:.80}, not {known}"
+            )
         return text
 
     def knows(self, type_name: str) -> bool:

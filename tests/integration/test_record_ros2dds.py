@@ -16,7 +16,8 @@ from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.queue import BridgedMessage
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
-from eventsrc.ros.derivation import read_recording, topic_of
+from eventsrc.ros.derivation import read_recording
+from eventsrc.ros.wire import topic_of
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from tests.support import ros2dds

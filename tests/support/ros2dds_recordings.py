@@ -13,7 +13,7 @@ from eventsrc.record.recorder.bridged import Bridge, derive
 from eventsrc.record.recorder.recorder import Recorder
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
-from eventsrc.ros.derivation import topic_of
+from eventsrc.ros.wire import topic_of
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log

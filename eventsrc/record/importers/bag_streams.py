@@ -1,4 +1,4 @@
-"""Choose the topics of a bag and their uses: by option, else by their types, names and frames.
+"""Choose topics and their uses, by option, else by types, names and frames.
 
 Of several candidates the one whose name shares the most leading parts with the detections' topic is
 used (``/robot1/tf`` for ``/robot1/camera/detections``). If two share as many, neither is used, and
@@ -23,9 +23,8 @@ from eventsrc.ros.transforms import TransformBuffer
 from .bag_files import BagContents
 
 TF_POSE: Final = "tf"
-"""The value of ``--pose`` for transforms instead of a topic of poses."""
 NONE: Final = "none"
-"""The value of an option that switches its kind of topic off."""
+"""Values of options: transforms instead of a topic of poses, and no topic of this kind."""
 _BASES: Final = ("base_link", "base_footprint")
 _MAP: Final = "map"
 _POSE_TYPES: Final = (ros.POSE, ros.ODOMETRY)
@@ -79,12 +78,18 @@ class Choice:
 
 
 class Chooser:
-    """Chooses the topics of a bag and their uses."""
+    """Chooses the topics of a bag, or of another ``source``, and their uses."""
 
     def __init__(
-        self, name: str, contents: BagContents, types: MessageTypes, options: BagOptions
+        self,
+        name: str,
+        contents: BagContents,
+        types: MessageTypes,
+        options: BagOptions,
+        source: str = "the bag",
     ) -> None:
         self._name = name
+        self._source = source
         self._contents = contents
         self._types = types
         self._options = options
@@ -123,7 +128,7 @@ class Chooser:
         found = any(tree.is_connected(map_frame, each) for each in (base_frame, camera_frame))
         pose = self._pose(topic, has_transforms=found)
         if pose == TF_POSE and tf is None and tf_static is None:
-            raise MisuseError(f"--pose {TF_POSE}: the bag has no topic of {ros.TF}")
+            raise MisuseError(f"--pose {TF_POSE}: {self._source} has no topic of {ros.TF}")
         if pose is None:  # without a topic of poses a stream takes those of its transforms
             tf = tf_static = None
         by_transforms = pose == TF_POSE
@@ -347,8 +352,8 @@ class Chooser:
         wanted = " or ".join(type_names)
         if known is None:
             raise MisuseError(
-                f"{option} {visible(topic)}: the bag has no messages of that topic; it should be "
-                f"of type {wanted}, and {others}"
+                f"{option} {visible(topic)}: {self._source} has no messages of that topic; it "
+                f"should be of type {wanted}, and {others}"
             )
         if known.type_name not in type_names:
             raise MisuseError(

@@ -31,20 +31,19 @@ from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
 from eventsrc.record.append import CROP_FORMAT, append_payload, map_event
 from eventsrc.record.gap_history import keyframe_of, loss_of
-from eventsrc.record.transport.session import Received
+from eventsrc.record.transport.session import Received, SequenceNumber
 from eventsrc.ros.derivation import (
     CDR,
     ROS2MSG,
     Derivation,
     Derived,
     RosRecording,
-    key_of,
     read_recording,
-    type_of_token,
 )
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import Counts
+from eventsrc.ros.wire import BridgeWire, Wire
 
 from .checking import CheckedMessage
 from .queue import BridgedMessage
@@ -52,6 +51,8 @@ from .queue import BridgedMessage
 HOLD_NS: Final = 10_000_000_000
 HOLD_MESSAGES: Final = 4_096
 HOLD_BYTES: Final = 32 * 1024 * 1024
+MAX_KEYS: Final = 4_096
+MAX_KEPT_NUMBERS: Final = 4_096
 _UNKNOWN: Final = MessageFormat(CDR)
 
 CheckEnvelope = Callable[[Sequence[Received]], Iterator[CheckedMessage]]
@@ -76,18 +77,25 @@ class Bridge:
         recording: RosRecording,
         topics: Collection[str],
         types: MessageTypes,
+        wire: Wire | None = None,
         cut: CutCrops | None = None,
     ) -> None:
         self.recording = recording
+        self.wire: Wire = wire or BridgeWire()
         self.derivation = Derivation(recording, types, cut)
         self._kept = frozenset(topics)
         self.topics = tuple(dict.fromkeys([*topics, *sorted(self.derivation.pictures)]))
-        self.keys = tuple(map(key_of, self.topics))
-        self._topics = dict(zip(self.keys, self.topics, strict=True))
+        self.keys = tuple(map(self.wire.key, self.topics))
+        self._topics: dict[str, str] = {}
         self._types = types
         self._lock = threading.Lock()
         self._new_types: dict[str, str] = {}
+        self._new_latched: set[str] = set()
+        self._kept_numbers: dict[SequenceNumber, None] = {}
         self._formats: dict[str, MessageFormat] = {}
+        self._undefined: dict[str, str] = {}
+        """Why messages of a key cannot be read, though their type is known by name."""
+        self._unread: dict[str, tuple[int, str]] = {}
         self._held: deque[_Held] = deque()
         self._held_bytes = 0
         self.untyped = 0
@@ -99,7 +107,8 @@ class Bridge:
     def unread(self) -> tuple[tuple[str, int, str], ...]:
         """Topics whose messages are kept but cannot be read, how many, and why the first cannot."""
         refused, reasons = self.derivation.refused, self.derivation.reasons
-        return tuple((topic, count, reasons.get(topic, "")) for topic, count in [*refused.items()])
+        unread = ((topic, count, reasons.get(topic, "")) for topic, count in [*refused.items()])
+        return *unread, *((topic, *why) for topic, why in [*self._unread.items()])
 
     @property
     def streams(self) -> tuple[tuple[str, Counts], ...]:
@@ -117,11 +126,18 @@ class Bridge:
             return frozenset(self._formats) | frozenset(self._new_types)
 
     @property
-    def latched_keys(self) -> tuple[str, ...]:
-        """Keys whose last messages a bridge may cache for late subscribers. Without detections,
-        their embeddings and pictures: cached ones are older than this recording."""
+    def latched_topics(self) -> tuple[str, ...]:
+        """Topics whose last messages a publisher may keep for late subscribers. Without detections,
+        their embeddings and pictures: those kept are older than this recording."""
         live = {t for s in self.recording.streams for t in (s.detections, s.embeddings, s.images)}
-        return tuple(key for key, topic in self._topics.items() if topic not in live)
+        return tuple(topic for topic in self.topics if topic not in live)
+
+    def take_new_latched(self) -> list[str]:
+        """The topics in `latched_topics` that a new publisher keeps messages of, each once; may be
+        called from any thread."""
+        with self._lock:
+            found, self._new_latched = self._new_latched, set()
+        return [topic for topic in self.latched_topics if topic in found]
 
     @property
     def held(self) -> int:
@@ -129,11 +145,13 @@ class Bridge:
         return len(self._held)
 
     def note_token(self, token: str) -> None:
-        """Note the type of a key that is recorded; called by Zenoh's threads."""
-        found = type_of_token(token)
-        if found is not None and found[0] in self._topics:
+        """Note what the token of a publisher says; called by Zenoh's threads."""
+        found = self.wire.read_token(token)
+        if found is not None and found.topic in self.topics:
             with self._lock:
-                self._new_types[found[0]] = found[1]
+                self._new_types[self.wire.key(found.topic)] = found.type_name
+                if found.is_latched:
+                    self._new_latched.add(found.topic)
 
     def take(
         self, messages: Sequence[BridgedMessage], logged_ns: int, check: CheckEnvelope
@@ -145,8 +163,10 @@ class Bridge:
         waiting = {held.key for held in self._held}
         for message in messages:
             key, payload = message.key, message.payload
-            if key not in self._topics:  # a key expression that a publisher made up
+            if key not in self._topics and not self._know(key):
                 self.unknown_keys += 1
+                continue
+            if message.number is not None and self._is_kept_already(message):
                 continue
             if self._topics[key] in self.derivation.pictures:
                 for derived in self.derivation.add_picture(self._topics[key], logged_ns, payload):
@@ -171,18 +191,43 @@ class Bridge:
             taken += _checked(derived, check)
         return taken
 
+    def _know(self, key: str) -> bool:
+        """Find the topic of a key, and the type if the key says it; whether it is recorded. No
+        publisher can make up so many keys that they fill the memory."""
+        parts = self.wire.read_key(key)
+        if parts is None or parts.topic not in self.topics or len(self._topics) >= MAX_KEYS:
+            return False
+        self._topics[key] = parts.topic
+        if parts.type_name is not None:
+            with self._lock:
+                self._formats[key] = self._format(parts.type_name, parts.type_hash, key)
+        return True
+
+    def _is_kept_already(self, message: BridgedMessage) -> bool:
+        """Whether a message of a topic that publishers keep came before: both sent, and fetched."""
+        number, kept = message.number, self._kept_numbers
+        if number is None or self._topics[message.key] not in self.latched_topics:
+            return False
+        known = number in kept
+        kept[number] = None
+        if len(kept) > MAX_KEPT_NUMBERS:
+            del kept[next(iter(kept))]
+        return known
+
     def _store_new_types(self) -> None:
         """Make a format of each type that tokens gave since the last call."""
         with self._lock:
             new_types, self._new_types = self._new_types, {}
             for key, type_name in new_types.items():
-                self._formats[key] = self._format(type_name)
+                self._formats[key] = self._format(type_name, None, key)
 
-    def _format(self, type_name: str) -> MessageFormat:
+    def _format(self, type_name: str, type_hash: str | None, key: str) -> MessageFormat:
         """The format of messages of a type, with its definition if that is known."""
         try:
-            text = self._types.definition(type_name).encode()
-        except Undecodable:
+            text = self._types.definition(type_name, type_hash).encode()
+        except Undecodable as error:
+            if self._types.knows(type_name):
+                self._undefined[key] = str(error)
             return MessageFormat(CDR, type_name)
         return MessageFormat(CDR, type_name, ROS2MSG, text)
 
@@ -216,9 +261,12 @@ class Bridge:
     ) -> Iterator[CheckedMessage]:
         topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
         yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
-        if (
-            form.schema and topic not in self.derivation.pictures
-        ):  # without a known definition no envelope is made, which is counted
+        if topic in self.derivation.pictures:
+            return
+        if key in self._undefined:
+            count, reason = self._unread.get(topic, (0, self._undefined[key]))
+            self._unread[topic] = count + 1, reason
+        elif form.schema:  # without a known definition no envelope is made, which is counted
             definition = form.schema_text.decode()
             made = self.derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:

@@ -20,7 +20,6 @@ from eventsrc.record.transport.session import (
     SizeLimit,
     check_keys,
 )
-from eventsrc.ros.derivation import cache_selectors, token_selectors
 
 from .bridged import Bridge
 from .edits import EditRequest, Edits, edit_key
@@ -64,6 +63,7 @@ class Recorder:
         check_keys((*keys, *bridged))
         check_keys(crops)
         self._session = session
+        self._bridge = bridge
         self._crop_prefixes = tuple(key.removesuffix("*") for key in crops)
         self._queue = MessageQueue(queue_size)
         self._writer_thread = WriterThread(
@@ -99,23 +99,37 @@ class Recorder:
         session.confirm()
 
     def _subscribe_bridge(self, session: Session, bridge: Bridge) -> None:
-        """Subscribe to a bridge's tokens, then to its messages, and get those that it has cached
-        for late subscribers."""
-        for key in bridge.keys:
-            for selector in token_selectors(key):
+        """Subscribe to the tokens of publishers, then to their messages, and get those that they
+        keep for late subscribers."""
+        wire = bridge.wire
+        for topic in bridge.topics:
+            for selector in wire.token_selectors(topic):
                 self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
         for key in bridge.keys:
             self._subscriptions += [
-                session.subscribe(key, self._receive_bridged, in_order=True),
+                session.subscribe(
+                    key,
+                    self._receive_bridged,
+                    in_order=True,
+                    read_attachment=wire.read_attachment if wire.has_attachments else None,
+                ),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             ]
         session.confirm()
-        for key in bridge.latched_keys:
-            for selector in cache_selectors(key):
-                for message in session.cached(
-                    selector, timeout_s=_CACHE_TIMEOUT_S, most=_MAX_CACHED
-                ):
-                    self._receive_bridged(message)
+        bridge.take_new_latched()
+        self._fetch(bridge, bridge.latched_topics)
+
+    def _fetch(self, bridge: Bridge, topics: Sequence[str]) -> None:
+        """Get the messages of topics that their publishers keep for late subscribers."""
+        wire = bridge.wire
+        for selector in (each for topic in topics for each in wire.cache_selectors(topic)):
+            for message in self._session.cached(
+                selector,
+                timeout_s=_CACHE_TIMEOUT_S,
+                most=_MAX_CACHED,
+                read_attachment=wire.read_attachment if wire.has_attachments else None,
+            ):
+                self._receive_bridged(message)
 
     def run(
         self,
@@ -149,7 +163,10 @@ class Recorder:
         every_s: float,
         watch: Callable[[RecorderReport], None] | None,
     ) -> None:
-        while not stop.wait(every_s if watch is not None else None):
+        bridge = self._bridge
+        while not stop.wait(every_s if watch is not None or bridge is not None else None):
+            if bridge is not None and (late := bridge.take_new_latched()):
+                self._fetch(bridge, late)
             if watch is not None:
                 watch(self.report())
 

@@ -331,8 +331,19 @@ def _parameters(text: str) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def sequence_number(sample: zenoh.Sample) -> SequenceNumber | None:
-    """The number of ``sample``; None if no advanced publisher sent it."""
+ReadAttachment = Callable[[bytes], tuple[str, int] | None]
+"""Finds publisher and number in the attachment of a message; None if it has neither."""
+
+
+def sequence_number(
+    sample: zenoh.Sample, read_attachment: ReadAttachment | None = None
+) -> SequenceNumber | None:
+    """The number of ``sample``, by ``read_attachment`` if it is given; None if no advanced
+    publisher sent it, or it has no such attachment."""
+    if read_attachment is not None:
+        attachment = sample.attachment
+        found = None if attachment is None else read_attachment(attachment.to_bytes())
+        return None if found is None else SequenceNumber(found[0], found[1] % 2**32)
     info = sample.source_info
     if info is None:
         return None

@@ -31,6 +31,7 @@ from .declarations import (
     BatchSubscription,
     Publisher,
     Query,
+    ReadAttachment,
     Received,
     SequenceNumber,
     SizeLimit,
@@ -81,6 +82,7 @@ class Session:
         limit: SizeLimit | None = None,
         *,
         in_order: bool = False,
+        read_attachment: ReadAttachment | None = None,
     ) -> Subscription:
         """Call ``handler`` for every message under ``key_expr``, from a thread of Zenoh's.
 
@@ -88,6 +90,7 @@ class Session:
         Zenoh closes links and loses messages silently. Messages over ``limit`` are not copied out
         of Zenoh. Each subscription has a thread of its own; those ``in_order`` share the one that
         receives, so that messages of several keys come in the order in which they were sent.
+        ``read_attachment`` finds publisher and number of messages that no advanced publisher sent.
         """
 
         def receive(sample: zenoh.Sample) -> None:
@@ -95,8 +98,8 @@ class Session:
             if limit is not None and len(payload) > limit.size_bytes:
                 limit.refuse()
             else:
-                key = str(sample.key_expr)
-                handler(Received(key, payload.to_bytes(), sequence_number(sample)))
+                key, number = str(sample.key_expr), sequence_number(sample, read_attachment)
+                handler(Received(key, payload.to_bytes(), number))
 
         check_key_length(key_expr)
         with transport_errors(f"key expression {key_expr!r} cannot be subscribed to"):
@@ -145,15 +148,30 @@ class Session:
                 self.raw.liveliness().declare_subscriber(key_expr, receive, history=True)
             )
 
-    def cached(self, selector: str, *, timeout_s: float, most: int) -> Iterator[Received]:
+    def tokens(self, key_expr: str, *, timeout_s: float) -> list[str]:
+        """The keys of all liveliness tokens under ``key_expr``."""
+        check_key_length(key_expr)
+        with transport_errors(f"key expression {key_expr!r} cannot be queried"):
+            replies = self.raw.liveliness().get(key_expr, timeout=timeout_s)
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def cached(
+        self,
+        selector: str,
+        *,
+        timeout_s: float,
+        most: int,
+        read_attachment: ReadAttachment | None = None,
+    ) -> Iterator[Received]:
         """The messages that caches reply to ``selector``, each under its own key, as they come; at
-        most ``most``."""
+        most ``most``. They have numbers only by ``read_attachment``."""
         check_key_length(selector)
         with transport_errors(f"selector {selector!r} cannot be queried"):
             replies = self.raw.get(selector, timeout=timeout_s)
         samples = (reply.ok for reply in replies)
         for sample in itertools.islice((sample for sample in samples if sample is not None), most):
-            yield Received(str(sample.key_expr), sample.payload.to_bytes())
+            number = read_attachment and sequence_number(sample, read_attachment)
+            yield Received(str(sample.key_expr), sample.payload.to_bytes(), number or None)
 
     def send(self, key: str, payload: bytes) -> None:
         """Send one message without blocking; it is dropped if the network is full."""

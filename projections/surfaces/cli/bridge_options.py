@@ -1,11 +1,14 @@
-"""`mapfold record --ros2dds`: the options of a bridge from ROS, and the messages at the start."""
+"""`mapfold record --ros2` and `--ros2dds`: options for messages of ROS, and lines at the start."""
 
+import dataclasses
 import functools
+import os
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import typer
 
@@ -14,13 +17,17 @@ from eventsrc.base.text import counted, visible
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.label_files import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport
-from eventsrc.ros.derivation import RosRecording, topic_of
+from eventsrc.record.ros_graph import MAP_FRAME, find_topics
+from eventsrc.record.transport.session import Session
+from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
+from eventsrc.ros.wire import MAX_DOMAIN, BridgeWire, RmwWire, Wire, topic_of
 
 from .bag_text import (
     check_run_id,
@@ -39,12 +46,35 @@ TF_POSE: Final = "tf"
 NONE: Final = "none"
 _DETECTIONS: Final = "/detections"
 _GRID: Final = "/map"
+_DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
+_BASE_FRAME: Final = "base_link"
 _QUIET_S: Final = 5.0
-_PANEL: Final = "Messages of ROS 2, with --ros2dds"
+_PANEL: Final = "Messages of ROS 2, with --ros2 or --ros2dds"
 
 
 _option = functools.partial(ros_option, _PANEL)
 
+Ros2Option = Annotated[
+    bool,
+    typer.Option(
+        "--ros2",
+        help="Record what nodes over rmw_zenoh publish, and make keyframes of it; the topics are "
+        "found as those of a bag are; needs mapfold[ros].",
+        rich_help_panel=_PANEL,
+    ),
+]
+DomainOption = Annotated[
+    int | None,
+    typer.Option(
+        "--domain",
+        metavar="N",
+        min=0,
+        max=MAX_DOMAIN,
+        envvar=_DOMAIN_VARIABLE,
+        help="The domain of the nodes, with --ros2. [default: 0]",
+        rich_help_panel=_PANEL,
+    ),
+]
 Ros2ddsOption = Annotated[
     bool,
     typer.Option(
@@ -58,28 +88,36 @@ Ros2ddsOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeChoice:
-    """The options of `mapfold record` that go with ``--ros2dds``."""
+    """The options of `mapfold record` that go with ``--ros2`` and ``--ros2dds``; what is None
+    follows from the graph with the first, is `recording_of`'s default with the second."""
 
     namespace: Annotated[
-        str, _option("--namespace", "NS", "The namespace in the bridge's configuration, as /bot1.")
+        str,
+        _option(
+            "--namespace",
+            "NS",
+            "The namespace in the bridge's configuration, as /bot1; with --ros2 only detections "
+            "under it are taken.",
+        ),
     ] = ""
     detections: Annotated[
         list[str] | None,
         _option(
             "--detections",
             "TOPIC",
-            f"Topic of vision_msgs/Detection2DArray; may be repeated. [default: {_DETECTIONS}]",
+            "Topic of vision_msgs/Detection2DArray; may be repeated. [default: all, with --ros2dds "
+            f"{_DETECTIONS}]",
         ),
     ] = None
     pose: Annotated[
-        str,
+        str | None,
         _option(
             "--pose",
             "tf|TOPIC|none",
             "Where poses come from: transforms, or a topic of Odometry or "
-            "PoseWithCovarianceStamped.",
+            f"PoseWithCovarianceStamped. [default: {TF_POSE}]",
         ),
-    ] = TF_POSE
+    ] = None
     covariance: Annotated[
         str | None,
         _option(
@@ -104,10 +142,21 @@ class BridgeChoice:
         ),
     ] = None
     grid: Annotated[
-        str, _option("--grid", "TOPIC", "Topic of OccupancyGrid, for the map's walls; or none.")
-    ] = _GRID
-    map_frame: Annotated[str, _option("--map-frame", "FRAME", "The frame of the map.")] = "map"
-    base_frame: Annotated[str, _option("--base-frame", "FRAME", "The robot's frame.")] = "base_link"
+        str | None,
+        _option(
+            "--grid",
+            "TOPIC",
+            f"Topic of OccupancyGrid, for the map's walls; or none. [default: {_GRID}]",
+        ),
+    ] = None
+    map_frame: Annotated[
+        str | None,
+        _option("--map-frame", "FRAME", f"The frame of the map. [default: {MAP_FRAME}]"),
+    ] = None
+    base_frame: Annotated[
+        str | None,
+        _option("--base-frame", "FRAME", f"The robot's frame. [default: {_BASE_FRAME}]"),
+    ] = None
     run_id: Annotated[
         str | None,
         _option(
@@ -129,20 +178,93 @@ class BridgeChoice:
     ] = None
 
 
-def check_unused(choice: BridgeChoice) -> None:
-    """Raise MisuseError if an option needs --ros2dds, which is not given."""
-    if choice != BridgeChoice():
+def check_unused(choice: BridgeChoice, domain: int | None, *, ros2: bool, ros2dds: bool) -> None:
+    """Raise MisuseError if an option needs --ros2 or --ros2dds, which is not given, or both are."""
+    if ros2 and ros2dds:
+        raise MisuseError("--ros2 and --ros2dds: give the one that the robot has")
+    if not ros2 and domain is not None and os.environ.get(_DOMAIN_VARIABLE) != str(domain):
+        raise MisuseError("--domain goes with --ros2")
+    if choice != BridgeChoice() and not (ros2 or ros2dds):
         raise MisuseError(
             "--namespace, --detections, --pose and the other options for messages of ROS go with "
-            "--ros2dds"
+            "--ros2 or --ros2dds"
         )
 
 
-def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId] | None) -> Bridge:
-    """The recorder of the topics of ``choice``. First makes the envelopes that a killed recorder
-    left out. Raises MisuseError for an invalid topic, MapfoldError without rosbags."""
-    types = MessageTypes()
-    recording, topics = recording_of(choice, writer.now_ns(), ledger)
+class Found(NamedTuple):
+    """What of ROS is recorded: how envelopes are made, all topics that are kept, how they come."""
+
+    recording: RosRecording
+    topics: tuple[str, ...]
+    wire: Wire
+
+
+def topics_of_bridge(choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None) -> Found:
+    """What of a bridge is recorded."""
+    return Found(*recording_of(choice, now_ns, ledger), BridgeWire())
+
+
+def find_topics_of_nodes(
+    choice: BridgeChoice,
+    session: Session,
+    domain: int,
+    types: MessageTypes,
+    ledger: GapLedger[RunId] | None,
+    stop: threading.Event,
+) -> Found | None:
+    """What of the nodes over rmw_zenoh is recorded, once somebody publishes detections; None if
+    ``stop`` is set before. Prints what is taken. Raises MisuseError."""
+    wire, options = RmwWire(domain), as_of_a_bag(choice)
+    made = find_topics(session, wire, types, options, choice.namespace, stop=stop, note=say)
+    if made is None:
+        return None
+    width = max(len(visible(topic)) for topic in made.uses)
+    for topic in sorted(made.uses):
+        say(f"  {visible(topic):{width}}  {visible(made.uses[topic])}")
+    for note in made.notes:
+        say(f"  note: {visible(note)}")
+    streams = tuple(
+        dataclasses.replace(each, first_keyframe=_next_keyframe(ledger, RunId(each.run_id)))
+        for each in made.streams
+    )
+    recording = RosRecording(key=DEFAULT_KEYS[0], streams=streams, grids=tuple(made.grids))
+    others = (topic_of("", topic, "--topic") for topic in choice.topic or ())
+    return Found(recording, tuple(dict.fromkeys([*used_topics(recording), *others])), wire)
+
+
+def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
+    """The options as those of a bag. Raises MisuseError."""
+
+    def full(topic: str | None, option: str) -> str | None:
+        return topic if topic in (None, NONE, TF_POSE) else topic_of("", topic, option)
+
+    detections = (topic_of("", topic, "--detections") for topic in choice.detections or ())
+    classes = (full(topic, "--classes") or "" for topic in choice.classes or ())
+    return BagOptions(
+        detections=tuple(detections),
+        pose=full(choice.pose, "--pose"),
+        covariance=full(choice.covariance, "--covariance"),
+        embeddings=full(choice.embeddings, "--embeddings"),
+        camera=full(choice.camera, "--camera"),
+        classes=tuple(classes),
+        grid=full(choice.grid, "--grid"),
+        map_frame=choice.map_frame,
+        base_frame=choice.base_frame,
+        run_id=check_run_id(choice.run_id),
+        embedding_model=choice.embedding_model,
+        labels={} if choice.labels is None else read_labels(choice.labels),
+        heights=choice.heights,
+        max_gap_ns=max_gap_ns(choice.max_gap),
+        images=full(choice.images, "--images"),
+        cut=crop_cutter(choice.keep_crops, choice.images),
+    )
+
+
+def open_bridge(
+    choice: BridgeChoice, found: Found, writer: LogWriter, types: MessageTypes
+) -> Bridge:
+    """The recorder of what was found. First makes the envelopes that a killed recorder left
+    out."""
     cut = crop_cutter(choice.keep_crops, choice.images)
     try:
         with LogReader(writer.path) as reader:
@@ -155,7 +277,12 @@ def open_bridge(choice: BridgeChoice, writer: LogWriter, ledger: GapLedger[RunId
                 f"{writer.path}: the last recording of ROS did not finish; made "
                 f"{counted(made, 'event')} from its messages"
             )
-    return Bridge(recording, topics, types, cut)
+    return Bridge(found.recording, found.topics, types, found.wire, cut)
+
+
+def _next_keyframe(ledger: GapLedger[RunId] | None, run_id: RunId) -> int:
+    highest = None if ledger is None else ledger.highest(run_id)
+    return 0 if highest is None else highest + 1
 
 
 def recording_of(
@@ -176,35 +303,34 @@ def recording_of(
         dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
     )
     run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
-    by_transforms = choice.pose == TF_POSE
+    pose = choice.pose or TF_POSE
     labels = {} if choice.labels is None else read_labels(choice.labels)
     gap_ns = max_gap_ns(choice.max_gap)
     streams = []
     for topic in detections:
         run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")
-        highest = None if ledger is None else ledger.highest(run_id)
         streams.append(
             Stream(
                 topic,
                 run_id,
-                None if choice.pose == NONE else full("/tf", "--namespace"),
-                None if choice.pose == NONE else full("/tf_static", "--namespace"),
-                None if by_transforms else given(choice.pose, "--pose"),
+                None if pose == NONE else full("/tf", "--namespace"),
+                None if pose == NONE else full("/tf_static", "--namespace"),
+                None if pose == TF_POSE else given(pose, "--pose"),
                 given(choice.covariance, "--covariance"),
                 given(choice.embeddings, "--embeddings"),
                 given(choice.camera, "--camera"),
-                choice.map_frame,
-                choice.base_frame,
+                choice.map_frame or MAP_FRAME,
+                choice.base_frame or _BASE_FRAME,
                 labels,
                 choice.embedding_model,
                 choice.heights,
                 max_gap_ns=gap_ns,
-                first_keyframe=0 if highest is None else highest + 1,
+                first_keyframe=_next_keyframe(ledger, run_id),
                 classes=tuple(full(t, "--classes") for t in choice.classes or () if t != NONE),
                 images=given(choice.images, "--images"),
             )
         )
-    grid = given(choice.grid, "--grid")
+    grid = given(choice.grid or _GRID, "--grid")
     recording = RosRecording(
         key=DEFAULT_KEYS[0], streams=tuple(streams), grids=() if grid is None else (grid,)
     )

@@ -23,14 +23,19 @@ from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes
 from projections.fold.corrections import check_settings
 
-from .bag_text import crop_cutter, stream_lines
+from .bag_text import stream_lines
 from .bridge_options import (
     BridgeChoice,
+    DomainOption,
     Ros2ddsOption,
+    Ros2Option,
+    as_of_a_bag,
     check_unused,
+    find_topics_of_nodes,
     open_bridge,
     recording_of,
     say_topics,
+    topics_of_bridge,
     warn_of_silence,
 )
 from .folded_log import classes_advice
@@ -106,31 +111,35 @@ def record(
         ),
     ] = False,
     new_log: NewLogOptions,
+    ros2: Ros2Option = False,
+    domain: DomainOption = None,
     ros2dds: Ros2ddsOption = False,
     choice: BridgeChoice,
     json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
 
-    With --ros2dds also the messages of a zenoh-bridge-ros2dds, and without --key only those.
+    With --ros2 also the messages of nodes over rmw_zenoh, with --ros2dds those of a
+    zenoh-bridge-ros2dds, and without --key only those.
 
     Exit 3 when anything was rejected or lost, is missing, or could not be read.
     """
-    if not ros2dds:
-        check_unused(choice)
+    check_unused(choice, domain, ros2=ros2, ros2dds=ros2dds)
+    is_ros = ros2 or ros2dds
     new_log.check()
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
         peer.zenoh,
         max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
     )
-    keys = tuple(key or (() if ros2dds else DEFAULT_KEYS))
+    keys = tuple(key or (() if is_ros else DEFAULT_KEYS))
     check_keys(keys)
     crop_keys = _crop_keys(crops)
+    types = MessageTypes() if is_ros else None
     if ros2dds:
-        MessageTypes()
         recording_of(choice, 0, None)
-        crop_cutter(choice.keep_crops, choice.images)
+    if is_ros:
+        as_of_a_bag(choice)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
         RecorderSummary(log, json=json) as summary,
@@ -140,9 +149,18 @@ def record(
     ):
         say_restart(log, writer)
         start = writer.next_offset
-        LogStart.of(log, writer, new_log, is_ros=ros2dds).record(writer)
+        LogStart.of(log, writer, new_log, is_ros=is_ros).record(writer)
         ledger = _gap_history(log)
-        bridge = open_bridge(choice, writer, ledger) if ros2dds else None
+        bridge = None
+        if types is not None:
+            found = (
+                topics_of_bridge(choice, writer.now_ns(), ledger)
+                if ros2dds
+                else find_topics_of_nodes(choice, session, domain or 0, types, ledger, stop)
+            )
+            if found is None:
+                return
+            bridge = open_bridge(choice, found, writer, types)
         recorder = Recorder(
             session,
             writer,
@@ -158,7 +176,7 @@ def record(
         )
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:
-            if bridge is not None:
+            if bridge is not None and ros2dds:
                 say_topics(log, bridge)
                 watch = warn_of_silence(bridge, watch, EVERY_S)
             named = ", ".join(keys or (bridge.keys if bridge is not None else ()))

@@ -1,0 +1,231 @@
+"""How messages of ROS 2 come over Zenoh: keys, tokens, caches and sequence numbers.
+
+In a log a topic has the name that it has in ROS, ``/bot1/tf``. A payload is the message in CDR,
+with the four bytes of encapsulation before it, in both ways:
+
+* `BridgeWire`, a zenoh-bridge-ros2dds. A message of ``/tf`` comes under the key ``tf``, or
+  ``bot1/tf`` from a bridge whose namespace is ``/bot1``. Its type is in a liveliness token of the
+  bridge, with ``§`` for each slash of key and type::
+
+      @/<zenoh id>/@ros2_lv/MP/bot1§tf/tf2_msgs§msg§TFMessage/<quality of service>
+      @ros2_lv/<zenoh id>/MP/…                                     (older bridges)
+
+  The last messages of a transient-local topic (``/tf_static``) are in a cache::
+
+      bot1/tf_static/@adv/pub/**
+      @/<zenoh id>/@ros2_pub_cache/bot1/tf_static                  (older bridges)
+
+* `RmwWire`, nodes whose middleware is rmw_zenoh. The key has domain, topic, type and the hash of
+  the type's definition; a publisher's token has the topic with ``%`` for each slash::
+
+      0/bot1/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_…
+      @ros2_lv/0/<zenoh id>/<node>/<publisher>/MP/<enclave>/<namespace>/<node name>/%bot1%tf/<type>/
+          <hash>/<quality of service>
+
+  Caches are ``<key>/@adv/pub/**``, of older versions ``<zenoh id>/<key>``. Each message has an
+  attachment: its number, the time, and the publisher's id, which is new when its node starts again.
+"""
+
+import re
+from typing import Final, NamedTuple, Protocol
+
+from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
+
+MAX_TOKEN: Final = 4_096
+SLASH: Final = "§"
+_ANY_KEY: Final = "?_anyke"
+"""The parameter of a query that accepts answers under other keys than its own."""
+_BRIDGE_TOKEN: Final = re.compile(r"(?:@/[^/]+/@ros2_lv|@ros2_lv/[^/]+)/MP/([^/]+)/([^/]+)(?:/.*)?")
+_RMW_TOKEN: Final = re.compile(
+    r"@ros2_lv/(\d+)/[^/]+/[^/]+/[^/]+/MP/[^/]+/[^/]+/[^/]+/([^/]+)/([^/]+)/([^/]+)/([^/]+)"
+)
+_TYPE: Final = re.compile(r"[A-Za-z]\w{0,99}/msg/[A-Za-z]\w{0,99}", re.ASCII)
+_DDS_TYPE: Final = re.compile(r"([A-Za-z]\w{0,99})::msg::dds_::([A-Za-z]\w{0,99})_", re.ASCII)
+_NAME: Final = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+_MAX_NAME: Final = 500
+_TRANSIENT_LOCAL: Final = "1"
+_LABELLED: Final = b"\x0fsequence_number"
+"""The start of attachments that name their fields, which older versions of rmw_zenoh send."""
+_FIELDS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
+MAX_DOMAIN: Final = 232
+
+
+class KeyParts(NamedTuple):
+    """What a message's key says: topic, type and hash of the type's definition; None if it does
+    not."""
+
+    topic: str
+    type_name: str | None = None
+    type_hash: str | None = None
+
+
+class PublisherToken(NamedTuple):
+    """What a publisher's liveliness token says; ``is_latched`` if it keeps messages for late
+    subscribers."""
+
+    topic: str
+    type_name: str
+    is_latched: bool = False
+
+
+class Wire(Protocol):
+    """Keys, tokens and caches of one of the two ways."""
+
+    has_attachments: bool
+    """Whether messages have attachments with their numbers."""
+
+    def key(self, topic: str) -> str:
+        """The key expression of a topic's messages."""
+
+    def read_key(self, key: str) -> KeyParts | None:
+        """The parts of a message's key; None if it is that of no topic."""
+
+    def token_selectors(self, topic: str) -> tuple[str, ...]:
+        """The key expressions of the tokens of a topic's publishers."""
+
+    def read_token(self, token: str) -> PublisherToken | None:
+        """The content of a token; None if it is that of no publisher of messages."""
+
+    def cache_selectors(self, topic: str) -> tuple[str, ...]:
+        """The queries for the messages that publishers of a topic keep for late subscribers."""
+
+    def read_attachment(self, attachment: bytes) -> tuple[str, int] | None:
+        """Publisher and number of the message with this attachment; None if it has neither."""
+
+
+class BridgeWire:
+    """Messages from a zenoh-bridge-ros2dds."""
+
+    has_attachments = False
+
+    def key(self, topic: str) -> str:
+        """`Wire.key`."""
+        return topic.removeprefix("/")
+
+    def read_key(self, key: str) -> KeyParts | None:
+        """`Wire.read_key`."""
+        return KeyParts(f"/{key}")
+
+    def token_selectors(self, topic: str) -> tuple[str, ...]:
+        """`Wire.token_selectors`."""
+        escaped = self.key(topic).replace("/", SLASH)
+        return f"@/*/@ros2_lv/MP/{escaped}/**", f"@ros2_lv/*/MP/{escaped}/**"
+
+    def read_token(self, token: str) -> PublisherToken | None:
+        """`Wire.read_token`."""
+        found = _BRIDGE_TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN else None
+        if found is None:
+            return None
+        key, type_name = (part.replace(SLASH, "/") for part in found.groups())
+        return PublisherToken(f"/{key}", type_name) if _TYPE.fullmatch(type_name) else None
+
+    def cache_selectors(self, topic: str) -> tuple[str, ...]:
+        """`Wire.cache_selectors`."""
+        key = self.key(topic)
+        return f"{key}/@adv/pub/**{_ANY_KEY}", f"@/*/@ros2_pub_cache/{key}{_ANY_KEY}"
+
+    def read_attachment(self, attachment: bytes) -> tuple[str, int] | None:  # noqa: ARG002
+        """`Wire.read_attachment`; a bridge's numbers are those of Zenoh's advanced publishers."""
+        return None
+
+
+class RmwWire:
+    """Messages from nodes over rmw_zenoh, in one domain."""
+
+    has_attachments = True
+
+    def __init__(self, domain: int = 0) -> None:
+        self.domain = domain
+
+    def key(self, topic: str) -> str:
+        """`Wire.key`."""
+        return f"{self.domain}{topic}/*/*"
+
+    def read_key(self, key: str) -> KeyParts | None:
+        """`Wire.read_key`."""
+        if len(key) > MAX_TOKEN:
+            return None
+        start, _, type_hash = key.rpartition("/")
+        start, _, dds_type = start.rpartition("/")
+        domain, _, name = start.partition("/")
+        type_name = _from_dds(dds_type)
+        if domain != str(self.domain) or type_name is None or not _is_name(name):
+            return None
+        return KeyParts(f"/{name}", type_name, type_hash)
+
+    def all_tokens(self) -> str:
+        """The key expression of the tokens of all publishers."""
+        return self._tokens("*")
+
+    def token_selectors(self, topic: str) -> tuple[str, ...]:
+        """`Wire.token_selectors`."""
+        return (self._tokens(topic.replace("/", "%")),)
+
+    def _tokens(self, topic: str) -> str:
+        return f"@ros2_lv/{self.domain}/*/*/*/MP/*/*/*/{topic}/*/*/*"
+
+    def read_token(self, token: str) -> PublisherToken | None:
+        """`Wire.read_token`."""
+        found = _RMW_TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN else None
+        if found is None or found[1] != str(self.domain):
+            return None
+        topic, type_name = found[2].replace("%", "/"), _from_dds(found[3])
+        if type_name is None or not topic.startswith("/") or not _is_name(topic[1:]):
+            return None
+        _, _, after_reliability = found[5].partition(":")
+        return PublisherToken(
+            topic, type_name, after_reliability.partition(":")[0] == _TRANSIENT_LOCAL
+        )
+
+    def cache_selectors(self, topic: str) -> tuple[str, ...]:
+        """`Wire.cache_selectors`."""
+        key = self.key(topic)
+        return f"{key}/@adv/pub/**{_ANY_KEY}", f"*/{key}{_ANY_KEY}"
+
+    def read_attachment(self, attachment: bytes) -> tuple[str, int] | None:
+        """`Wire.read_attachment`."""
+        parts = _labelled_parts(attachment) if attachment.startswith(_LABELLED) else attachment
+        if len(parts) < 17 or len(parts) != 17 + parts[16]:
+            return None
+        return parts[17:].hex(), int.from_bytes(parts[:8], "little")
+
+
+def _labelled_parts(attachment: bytes) -> bytes:
+    """An attachment that names its fields, without the names; empty if it is none."""
+    rest, parts = attachment, b""
+    for name, size in zip(_FIELDS, (8, 8, None), strict=True):
+        if not rest.startswith(name):
+            return b""
+        rest = rest[len(name) :]
+        parts += rest[:size]
+        rest = rest[size:] if size else b""
+    return parts
+
+
+def _from_dds(dds_type: str) -> str | None:
+    """``tf2_msgs/msg/TFMessage`` of ``tf2_msgs::msg::dds_::TFMessage_``; None if it is no message's
+    type."""
+    found = _DDS_TYPE.fullmatch(dds_type)
+    return None if found is None else f"{found[1]}/msg/{found[2]}"
+
+
+def topic_of(namespace: str, topic: str, option: str) -> str:
+    """The topic in a log of messages of the ROS topic ``topic`` from a bridge with ``namespace``.
+    Raises MisuseError, which names ``option``, for an invalid name."""
+    name = topic.removeprefix("/")
+    if not _is_name(name):
+        raise MisuseError(
+            f"{option} {visible(repr(topic[:80]))} is no name of a ROS 2 topic; examples: "
+            "/detections, /camera/detections"
+        )
+    bare = namespace.strip("/")
+    if bare and not _is_name(bare):
+        raise MisuseError(
+            f"--namespace {visible(repr(namespace[:80]))} is no ROS 2 namespace; example: /bot1"
+        )
+    return f"/{bare}/{name}" if bare else f"/{name}"
+
+
+def _is_name(text: str) -> bool:
+    return len(text) <= _MAX_NAME and _NAME.fullmatch(text) is not None
