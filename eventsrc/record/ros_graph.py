@@ -17,8 +17,8 @@ from eventsrc.ros.library import BagTopic, MessageTypes
 from eventsrc.ros.named_classes import nearest
 from eventsrc.ros.wire import RmwWire
 
-from .importers.bag_files import BagContents
-from .importers.bag_streams import BagOptions, Choice, Chooser, sampled
+from .importers.bag_files import BagContents, sampled
+from .importers.bag_streams import BagOptions, Choice, Chooser
 from .transport.session import Received, Session
 
 _TOKENS_S: Final = 2.0

@@ -217,7 +217,7 @@ def test_a_bridge_cuts_crops_and_does_not_keep_the_pictures(
             sent.append(("/image", compressed(stamp_ns, jpeg(shown))))
         sent.append((topic, message))
     ros_recording, topics = recording_of(choice(keep_crops=True, images="/image"), 0, None)
-    own = Bridge(ros_recording, topics, TYPES, crops_of_message)
+    own = Bridge(ros_recording, topics, TYPES, cut=crops_of_message)
     with (
         ros2dds.bridge(endpoint) as bridge,
         recording(connected(), log_path, own) as running,
