@@ -19,8 +19,8 @@ from eventsrc.base.machine import crc32
 from eventsrc.envelope.system_events import MAX_KEPT_BYTES, Excerpt
 
 from . import mcap_records as _mcap
+from .channels import ENVELOPE_VERSION_KEY, envelope_version, is_verbatim, message_format
 from .event import MessageFormat
-from .format import ENVELOPE_VERSION_KEY, envelope_version, is_verbatim, message_format
 from .mcap_records import FRAME, MAGIC, BadRecord, Channel, Opcode, Schema
 
 MAX_FOREIGN_BYTES: Final = MAX_KEPT_BYTES

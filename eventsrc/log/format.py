@@ -1,4 +1,4 @@
-"""Names of a log's files, the head of every segment, and its channels and schemas.
+"""Names of a log's files, and the head of every segment.
 
     00000000000000000000.mcap          sealed: immutable, compressed, indexed
     00000000000000004711.mcap.active   growing, or left over and not sealed yet
@@ -11,43 +11,20 @@
     .sealed.json                       how far the log is sealed: see `sealed_end`
 
 A segment is named by its base, the offset of its first event. While a sealed file replaces its
-active one, both exist for an instant; the sealed one counts.
-
-The head is magic, MCAP header and metadata that name log and base. JSON schemas are generated from
-the models that validate the payloads, in the form that viewers read.
+active one, both exist for an instant; the sealed one counts. The head is magic, MCAP header and
+metadata that name log and base.
 """
 
-import functools
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from pydantic import BaseModel, TypeAdapter
 
 from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.base.text import advised
-from eventsrc.envelope.commands import COMMAND
-from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
-from eventsrc.envelope.occupancy_map import OccupancyMapEvent
-from eventsrc.envelope.readers import EnvelopeModel
-from eventsrc.envelope.system_events import (
-    COMMAND_KEY,
-    EMBEDDINGS_KEY,
-    LOSS_KEY,
-    MAP_KEY,
-    REJECTED_KEY,
-    Embeddings,
-    Loss,
-    RejectedPayload,
-    is_system_key,
-)
+from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
-from .event import MessageFormat
-from .flat_schema import flat_schema
-from .mcap_records import BadRecord, Channel, Header, Metadata, Opcode, Schema
+from .mcap_records import BadRecord, Header, Metadata, Opcode
 
 FORMAT = "1"
 SEGMENT_METADATA = "mapfold.segment"
@@ -213,90 +190,6 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
     if not _NUMBER.fullmatch(values.get(BEGUN, "0")):
         raise BadRecord("the segment's metadata has an invalid time")
     return values
-
-
-ENVELOPE_VERSION_KEY = "mapfold.envelope_version"
-UNREADABLE_VERSION = 0
-"""The version of a channel whose metadata has no number for it: forged, or of another program. Its
-events are read and not folded."""
-_VERSION = re.compile(r"[0-9]{1,9}")
-
-_SYSTEM_MODELS: dict[str, type[BaseModel]] = {
-    REJECTED_KEY: RejectedPayload,
-    LOSS_KEY: Loss,
-    MAP_KEY: OccupancyMapEvent,
-    EMBEDDINGS_KEY: Embeddings,
-}
-
-
-def schema_of(key: str) -> tuple[str, bytes]:
-    """Name and JSON schema text of the payloads under ``key``."""
-    if not is_system_key(key):
-        return "mapfold.Envelope", _json_schema(EnvelopeModel)
-    if key == COMMAND_KEY:
-        return "mapfold.Command", _json_schema(COMMAND)
-    model = _SYSTEM_MODELS.get(key)
-    if model is None:
-        return "mapfold.System", b'{"properties": {}, "type": "object"}'
-    return f"mapfold.{model.__name__}", _json_schema(model)
-
-
-@functools.cache
-def _json_schema(model: type[BaseModel] | TypeAdapter[Any]) -> bytes:
-    return json.dumps(flat_schema(model), sort_keys=True).encode()
-
-
-def key_channel(channel_id: int, schema_id: int, key: str, version: int) -> Channel:
-    """The channel of ``key`` for envelopes of ``version``."""
-    return Channel(
-        id=channel_id,
-        topic=key,
-        message_encoding="json",
-        schema_id=schema_id,
-        metadata={ENVELOPE_VERSION_KEY: str(version)},
-    )
-
-
-def envelope_version(channel: Channel) -> int:
-    """The version of the envelopes on a channel; the current one if it has none."""
-    version = channel.metadata.get(ENVELOPE_VERSION_KEY)
-    if version is None:
-        return ENVELOPE_VERSION
-    return int(version) if _VERSION.fullmatch(version) else UNREADABLE_VERSION
-
-
-VERBATIM_KEY = "mapfold.verbatim"
-"""In the metadata of the channel of verbatim messages, and of no other."""
-NO_SCHEMA = 0
-"""The schema id of a channel without a schema, by the specification of MCAP."""
-
-
-def verbatim_channel(channel_id: int, schema_id: int, topic: str, encoding: str) -> Channel:
-    """The channel of verbatim messages of one topic and format."""
-    return Channel(
-        id=channel_id,
-        topic=topic,
-        message_encoding=encoding,
-        schema_id=schema_id,
-        metadata={VERBATIM_KEY: "1"},
-    )
-
-
-def is_verbatim(channel: Channel) -> bool:
-    """Whether the messages of a channel are verbatim messages."""
-    return VERBATIM_KEY in channel.metadata
-
-
-def message_format(channel: Channel, schema: Schema | None) -> MessageFormat:
-    """The format of the messages on a verbatim channel; without its schema if that is lost."""
-    if schema is None:
-        return MessageFormat(channel.message_encoding)
-    return MessageFormat(channel.message_encoding, schema.name, schema.encoding, schema.data)
-
-
-def carries_envelopes(channel: Channel) -> bool:
-    """Whether the messages of a channel are envelopes, of any version."""
-    return not (is_system_key(channel.topic) or is_verbatim(channel))
 
 
 SEALED = ".mcap"

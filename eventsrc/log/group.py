@@ -13,9 +13,9 @@ from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
+from .channels import NO_SCHEMA, key_channel, schema_of, verbatim_channel
 from .durable_files import FsyncPolicy
 from .event import MessageFormat, NewEvent
-from .format import NO_SCHEMA, key_channel, schema_of, verbatim_channel
 from .mcap_records import MESSAGE_HEAD, Channel, Schema, encode_message_head
 
 MAX_LEADING_BYTES: Final = 2 * 1024 * 1024

@@ -17,7 +17,8 @@ from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 
 from . import mcap_records as _mcap
-from .format import NO_SCHEMA, SegmentPath, is_verbatim, key_channel, schema_of
+from .channels import NO_SCHEMA, is_verbatim, key_channel, schema_of
+from .format import SegmentPath
 from .mcap_records import Channel, Schema
 from .scan import read_body
 from .seal import SegmentPlan, seal

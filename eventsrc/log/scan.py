@@ -24,9 +24,10 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
+from .channels import envelope_version
 from .event import Event
 from .file_bytes import DamagedBytes, FileBytes, skip_damaged
-from .format import HEAD_BYTES, WrongPlace, end_in, envelope_version, mark_seed, read_head
+from .format import HEAD_BYTES, WrongPlace, end_in, mark_seed, read_head
 from .mcap_records import BadRecord, Metadata
 from .sealed_segment import SEAL_METADATA, SealedFile, sealed_edges
 from .segment import ChunkRef, Scan, formats_of, verbatim_event

@@ -30,6 +30,7 @@ from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
+from .channels import is_verbatim
 from .durable_files import drop_cached, replace_durably, sync_file, unlink_quietly, write_all
 from .format import (
     ACTIVE,
@@ -39,7 +40,6 @@ from .format import (
     SEALING,
     file_head,
     head_metadata,
-    is_verbatim,
     metadata_name,
     segment_path,
 )

@@ -17,7 +17,8 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
-from .format import NO_SCHEMA, end_in, is_metadata_of, is_verbatim
+from .channels import NO_SCHEMA, is_verbatim
+from .format import end_in, is_metadata_of
 from .mcap_records import (
     BadRecord,
     Channel,

@@ -16,18 +16,10 @@ from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import mcap_records as _mcap
+from .channels import envelope_version, is_verbatim, message_format
 from .event import Event, MessageFormat, VerbatimEvent
 from .file_bytes import DamagedBytes, FileBytes, skip_damaged
-from .format import (
-    HEAD_BYTES,
-    SEALED,
-    envelope_version,
-    is_verbatim,
-    mark_seed,
-    message_format,
-    read_head,
-    segment_path,
-)
+from .format import HEAD_BYTES, SEALED, mark_seed, read_head, segment_path
 from .mcap_records import BadRecord, Channel, Schema
 
 

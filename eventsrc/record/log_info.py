@@ -19,7 +19,8 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogReader
 from eventsrc.log import mcap_records as _mcap
-from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath, carries_envelopes
+from eventsrc.log.channels import carries_envelopes
+from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
 from eventsrc.log.sealed_segment import SealedFile

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from eventsrc.envelope.occupancy_map import OccupancyMapEvent, decode_map
 from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, RejectedPayload
 from eventsrc.log import LogWriter
-from eventsrc.log.flat_schema import flat_schema
+from eventsrc.log.channels import flat_schema
 from eventsrc.record.transport.session import Session
 from tests.integration.test_recorder import recording
 from tests.support.commands import Commands

@@ -15,12 +15,12 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import ALWAYS, LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import mcap_records as _mcap
+from eventsrc.log.channels import key_channel
 from eventsrc.log.format import (
     HEAD_BYTES,
     MARK_SEED,
     file_head,
     head_metadata,
-    key_channel,
     mark_seed,
     read_head,
 )

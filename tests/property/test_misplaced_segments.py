@@ -203,7 +203,7 @@ def test_events_only_in_an_overlapping_backup_are_kept(quick_path: Path, tail_go
 
 
 def by_hand(log_id: str, base: int, messages: list[tuple[int, bytes]]) -> bytes:
-    from eventsrc.log.format import key_channel
+    from eventsrc.log.channels import key_channel
     from eventsrc.log.mcap_records import encode
 
     body = encode(key_channel(1, 0, KEY, ENVELOPE_VERSION))

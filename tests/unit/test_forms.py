@@ -9,7 +9,7 @@ from eventsrc.envelope.forms import detect_version, read_envelope
 from eventsrc.envelope.ingest import Accepted, CheckedEnvelope, Rejected
 from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.log import Event, LogReader, LogWriter
-from eventsrc.log.format import ENVELOPE_VERSION_KEY, envelope_version, key_channel
+from eventsrc.log.channels import ENVELOPE_VERSION_KEY, envelope_version, key_channel
 from eventsrc.log.verify import verify_log
 from eventsrc.record.append import append_payload
 from eventsrc.record.importers.run import import_files

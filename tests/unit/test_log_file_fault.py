@@ -13,7 +13,8 @@ from eventsrc.envelope.system_events import LOSS_KEY
 from eventsrc.log import LogReader, LogWriter, recover_log, verify_log
 from eventsrc.log import active_segment as _active
 from eventsrc.log import mcap_records as _mcap
-from eventsrc.log.format import ACTIVE, SEALED, head_of, mark_seed, schema_of, segment_path
+from eventsrc.log.channels import schema_of
+from eventsrc.log.format import ACTIVE, SEALED, head_of, mark_seed, segment_path
 from tests.support.fixtures_log import BY_HAND, KEY, read_log, read_with_gaps
 
 BEFORE = 3

@@ -14,7 +14,7 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 from eventsrc.log import Event, LogReader, LogWriter, verify_log
-from eventsrc.log.flat_schema import flat_schema
+from eventsrc.log.channels import flat_schema
 from eventsrc.record.importers.run import import_files
 from tests.support.fixtures_log import BY_HAND, KEY, envelope, read_log
 from tests.support.rewriting import DuplicateMetadata, merge

@@ -50,7 +50,7 @@ from foxglove.messages import (
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, MessageFormat
-from eventsrc.log.format import schema_of
+from eventsrc.log.channels import schema_of
 from projections.adapters.palette import place_colour
 from projections.adapters.scene import (
     Point,

@@ -12,8 +12,7 @@ from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import KINDS, KeepApart, encode_command
 from eventsrc.envelope.readers import EnvelopeModel
 from eventsrc.log import LogWriter
-from eventsrc.log.flat_schema import flat_schema
-from eventsrc.log.format import schema_of
+from eventsrc.log.channels import flat_schema, schema_of
 from tests.support.envelopes import detection, envelope, payload
 
 SYSTEM_KEYS = sorted(value for name, value in vars(system_events).items() if name.endswith("_KEY"))
