@@ -8,6 +8,7 @@ describes them.
 """
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal, TypeAlias
 
 from pydantic import (
@@ -300,6 +301,8 @@ Command: TypeAlias = (
 )
 KINDS: tuple[str, ...] = tuple(c.model_fields["kind"].default for c in Command.__args__)
 COMMAND: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
+_validate_json: Callable[[bytes], Command] = COMMAND.validator.validate_json
+"""``COMMAND.validate_json`` without its Python wrapper."""
 
 
 class InvalidCommand(ValueError):
@@ -321,7 +324,7 @@ def parse_command(payload: bytes) -> Command:
     if len(payload) > _UNCOUNTED_BYTES:
         _check_cost(payload)
     try:
-        return COMMAND.validate_json(payload)
+        return _validate_json(payload)
     except ValidationError as error:
         first = error.errors()[0]
         if first["type"] == "union_tag_invalid":

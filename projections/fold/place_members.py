@@ -193,13 +193,19 @@ class PlaceAnchors:
 
     def apart(self, inside: Inside, other: Inside) -> Apart | None:
         """The earliest anchors of two sides that are kept apart, None if there are none."""
-        swapped = len(inside) > len(other)
-        less, more = (other, inside) if swapped else (inside, other)
-        pairs = (
-            (less[group], min(map(more.__getitem__, against)))
-            for group, against in self._groups.conflicts(less, more.keys())
-        )
-        return min(((b, a) for a, b in pairs) if swapped else pairs, default=None)
+        if not inside or not other:
+            return None
+        conflicts = self._groups.conflicts
+        if len(inside) > len(other):
+            pairs = [
+                (min(map(inside.__getitem__, against)), other[group])
+                for group, against in conflicts(other, inside.keys())
+            ]
+            return min(pairs, default=None)
+        earliest = sorted(inside, key=inside.__getitem__) if len(inside) > 1 else inside
+        for group, against in conflicts(earliest, other.keys()):
+            return inside[group], min(map(other.__getitem__, against))
+        return None
 
     def are_apart(self, inside: Inside, other: Inside) -> bool:
         """Whether any anchors of two sides are kept apart."""
