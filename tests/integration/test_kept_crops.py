@@ -1,8 +1,13 @@
 """Crops of detections that are kept from the pictures of a bag or of a bridge from ROS."""
 
+import json
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import quote
+from urllib.request import Request, urlopen
 
 import cv2
 import numpy as np
@@ -15,11 +20,22 @@ from eventsrc.envelope.crops import CROPS_TOPIC, decode_crop
 from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.transport.session import Session
+from projections.ask.best_views import views_in_order
+from projections.fold.map_errors import QuestionError
+from projections.fold.settings import Settings
+from projections.postgres import rebuild
+from projections.postgres.connection import Targets
 from projections.surfaces.cli.bag_text import BagChoice, stream_lines
 from projections.surfaces.cli.bridge_options import BridgeChoice, recording_of
+from projections.surfaces.python import fold
+from projections.surfaces.serve import Answerer, FairQueue, Pools
+from projections.surfaces.serve.asked import ServedLog
 from tests.support import ros2dds
 from tests.support import ros_messages as ros
+from tests.support.commands import Commands
+from tests.support.envelopes import detection, envelope
 from tests.support.fixtures_log import read_log
+from tests.support.logs import write_log
 from tests.support.ros2dds import KINDS
 from tests.support.ros2dds_recordings import (
     announce_all,
@@ -28,8 +44,9 @@ from tests.support.ros2dds_recordings import (
     send_all,
     verbatim,
 )
-from tests.support.ros_bags import Drive, Raw, Recorded, imported, write_bag
+from tests.support.ros_bags import CAMERA, Drive, Raw, Recorded, imported, write_bag
 from tests.support.ros_messages import SECOND, TYPES, make
+from tests.support.serve_questions import DEADLINE_S, http_at
 
 COMPRESSED, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 DRIVE = Drive(12)
@@ -203,6 +220,94 @@ def test_a_box_outside_the_picture_has_no_crop() -> None:
     assert crops[0] is None
     assert [decode(crop).shape for crop in crops[1:] if crop] == [(10, 10, 3), (10, 10, 3)]
     assert crops_of_message(payload, [[float("nan"), 0, 1, 1], [0, 0, 9, 9]]) == [None, None]
+
+
+def test_find_and_python_give_the_best_view(tmp_path: Path) -> None:
+    """Of an Object's crops that of the largest, surest box that is whole in the picture."""
+    bag, log = write_bag(tmp_path / "drive", compressed_pictures()), tmp_path / "log"
+    imported(log, bag, cut=crops_of_message)
+    house = fold(log, preset="full")
+    mapfold = Commands.in_folder(tmp_path)
+    words = ("find", "log", "--preset", "full", "--all", "--crops", "crops")
+    found = mapfold(*words, "--json").json["answers"]
+    assert found
+    by_id = {each.object_id: each for each in house.view.objects.values()}
+    for answer in found:
+        numbers = by_id[answer["object_id"]].observations
+        seen = [house.view.observations[number] for number in numbers]
+        best = max(seen, key=lambda one: (one.confidence, -one.ordinal))  # all boxes are equal
+        jpeg = (tmp_path / answer["crop"]).read_bytes()
+        assert jpeg == stored(log)[best.det_id] == house.crops(answer["object_id"])[0]
+        assert len(house.crops(answer["object_id"])) == len(seen)
+    said = mapfold(*words)
+    assert all(answer["crop"] in said.out for answer in found)
+    assert "--crops needs the LOG" in mapfold("find", "--db", "", "--crops", "crops", code=2).err
+
+
+def stored(log: Path) -> dict[str, bytes]:
+    found = [decode_crop(event.payload) for event in read_log(log) if event.key == CROPS_TOPIC]
+    return {crop.det_id: crop.jpeg for crop in found}
+
+
+def test_boxes_at_the_edge_come_last(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    boxes = [[0, 50, 300, 300], [100, 100, 150, 150], [300, 200, 640, 480], [100, 100, 160, 160]]
+    write_log(
+        log,
+        [
+            envelope(number, detections=[detection(vector=[1.0, 0.0], bbox=box)], camera=CAMERA)
+            for number, box in enumerate(boxes)
+        ],
+    )
+    view = fold(log).view
+    (only,) = view.objects.values()
+    order = [view.keyframes[each.keyframe].keyframe_id for each in views_in_order(view, only)]
+    assert order == [3, 1, 2, 0]
+
+
+def got(url: str, headers: dict[str, str] | None = None) -> tuple[int, Any, bytes]:
+    """Status, headers and body of an answer."""
+    try:
+        with urlopen(Request(url, headers=headers or {}), timeout=DEADLINE_S) as answer:
+            return answer.status, answer.headers, answer.read()
+    except HTTPError as refused:
+        return refused.code, refused.headers, refused.read()
+
+
+def test_http_gives_crops_of_detections_and_objects(
+    tmp_path: Path, module_database: Targets
+) -> None:
+    bag, log = write_bag(tmp_path / "drive", compressed_pictures()), tmp_path / "log"
+    imported(log, bag, cut=crops_of_message)
+    rebuild(log, module_database, Settings())
+    kept = stored(log)
+    with Pools(module_database, 2) as pools, FairQueue(2) as queue, ExitStack() as stack:
+        beside = stack.enter_context(closing(ServedLog(log)))
+        answerer = Answerer(pools, per_second=1000.0, log=beside)
+        with http_at(answerer, queue) as port:
+            at = f"http://127.0.0.1:{port}/crops/"
+            for det_id, jpeg in kept.items():
+                status, headers, content = got(at + quote(det_id, safe=""))
+                assert (status, content) == (200, jpeg)
+                assert headers["content-type"] == "image/jpeg"
+                assert headers["cache-control"] == "private, max-age=3600"
+                again = got(at + quote(det_id, safe=""), {"If-None-Match": headers["etag"]})
+                assert (again[0], again[2]) == (304, b"")
+            one = next(iter(fold(log).view.objects.values()))
+            assert got(at + one.object_id)[2] in kept.values()
+            for hostile in (
+                "../../etc/passwd",
+                "%2e%2e%2f%2e%2e%2fetc",
+                "obj-",
+                "a%00b",
+                "x" * 300,
+            ):
+                status, _, content = got(at + hostile)
+                assert status in (400, 404), hostile
+                assert json.loads(content)["error"]["kind"] == "bad_question"
+            without = Answerer(pools, per_second=1000.0)
+            with pytest.raises(QuestionError, match="start the service with --log LOG"):
+                without.crop(next(iter(kept)))
 
 
 def test_a_bridge_cuts_crops_and_does_not_keep_the_pictures(

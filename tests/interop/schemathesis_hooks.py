@@ -30,6 +30,8 @@ def before_call(
         _fit(case.body)
     if case.operation.path == "/objects/{name}":
         case.path_parameters["name"] = OBJECT
+    if case.operation.path == "/crops/{name}":
+        case.path_parameters["name"] = "shown"
     if case.operation.path == "/path":
         case.query |= {"from": "bath", "to": OBJECT}
     if case.operation.path == "/changes":

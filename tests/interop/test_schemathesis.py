@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from eventsrc.envelope.crops import CROPS_TOPIC, Crop, encode_crop
+from eventsrc.envelope.model import DetId
+from eventsrc.log import LogWriter
+from eventsrc.record.append import CROP_FORMAT
 from projections.postgres.connection import Targets
 from tests.support.http_attacks import served
 from tests.support.services import MODEL, build
@@ -18,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "0123456789abcdef-not-a-secret"
 PROGRAM = Path(sys.executable).with_name("schemathesis")
-OPERATIONS = 9
+OPERATIONS = 10
 ARGS = ("--no-zenoh", "--http", "127.0.0.1:0", "--rate", "100000")
 
 
@@ -51,7 +55,11 @@ def found(port: int, folder: Path, *options: str) -> str:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory, module_database: Targets) -> Path:
-    return build(tmp_path_factory.mktemp("described"), module_database)
+    log = build(tmp_path_factory.mktemp("described"), module_database)
+    crop = encode_crop(Crop(DetId("shown"), b"\xff\xd8\xff\xd9"), 0)
+    with LogWriter(log) as writer:
+        writer.append(CROPS_TOPIC, crop, form=CROP_FORMAT)
+    return log
 
 
 @pytest.mark.timeout(900)

@@ -1,8 +1,10 @@
 """``mapfold find``, ``room`` and ``path``: where things are, what is in a place, the way to it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -10,6 +12,10 @@ import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised, counted, shorten_by, table, visible
+from eventsrc.base.user_files import written_whole
+from eventsrc.log import LogReader
+from eventsrc.record.kept_crops import KeptCrops
+from projections.ask.best_views import best_views
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find, robot_seconds
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
@@ -82,6 +88,22 @@ class AskedMap(FoldSettings):
         view = self._view()
         shorten_by(ShortIds.of(things_of(view)).text)
         return view
+
+    def write_crops(self, view: MapView, found: FoundObjects, folder: Path) -> dict[str, str]:
+        """Write the best crop of each answer that has one; the files by Object."""
+        files: dict[str, str] = {}
+        records = {each.object_id: each for each in view.objects.values()}
+        with LogReader(self.log or Path()) as reader:
+            kept = KeptCrops(reader)
+            for each in found.answers:
+                for best in islice(best_views(view, records[each.object_id], kept), 1):
+                    files[each.object_id] = str(folder / f"{each.object_id}.jpg")
+                    with written_whole(Path(files[each.object_id])) as file:
+                        file.write(best.jpeg)
+        if len(files) < len(found.answers):
+            count = counted(len(found.answers) - len(files), "answer")
+            say(f"{self.log} keeps no crop of {count}; `mapfold import --keep-crops` keeps them")
+        return files
 
     def _view(self) -> MapView:
         if self.db is None:
@@ -158,6 +180,14 @@ def find_things(
     ] = None,
     top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Most answers.")] = 10,
     every: Annotated[bool, typer.Option("--all", help="Also what was seen once.")] = False,
+    crops: Annotated[
+        Path | None,
+        typer.Option(
+            "--crops",
+            metavar="FOLDER",
+            help="Write the best crop that the log keeps of each answer there, and name its file.",
+        ),
+    ] = None,
     goal: GoalOption = None,
     clearance: ClearanceOption = CLEARANCE_M,
     json_: JsonOption = False,
@@ -167,6 +197,8 @@ def find_things(
     WHAT forgives letter case, plurals and near spellings; a place is given by its id, name or type.
     """
     (what,) = asked.words(what)
+    if crops is not None and asked.db is not None:
+        raise MisuseError("--crops needs the LOG: the databases keep no crops")
     wanted = Wanted(
         what=what,
         room=in_,
@@ -181,15 +213,19 @@ def find_things(
     )
     view = asked.view()
     found = find(view, wanted)
+    files = {} if crops is None else asked.write_crops(view, found, crops)
     if goal is not None:
         if not found.answers:
             raise MapfoldError("nothing found, so there is no goal")
         _print_goal(goal_of(view, found.answers[0].object_id, clearance), goal)
         return
     if json_:
-        emit(found.document())
+        document = found.document()
+        for each in document["answers"] if crops is not None else ():
+            each["crop"] = files.get(each["object_id"])
+        emit(document)
         return
-    display(_table(found) if found.answers else "nothing found\n")
+    display(_table(found, files) if found.answers else "nothing found\n")
     for line in _remarks(wanted, found):
         say(line)
 
@@ -301,7 +337,7 @@ def _path_text(found: DrivenPath) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _table(found: FoundObjects) -> str:
+def _table(found: FoundObjects, files: Mapping[str, str]) -> str:
     header = ["object", "class", "place", "position (m)", "seen", "last seen"]
     away, way = (
         any(getattr(each, name) is not None for each in found.answers)
@@ -320,7 +356,8 @@ def _table(found: FoundObjects) -> str:
         ]
         measured = [each.distance_m] * away + [each.way_m] * way
         row[4:4] = ["none" if metres is None else f"{metres:.2f}" for metres in measured]
-        rows.append(row)
+        rows.append([*row, visible(files.get(each.object_id, "none"))] if files else row)
+    header += ["crop"] if files else []
     return table(header, rows, right=("seen", "away (m)", "way (m)"))
 
 

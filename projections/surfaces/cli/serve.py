@@ -199,7 +199,7 @@ def serve(
         typer.Option(
             "--log",
             metavar="LOG",
-            help="The log that the databases were made from; HTTP's /changes needs it.",
+            help="The log that the databases were made from; HTTP's /changes and /crops need it.",
         ),
     ] = None,
     camera: CameraOptions,

@@ -14,6 +14,8 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
+from eventsrc.record.kept_crops import KeptCrops
+from projections.ask.best_views import best_views
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObjects, Wanted, find, robot_seconds
 from projections.ask.room_and_path import DrivenPath, Room, goal_of, path, room
@@ -53,9 +55,11 @@ class Map:
         ('living room', '18fce70e')
     """
 
-    def __init__(self, view: MapView, known_at: Offset | None = None) -> None:
+    def __init__(
+        self, view: MapView, known_at: Offset | None = None, log: Path | None = None
+    ) -> None:
         self.view = view
-        self._known_at = known_at
+        self._known_at, self._log = known_at, log
 
     @cached_property
     def digest(self) -> str:
@@ -153,6 +157,16 @@ class Map:
             'oven'
         """
         return room(self.view, name)
+
+    def crops(self, thing: str) -> list[bytes]:
+        """The JPEGs that the log keeps of an Object, by any of its names, best view first: whole in
+        the picture, then large and sure. Raises NoSuchThing and SeveralThings, LogNotFound."""
+        wanted = ObjectOrdinal(thing_called(thing, things_of(self.view), ("object",)).ordinal)
+        found = self.view.all_objects[self.view.object_survivors.find(wanted)]
+        if self._log is None:
+            raise MisuseError("this map was not folded from a log by itself; use fold(LOG)")
+        with LogReader(self._log) as reader:
+            return [each.jpeg for each in best_views(self.view, found, KeptCrops(reader))]
 
     def path(
         self,
@@ -327,7 +341,7 @@ def fold(
         corrections = read_corrections(reader, known)
         chosen = settings_from(settings, preset)(corrections)
         view = fold_log(reader, chosen, end, keep_embeddings=embeddings, corrections=corrections)[1]
-    return Map(view, known)
+    return Map(view, known, reader.path)
 
 
 def settings_from(

@@ -87,7 +87,7 @@ class Timeline:
     def at(self, point: int | str = "end") -> Map:
         """The map at a point. It has no embeddings: ask a map of `fold` by `relocalize`."""
         end = self._offset(point)
-        return Map(self._timeline.at(end), end)
+        return Map(self._timeline.at(end), end, self._timeline.reader.path)
 
     @_one_at_a_time
     def merges(self, point: int | str = "end") -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, NamedTuple, cast, get_args
+from typing import Any, Final, NamedTuple, TypeVar, cast, get_args
 
 from eventsrc.base.errors import LogError, MapfoldError
 from projections.fold.map_errors import (
@@ -38,9 +38,19 @@ from projections.localize.relocalize.question import Movement
 from projections.localize.relocalize.track import Track, movement_of
 from projections.postgres.queries.live_view import LiveView
 
-from .asked import NO_LOG, ChangesQuery, MapQuestion, NotInMapError, ServedLog, asked
+from .asked import (
+    NO_LOG,
+    NO_LOG_OF_CROPS,
+    ChangesQuery,
+    MapQuestion,
+    NotInMapError,
+    ServedLog,
+    asked,
+)
 from .pools import Pools
 from .states import refuse_unknown, state_read
+
+Result = TypeVar("Result")
 
 
 class TooMuchError(MapfoldError):
@@ -192,7 +202,7 @@ class Answerer:
     """Answers questions from the live databases; safe to use from many threads.
 
     ``note`` gets a line for people when a question fails because of the database. Without a ``log``
-    beside them, `changes` is refused.
+    beside them, `changes` and `crop` are refused.
     """
 
     def __init__(
@@ -257,12 +267,20 @@ class Answerer:
 
     def changes(self, query: ChangesQuery) -> dict[str, Any]:
         """A page of what changed in the building. Raises NotInMapError."""
+        return self._ask_log(NO_LOG, lambda log, view: log.changes(view, query))
+
+    def crop(self, name: str) -> bytes:
+        """The JPEG of a detection, or of an Object's best view. Raises NotInMapError."""
+        return self._ask_log(NO_LOG_OF_CROPS, lambda log, view: log.crop(view, name))
+
+    def _ask_log(self, missing: str, ask: Callable[[ServedLog, LiveView], Result]) -> Result:
+        """The log's answer; without one NotInMapError with the text ``missing``."""
         if self._log is None:
-            raise NotInMapError(NO_LOG)
+            raise NotInMapError(missing)
         view = self._view()
         with self._reporting_errors():
             try:
-                return self._log.changes(view, query)
+                return ask(self._log, view)
             except (FoldError, LogError) as error:
                 self._note(f"mapfold: {error}")
                 raise

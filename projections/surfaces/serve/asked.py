@@ -16,6 +16,8 @@ from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised
+from eventsrc.record.kept_crops import KeptCrops
+from projections.ask.best_views import best_views
 from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find, robot_seconds
 from projections.ask.room_and_path import path, room
@@ -146,6 +148,7 @@ class ServedLog:
     def __init__(self, log: Path, note: Callable[[str], None] = lambda _: None) -> None:
         self._lock, self._settings = threading.Lock(), Settings()
         self._timeline = LogTimeline(log, lambda _: self._settings, note=note, histories=1)
+        self._crops = KeptCrops(self._timeline.reader)
 
     def close(self) -> None:
         """Close the log."""
@@ -160,6 +163,29 @@ class ServedLog:
                 f"--log {reader.path} is log {reader.log_id}, but the databases were made from"
                 f" {view.log_id}; give that log, or run `{advised('replay', reader.path)}`"
             )
+
+    def crop(self, served: LiveView, name: str) -> bytes:
+        """The JPEG of a detection, by its det_id, or of an Object's best view, by its id. Raises
+        NotInMapError."""
+        with self._lock:
+            self.refuse_other(served)
+            self._settings = served.settings
+            self._timeline.refresh()
+            found = self._crops.jpeg(name)
+            if found is None and name.startswith("obj-"):
+                found = self._best_view(self._timeline.at(served.next_offset), name)
+        if found is None:
+            raise NotInMapError(f"the log keeps no crop of {describe_value(name)}")
+        return found
+
+    def _best_view(self, view: MapView, object_id: str) -> bytes | None:
+        try:
+            meant = thing_called(object_id, things_of(view), ["object"])
+        except MisuseError as error:
+            raise NotInMapError(str(error)) from None
+        found = view.object_survivors.find(ObjectOrdinal(meant.ordinal))
+        views = best_views(view, view.all_objects[found], self._crops)
+        return next((each.jpeg for each in views), None)
 
     def changes(self, view: LiveView, asked: ChangesQuery) -> dict[str, Any]:
         """A page of what changed. Raises NotInMapError, and ProjectionMismatch."""
@@ -182,6 +208,7 @@ class ServedLog:
         return {**document, "changes": document["changes"][first:until], **more}
 
 
+NO_LOG_OF_CROPS: Final = "the databases keep no crops; start the service with --log LOG"
 NO_LOG: Final = (
     "the databases have one map, and only the log knows what changed since another; start the"
     " service with --log LOG, or run `mapfold changes LOG`"

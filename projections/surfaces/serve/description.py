@@ -145,6 +145,15 @@ METRICS: Final[dict[int | str, dict[str, Any]]] = {
 }
 
 
+CROP: Final[dict[int | str, dict[str, Any]]] = {
+    200: {
+        "description": "The JPEG",
+        "content": {"image/jpeg": {"schema": {"type": "string", "format": "binary"}}},
+    },
+    304: {"description": "The client has it already"},
+}
+
+
 EXAMPLES: Final = (
     ("/relocalize", "post", _ANSWER),
     ("/state/{what}", "get", _PLACES),

@@ -7,6 +7,7 @@ threads of the `FairQueue` answer them, because database access is synchronous.
 """
 
 import asyncio
+import hashlib
 from collections.abc import Callable, Collection, Sequence
 from functools import cache
 from typing import Annotated, Any, Final
@@ -40,13 +41,14 @@ from .asked import (
     room_question,
 )
 from .connections import peer_of
-from .description import EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
+from .description import CROP, EXAMPLES, METRICS, QUESTION, add_docs, refusals, state_parameter
 from .fair_queue import FairQueue
 from .models import AnswerShape, Health, ObjectsShape, PlacesShape, StateQuery
 from .service_metrics import ServiceMetrics
 from .states import State, refuse_unknown
 
 _DRAIN_FACTOR: Final = 8
+_KEPT: Final = "private, max-age=3600"
 _NAME: Final = Path(min_length=1, max_length=MOST_TEXT)
 _END: Final = "X,Y in metres, a Place or an Object; the way to an Object ends at its goal."
 _RETRY_AFTER: Final = {"Retry-After": "1"}
@@ -199,6 +201,23 @@ def create_app(
     )
     async def changes(request: Request, wanted: Annotated[ChangesQuery, Query()]) -> Response:
         return await answered(request, "changes", lambda: answerer.changes(wanted))
+
+    @app.get(
+        "/crops/{name:path}",
+        summary="The crop of a detection, or of an Object's best view; needs --log",
+        response_class=Response,
+        responses=refusals(asking=True) | CROP,
+        dependencies=[only()],
+    )
+    async def crop(request: Request, name: Annotated[str, _NAME]) -> Response:
+        peer = "" if request.client is None else peer_of(request.client.host)
+        future = queue.submit(peer, lambda: answerer.crop(name))
+        counted.watch("http", "crop", future)
+        jpeg = await asyncio.wrap_future(future)
+        headers = {"ETag": f'"{hashlib.sha256(jpeg).hexdigest()[:16]}"', "Cache-Control": _KEPT}
+        if request.headers.get("if-none-match") == headers["ETag"]:
+            return Response(status_code=304, headers=headers)
+        return Response(jpeg, media_type="image/jpeg", headers=headers)
 
     @app.get(
         "/health",

@@ -1,0 +1,47 @@
+"""The best pictures of an Object: of the crops that a log keeps of its detections.
+
+A view whose box ends at the edge of the picture, where the thing may be cut off, comes behind all
+others. Then the view with the largest confidence times diagonal of its box is the best, and of
+equal ones the first.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from eventsrc.envelope.model import DetId
+from eventsrc.record.kept_crops import KeptCrops
+from projections.map.records import ObjectRecord, ObservationRecord
+from projections.map.view import MapView
+
+_EDGE_PX: Final = 1.0
+_MOST_TRIED: Final = 16
+"""Views of an Object that are looked for: behind these the log keeps none of it, or poor ones."""
+
+
+class View(NamedTuple):
+    """The crop of a detection, a JPEG."""
+
+    det_id: DetId
+    jpeg: bytes
+
+
+def views_in_order(view: MapView, found: ObjectRecord) -> list[ObservationRecord]:
+    """The detections of an Object, the best view first."""
+
+    def order(seen: ObservationRecord) -> tuple[bool, float, int]:
+        x0, y0, x1, y1 = seen.bbox
+        camera = view.keyframes[seen.keyframe].camera
+        width, height = (camera.width_px, camera.height_px) if camera else (math.inf, math.inf)
+        is_cut = min(x0, y0, width - x1, height - y1) <= _EDGE_PX
+        return is_cut, -seen.confidence * math.hypot(x1 - x0, y1 - y0), seen.ordinal
+
+    return sorted((view.observations[number] for number in found.observations), key=order)
+
+
+def best_views(view: MapView, found: ObjectRecord, crops: KeptCrops) -> Iterator[View]:
+    """The crops that a log keeps of an Object, the best view first."""
+    for seen in views_in_order(view, found)[:_MOST_TRIED]:
+        jpeg = crops.jpeg(seen.det_id, view.keyframes[seen.keyframe].offset)
+        if jpeg is not None:
+            yield View(seen.det_id, jpeg)
