@@ -14,7 +14,6 @@ OWN_WAY = {
     "projections/adapters/rerun/rrd_recording.py": "into a pipe",
     "projections/localize/evaluate/evaluation.py": "into memory",
     "projections/adapters/drawing/sheet.py": "into memory",
-    "projections/adapters/drawing/align_picture.py": "by Sheet",
     "projections/adapters/drawing/merge_picture.py": "by Sheet",
     "projections/adapters/drawing/map_picture.py": "by Sheet",
     "projections/store/kept_files.py": "members of an archive that log_identity.py opened",

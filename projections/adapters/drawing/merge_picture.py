@@ -1,29 +1,30 @@
-"""Draw a merge before and after, and maps under several settings side by side.
-
-Each map is a panel of one figure, drawn with `projections.adapters.drawing`.
-"""
+"""Pictures of several maps: a merge before and after, maps under several settings side by side, and
+a run over the map that it is aligned to."""
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from eventsrc.envelope.model import Offset
 from projections.adapters import palette
+from projections.adapters.scene import HousePlan, drives
 from projections.history.known_history import KnownHistory
 from projections.history.merge_reasons import chains_of, merge_reason
 from projections.history.names import keyframe_name, place_title
+from projections.localize.align import Alignment, moved
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_records import Merge
 
-from .base_layers import draw_drives, draw_regions
+from .base_layers import draw_drives, draw_map_walls, draw_regions, wall_spots
 from .overlays import draw_place_names
-from .sheet import HALO, Bounds, Sheet, check_suffix
+from .sheet import HALO, Bounds, Sheet, check_suffix, new_sheet
 
 _PANEL_IN = 6.5
 _SMALL_PANEL_IN = 4.2
@@ -37,6 +38,11 @@ _ROOMS_LEGEND = (
     "★ bridging keyframe    red: the two cells with the shortest drive between them    "
     "■ start of the run"
 )
+_ALIGNED_LEGEND = (
+    "small dots: keyframes of the frame    ● its things    blue: the drive and × the things moved "
+    "into it    red: one thing"
+)
+_MOVED, _PAIR = "#1f6fb4", "#c0392b"
 _HEADER_WIDTH = 170
 """Characters in a line of the header."""
 _AROUND_EPS = 4.0
@@ -75,6 +81,35 @@ def draw_maps(maps: Sequence[tuple[str, MapView]], out: Path) -> None:
         _draw_map(panel, view)
         panel.axes.set_title(title, fontsize=8.5)
     _save(figure, out)
+
+
+def draw_alignment(
+    first: MapView, second: MapView, found: Alignment, out: Path, title: str
+) -> None:
+    """Draw ``second``, moved into the frame of ``first``, over it, to ``out``. Raises MisuseError
+    when ``out`` is not the name of a picture or cannot be written."""
+    check_suffix(out)
+    here, own = (
+        {each.object_id: each.spot for each in view.objects.values()} for view in (first, second)
+    )
+    into = moved(np.array([*own.values()]), found.transform)
+    there = dict(zip(own, into.tolist(), strict=True))
+    ways = [moved(np.array(way), found.transform) for _, way in drives(second)]
+    spots = [*here.values(), *there.values(), *(point for way in ways for point in way.tolist())]
+    sheet = new_sheet(first, HousePlan(), [*spots, *wall_spots(first)])
+    draw_map_walls(sheet, first)
+    draw_drives(sheet, first)
+    axes = sheet.axes
+    for way in ways:
+        axes.plot(*way.T, color=_MOVED, linewidth=0.8, alpha=0.6)
+    axes.plot(*np.array([*here.values()]).T, "o", color=palette.FAINT, markersize=4, zorder=5)
+    axes.plot(*into.T, "x", color=_MOVED, markersize=5, zorder=6)
+    for one, other, _ in found.pairs:
+        ends = np.array([here[one], there[other]])
+        axes.plot(*ends.T, color=_PAIR, linewidth=1.6, zorder=7)
+    sheet.header(0, title, 14, palette.INK, "bold")
+    sheet.footer(0, _ALIGNED_LEGEND, palette.SMALL_PRINT)
+    sheet.save(out)
 
 
 def _panels(

@@ -148,7 +148,7 @@ def align(
     found = align_things(first, second)
     title = f"{', '.join(map(visible, runs))} into the frame of {visible(target)}"
     if picture is not None and found is not None:
-        from projections.adapters.drawing.align_picture import draw_alignment
+        from projections.adapters.drawing.merge_picture import draw_alignment
 
         draw_alignment(frame, moved, found, picture, title)
     is_usable = found is not None and found.verdict in ("sure", "likely" if yes else "sure")
