@@ -191,7 +191,7 @@ def check_unused(choice: BridgeChoice, domain: int | None, *, ros2: bool, ros2dd
         )
 
 
-class Found(NamedTuple):
+class RecordedRos(NamedTuple):
     """What of ROS is recorded: how envelopes are made, all topics that are kept, how they come."""
 
     recording: RosRecording
@@ -199,9 +199,11 @@ class Found(NamedTuple):
     wire: Wire
 
 
-def topics_of_bridge(choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None) -> Found:
+def topics_of_bridge(
+    choice: BridgeChoice, now_ns: int, ledger: GapLedger[RunId] | None
+) -> RecordedRos:
     """What of a bridge is recorded."""
-    return Found(*recording_of(choice, now_ns, ledger), BridgeWire())
+    return RecordedRos(*recording_of(choice, now_ns, ledger), BridgeWire())
 
 
 def find_topics_of_nodes(
@@ -211,7 +213,7 @@ def find_topics_of_nodes(
     types: MessageTypes,
     ledger: GapLedger[RunId] | None,
     stop: threading.Event,
-) -> Found | None:
+) -> RecordedRos | None:
     """What of the nodes over rmw_zenoh is recorded, once somebody publishes detections; None if
     ``stop`` is set before. Prints what is taken. Raises MisuseError."""
     wire, options = RmwWire(domain), as_of_a_bag(choice)
@@ -229,7 +231,7 @@ def find_topics_of_nodes(
     )
     recording = RosRecording(key=DEFAULT_KEYS[0], streams=streams, grids=tuple(made.grids))
     others = (topic_of("", topic, "--topic") for topic in choice.topic or ())
-    return Found(recording, tuple(dict.fromkeys([*used_topics(recording), *others])), wire)
+    return RecordedRos(recording, tuple(dict.fromkeys([*used_topics(recording), *others])), wire)
 
 
 def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
@@ -261,7 +263,7 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
 
 
 def open_bridge(
-    choice: BridgeChoice, found: Found, writer: LogWriter, types: MessageTypes
+    choice: BridgeChoice, found: RecordedRos, writer: LogWriter, types: MessageTypes
 ) -> Bridge:
     """The recorder of what was found. First makes the envelopes that a killed recorder left
     out."""
