@@ -5,10 +5,12 @@ from one straight to the other, at most `STEP_M`, or when they are within `_BESI
 other with no wall in between. So a way goes where robots went, and a robot can drive it.
 
 The *goal* of an Object is a pose that faces it, `clearance_m` or more from all walls where those
-are known, with a line of sight that is free. Of these a pose from which the Object was seen where
-it stands now comes first, then another driven one, then free floor of an occupancy map; within each
-the one whose distance is nearest to that from which the Object is seen usually, a metre counting as
-much as `_A_METRE` radians off the middle of the picture; of equal ones the earliest.
+are known. A pose from which the Object was seen where it stands now comes first, then another
+driven one, then free floor of an occupancy map, both with a free line of sight; within each the one
+whose distance is nearest to that from which the Object is seen usually, a metre counting as much as
+`_A_METRE` radians off the middle of the picture; of equal ones the earliest. Of the poses that saw
+it those of an earlier run than the last, those where another Object stands and those with a wall in
+the line of sight, for estimates err, count as `_WORSE` radians more for each of these.
 """
 
 import heapq
@@ -37,6 +39,9 @@ _BESIDE_M: Final = 0.75
 STEP_M: Final = 5.0
 _BEST_M: Final = 1.2
 _A_METRE: Final = 0.3
+_WORSE: Final = 1.0
+_STANDS_M: Final = 0.4
+"""So near to its estimate an Object stands in the way of a robot."""
 _LEAST_M, _MOST_M = 0.5, 4.0
 _RINGS: Final = (1.2, 1.0, 1.4, 0.8, 1.6, 2.0, 0.6, 2.5)
 _TURNS: Final = 16
@@ -99,6 +104,10 @@ class DrivenGround:
         self.spots: list[Spot] = []
         self._of: dict[tuple[_Floor, int, int], int] = {}
         self._links: list[dict[int, float]] = []
+        self._standing: dict[tuple[int, int], list[ObjectRecord]] = {}
+        for each in view.objects.values():
+            if each.confirmed and each.estimate is not None and each.missing_in is None:
+                self._standing.setdefault(_stand(each.spot), []).append(each)
         last: dict[int, tuple[int, int]] = {}
         posed = [k for k in view.keyframes if k.pose is not None]
         for keyframe in sorted(posed, key=lambda k: (k.run, k.keyframe_id)):
@@ -163,6 +172,7 @@ class DrivenGround:
         """The goal of an Object. Raises MisuseError where there is none."""
         since = found.relocations[-1].offset if found.relocations else 0
         seen = [k for k in self._view.sightings(found) if k.pose is not None and k.offset >= since]
+        last = max((k.run for k in seen), default=None)
         distances = sorted(math.dist(_spot(keyframe), found.spot) for keyframe in seen)
         usual = distances[len(distances) // 2] if distances else _BEST_M
         for ground, candidates in (
@@ -174,13 +184,16 @@ class DrivenGround:
             goal: GoalPose | None = None
             for number, (spot, floor, keyframe) in enumerate(candidates):
                 distance = math.dist(spot, found.spot)
-                aside = _off_centre(keyframe, found.spot) if ground == "seen" else 0.0
-                rank = round(aside + abs(distance - usual) * _A_METRE, 2), number
-                if not _LEAST_M <= distance <= _MOST_M or (best is not None and rank >= best):
+                is_seen = ground == "seen"
+                worse = self._worse(found, keyframe, last) if is_seen and keyframe else 0.0
+                rank = round(worse + abs(distance - usual) * _A_METRE, 2), number
+                if distance < _LEAST_M or (best is not None and rank >= best):
                     continue
                 if not self._is_clear(floor, spot, clearance_m):
                     continue
-                if not self.is_free(floor, spot, found.spot):
+                if not is_seen and (
+                    distance > _MOST_M or not self.is_free(floor, spot, found.spot)
+                ):
                     continue
                 best = rank
                 goal = GoalPose(
@@ -194,6 +207,26 @@ class DrivenGround:
         raise MisuseError(
             f"no pose from which {visible(found.class_name)} {found.object_id} can be seen is"
             f" {clearance_m:g} m from walls; give a smaller --clearance"
+        )
+
+    def _worse(self, found: ObjectRecord, keyframe: KeyframeRecord, last: int | None) -> float:
+        """Radians by which a pose that saw an Object is worse than the best one."""
+        spot = _spot(keyframe)
+        flaws = (
+            keyframe.run != last,
+            self._is_taken(spot, found),
+            not self.is_free(keyframe.floor, spot, found.spot),
+        )
+        return _off_centre(keyframe, found.spot) + _WORSE * sum(flaws)
+
+    def _is_taken(self, spot: Spot, found: ObjectRecord) -> bool:
+        """Whether another Object than ``found`` stands at a spot."""
+        column, row = _stand(spot)
+        return any(
+            other is not found and math.dist(other.spot, spot) < _STANDS_M
+            for x in (column - 1, column, column + 1)
+            for y in (row - 1, row, row + 1)
+            for other in self._standing.get((x, y), ())
         )
 
     def is_free(self, floor: _Floor, a: Spot, b: Spot) -> bool:
@@ -288,9 +321,14 @@ def _um(spot: Spot) -> tuple[int, int]:
     return metres_to_um(spot[0]), metres_to_um(spot[1])
 
 
-def _off_centre(keyframe: KeyframeRecord | None, spot: Spot) -> float:
+def _stand(spot: Spot) -> tuple[int, int]:
+    """The square of a spot, `_STANDS_M` wide."""
+    return math.floor(spot[0] / _STANDS_M), math.floor(spot[1] / _STANDS_M)
+
+
+def _off_centre(keyframe: KeyframeRecord, spot: Spot) -> float:
     """Radians between where a keyframe looked and a spot."""
-    if keyframe is None or keyframe.pose is None:
+    if keyframe.pose is None:
         return 0.0
     off = keyframe.pose.yaw_rad - _bearing(_spot(keyframe), spot)
     return abs(math.remainder(off, 2 * math.pi))

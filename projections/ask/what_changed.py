@@ -11,21 +11,18 @@ first.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import Offset
-from projections.fold.exact import UM_PER_M
-from projections.fold.presence import would_see
-from projections.fold.sights import camera_of
 from projections.map.naming import ShortIds, things_of
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 from .find import SeenAt, seen_at
-from .object_changes import KNOWN_M, Point, became, is_within, object_rows
+from .object_changes import KNOWN_M, Point, became, is_within, keyframes_looking, object_rows
 
 ChangeKind = Literal["moved", "missing", "new", "back"]
 KINDS: Final[tuple[ChangeKind, ...]] = ("moved", "missing", "new", "back")
@@ -160,26 +157,9 @@ def _new(first: MapView, second: MapView) -> tuple[list[ObjectRecord], int]:
         alike = any(is_within(e.estimate, at) for e in there.get(record.class_name, ()))
         if at.est_sigma_m > KNOWN_M or alike:
             doubtful += 1
-        elif _looks(second, record, earlier) >= _LOOKS:
+        elif len(keyframes_looking(second, record, earlier)) >= _LOOKS:
             sure.append(record)
     return sure, doubtful
-
-
-def _looks(view: MapView, record: ObjectRecord, earlier: Iterable[KeyframeRecord]) -> int:
-    """How many of some keyframes looked at where an Object stands."""
-    vantages = [
-        (k.pose.x_um / UM_PER_M, k.pose.y_um / UM_PER_M)
-        for k in view.sightings(record)
-        if k.pose is not None
-    ]
-    count = 0
-    for keyframe in earlier:
-        pose = keyframe.pose
-        if pose is None:
-            continue
-        camera = camera_of(keyframe.camera, view.settings.camera)
-        count += any(would_see(pose, camera, record.spot, vantage) for vantage in vantages)
-    return count
 
 
 class _Writer:

@@ -161,7 +161,7 @@ def test_a_goal_is_clear_of_walls_and_sees_the_thing(sample: MapView) -> None:
         if 50 <= grid.source.cells[row, column] <= 100
     ]
     half = grid.source.resolution / 2
-    goals = 0
+    goals = free = 0
     for each in sample.objects.values():
         if not each.confirmed or not has_goal(sample, each.object_id):
             continue
@@ -173,9 +173,13 @@ def test_a_goal_is_clear_of_walls_and_sees_the_thing(sample: MapView) -> None:
         facing = math.atan2(each.spot[1] - goal.y, each.spot[0] - goal.x)
         assert goal.yaw == pytest.approx(facing)
         ends = [(round(x * 1e6), round(y * 1e6)) for x, y in (at, each.spot)]
-        assert grid.is_free_line(*ends)
+        saw = {(k.run_id, k.keyframe_id) for k in sample.sightings(each)}
+        assert goal.ground == "seen" or grid.is_free_line(*ends)
+        assert (goal.ground == "seen") == ((goal.run_id, goal.keyframe_id) in saw)
+        free += grid.is_free_line(*ends)
         assert goal.walls_known
     assert goals > 40
+    assert free >= 0.9 * goals
 
 
 def test_a_goal_is_printed_for_ros(mapfold: Commands) -> None:

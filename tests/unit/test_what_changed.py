@@ -55,6 +55,31 @@ def test_moved_missing_and_new_are_told_apart() -> None:
     assert "and 1 more" not in changes_text(found, most=1)
 
 
+def test_what_the_later_run_saw_once_more_is_not_surely_missing() -> None:
+    """The look may be of another thing in its place, so nobody knows."""
+    glimpse = next(
+        document
+        for document in run("b", ROOM)
+        if any(seen["class"] == "plant" for seen in document["detections"])
+    )
+    rest = [d for d in run("b", AWAY) if d["keyframe_id"] != glimpse["keyframe_id"]]
+    found = changed(run("a", ROOM), [glimpse, *rest])
+    assert (found.changes, found.unsure) == ((), 1)
+
+
+def test_what_was_often_overlooked_before_is_not_surely_missing() -> None:
+    """A plant that only every fourth look saw is missed as easily as it is gone."""
+    documents, looks = run("a", ROOM), 0
+    for document in documents:
+        seen = [each for each in document["detections"] if each["class"] == "plant"]
+        if seen:
+            looks += 1
+        if seen and looks % 4:
+            document["detections"].remove(seen[0])
+    found = changed(documents, run("b", AWAY))
+    assert found.changes == ()
+
+
 def test_what_comes_back_is_back_and_not_new() -> None:
     found = changed(run("a", ROOM), run("b", AWAY), run("c", ROOM), before=2)
     assert [(c.kind, c.class_name) for c in found.changes] == [("back", "plant")]

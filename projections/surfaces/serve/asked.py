@@ -2,8 +2,8 @@
 model of `projections.ask`.
 
 The map is read from the databases whole and kept until their checkpoint moves, so a question of a
-map that does not change reads one row. They have that one map: what changed since another moment
-is asked of the log (`ServedLog`).
+map that does not change reads one row. Reading it keeps only one question waiting. Databases have
+one map: what changed since another moment is asked of the log (`ServedLog`).
 """
 
 import threading
@@ -29,9 +29,7 @@ from projections.history import LogTimeline
 from projections.localize.relocalize import describe_value
 from projections.map.naming import thing_called, things_of
 from projections.map.view import MapView
-from projections.postgres import checkpoints
-from projections.postgres.connection import Connection
-from projections.postgres.queries.live_view import LiveView, read_view
+from projections.postgres.queries.live_view import LiveView
 
 from .states import CURSOR, MAX_PAGE
 
@@ -47,19 +45,27 @@ class NotInMapError(QuestionError):
 
 
 class MapMemory:
-    """The map of a database, read again when its checkpoint has moved; for any thread."""
+    """The map of a database, read again when its checkpoint has moved; for any thread. Of questions
+    at one time the first reads it; the others get the map at hand, and wait where there is none."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._reading = threading.Lock()
         self._kept: tuple[object, LiveView] | None = None
 
-    def view(self, connection: Connection) -> LiveView:
-        """The map; ``connection`` was set up by `prepare_graph`. Not to be changed."""
-        at = checkpoints.load(connection, "graph")
-        with self._lock:
-            if self._kept is None or self._kept[0] != at:
-                self._kept = at, read_view(connection)
-            return self._kept[1]
+    def view(self, at: object, read: Callable[[], LiveView]) -> LiveView:
+        """The map at a checkpoint, or that at hand while it is read. Not to be changed."""
+        kept = self._kept
+        if kept is not None and kept[0] == at:
+            return kept[1]
+        if not self._reading.acquire(blocking=kept is None) and kept is not None:
+            return kept[1]
+        try:
+            kept = self._kept
+            if kept is None or kept[0] != at:
+                self._kept = kept = at, read()
+            return kept[1]
+        finally:
+            self._reading.release()
 
 
 def asked(question: MapQuestion, view: MapView) -> dict[str, Any]:

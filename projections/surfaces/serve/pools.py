@@ -32,7 +32,7 @@ from projections.postgres.queries.candidate_search import (
     prepare_graph,
     prepare_vectors,
 )
-from projections.postgres.queries.live_view import LiveView
+from projections.postgres.queries.live_view import LiveView, read_view
 
 from .asked import MapMemory
 
@@ -140,7 +140,9 @@ class Pools:
 
     def view(self) -> LiveView:
         """The map of the graph's database, not to be changed."""
-        return self.on_graph(self._map.view)
+        return self.on_graph(
+            lambda graph: self._map.view(checkpoints.load(graph, "graph"), lambda: read_view(graph))
+        )
 
     def _candidates(self, crops: Sequence[QuestionCrop], wait_s: float) -> MapCandidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
