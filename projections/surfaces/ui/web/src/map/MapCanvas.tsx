@@ -13,6 +13,7 @@ import * as store from "../state/store";
 import { summary } from "../ui/summary";
 import { type Side, currentScene } from "./current_scene";
 import { DotLayer } from "./dots";
+import type { Box } from "./labels";
 import { dotRadius } from "./keyframes";
 import { paint } from "./paint";
 import { DARK, LIGHT } from "./palette";
@@ -91,6 +92,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
     context.fillRect(0, 0, w, h);
     const scene = currentScene(side, w, h);
     if (scene !== null) {
+      scene.controls = controlsOver(canvas);
       scene.dots = () => {
         const radius = dotRadius(scene.view.k) * 0.8;
         const layer = dots.draw(scene.history, scene.map, scene.view, palette, canvas.width, canvas.height, ratio, radius);
@@ -129,6 +131,15 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
     stopFitting();
     cancelAnimationFrame(frame);
   };
+}
+
+/** Where counts, buttons and the scale are over a map. */
+function controlsOver(canvas: HTMLCanvasElement): Box[] {
+  const { left, top } = canvas.getBoundingClientRect();
+  return [...document.querySelectorAll(".facts, .zoom, .scale, .pane-title")].map((control) => {
+    const { x, y, width, height } = control.getBoundingClientRect();
+    return { x: x - left - 3, y: y - top - 3, width: width + 6, height: height + 6 };
+  });
 }
 
 /** The signals that a drawing depends on; the map itself is computed once a frame, in it. */

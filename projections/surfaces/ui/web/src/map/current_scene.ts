@@ -34,6 +34,7 @@ export function currentScene(side: Side, width: number, height: number): Scene |
     difference: compared === null ? null : { ...compared, difference: differenceOn(history, compared.difference, floor) },
     bridge: main ? shownBridge.value : null,
     lost: main ? shownLost.value : null,
+    controls: [],
     dots: null,
   };
 }

@@ -4,18 +4,19 @@
  */
 
 import { floorOfPlace } from "../model/floors";
-import { isolated, label, objectClass, placeTitle } from "../model/names";
+import { isolated, label, labelOfPlace, objectClass } from "../model/names";
 import { isPlaceLit, litObject } from "./lit";
 import { placeColour, withAlpha } from "./palette";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { objectRadius } from "./things";
-import { screenX, screenY } from "./view";
+import { NEAR, screenX, screenY } from "./view";
 
 export const FONT = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", "Noto Sans", Arial, sans-serif';
 const PLACE_FONT = `600 13px ${FONT}`;
 const SMALL_FONT = `11px ${FONT}`;
 const LIT_FONT = `600 12px ${FONT}`;
+const FAR_FONT = `600 11px ${FONT}`;
 const MOST = 400;
 
 interface Wanted {
@@ -25,10 +26,13 @@ interface Wanted {
   away: number;
   text: string;
   second?: string;
+  /** Whether it may stand beside its anchor. */
+  strays?: boolean;
   font: string;
   colour: string;
   chip?: string;
-  always?: boolean;
+  /** Before all others: what is pointed at, selected or found. */
+  first?: boolean;
 }
 
 export interface Box {
@@ -40,22 +44,21 @@ export interface Box {
 
 export function drawLabels(on: Surface, scene: Scene) {
   const taken = reserved(scene);
-  for (const wanted of [...placeLabels(scene), ...edgeLabels(scene), ...objectLabels(scene)].slice(0, MOST)) {
-    draw(on, scene, wanted, taken);
+  const wanted = [...placeLabels(scene), ...objectLabels(scene), ...edgeLabels(scene)];
+  for (const each of [...wanted.filter(({ first }) => first), ...wanted.filter(({ first }) => !first)].slice(0, MOST)) {
+    draw(on, scene, each, taken);
   }
 }
 
 /** Where an answer is drawn that labels must not cover. */
-function reserved({ bridge, lost, difference, view, dots, width, height }: Scene): Box[] {
+function reserved({ bridge, lost, difference, view, controls }: Scene): Box[] {
   const spots = [
     ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
     ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.evidence]),
   ];
   const gone = difference === null ? [] : goneAt(difference).map(([x, y]) => ({ x: screenX(view, x) - 55, y: screenY(view, y) + 13, width: 110, height: 18 }));
   const marked = spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
-  // On the screen, not in a picture: the counts at the top left, the buttons at the bottom right.
-  const covered = dots === null ? [] : [{ x: 0, y: 0, width: 380, height: 64 }, { x: width - 50, y: height - 110, width: 50, height: 110 }];
-  return [...marked, ...gone, ...covered];
+  return [...marked, ...gone, ...controls];
 }
 
 /** The middles, in metres, of places that a difference says are gone. */
@@ -68,22 +71,24 @@ export function goneAt({ before, difference }: NonNullable<Scene["difference"]>)
 function placeLabels(scene: Scene): Wanted[] {
   const { history, map, view, palette } = scene;
   const order = [...map.places].sort((a, b) => map.size[b] - map.size[a]);
+  const near = view.k >= NEAR;
   return order.map((place) => ({
     x: screenX(view, map.x[place]),
     y: screenY(view, map.y[place]),
     away: 0,
-    text: isolated(label(placeTitle(history, map, place))),
-    second: [map.size[place], map.name[place] === null && scene.types.get(history.placeIds[place])?.type].filter(Boolean).join(" · "),
-    font: PLACE_FONT,
+    text: isolated(label(map.name[place] ?? labelOfPlace(history, place), near ? 28 : 16)),
+    second: near || isPlaceLit(scene, place) ? [map.size[place], map.name[place] === null && scene.types.get(history.placeIds[place])?.type].filter(Boolean).join(" · ") : undefined,
+    font: near ? PLACE_FONT : FAR_FONT,
+    strays: near,
     colour: palette.ink,
     chip: placeColour(palette, history, place),
-    always: isPlaceLit(scene, place),
+    first: isPlaceLit(scene, place),
   }));
 }
 
 function edgeLabels(scene: Scene): Wanted[] {
   const { history, map, view, palette } = scene;
-  if (!scene.layers.edges) return [];
+  if (!scene.layers.edges || view.k < NEAR) return [];
   return map.edges.map(({ a, b, count }) => ({
     x: screenX(view, (map.x[a] + map.x[b]) / 2),
     y: screenY(view, (map.y[a] + map.y[b]) / 2),
@@ -100,9 +105,11 @@ function objectLabels(scene: Scene): Wanted[] {
   const lit = [litObject(scene, scene.selection), litObject(scene, scene.hovered)];
   const { x, y, count, missing, confirmed } = history.changes;
   const isShown = (object: number) => scene.layers.once || confirmed[map.objectRow[object]] === 1 || lit.includes(object) || scene.found.has(object);
+  const first = (object: number) => lit.includes(object) || scene.found.has(object);
   const rank = (object: number) => (lit.includes(object) ? 1e9 : scene.found.has(object) ? 1e8 : 0) + count[map.objectRow[object]];
   return map.objects
     .filter(isShown)
+    .filter((object) => view.k >= NEAR || first(object) || missing[map.objectRow[object]])
     .sort((a, b) => rank(b) - rank(a))
     .map((object) => {
       const row = map.objectRow[object];
@@ -114,7 +121,7 @@ function objectLabels(scene: Scene): Wanted[] {
         text: missing[row] ? `${name} missing` : name,
         font: lit.includes(object) ? LIT_FONT : SMALL_FONT,
         colour: lit.includes(object) || scene.found.has(object) ? palette.accent : missing[row] ? palette.removed : palette.dim,
-        always: lit.includes(object),
+        first: first(object),
       };
     });
 }
@@ -138,10 +145,9 @@ function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
       box.x >= 2 && box.y >= 2 && box.x + width <= scene.width - 2 && box.y + height <= scene.height - 2 &&
       !taken.some((other) => overlap(box, other)),
   );
-  const box = free ?? (wanted.always ? spots[0] : undefined);
-  if (box === undefined) return;
-  taken.push(box);
-  write(on, scene, wanted, box, main);
+  if (free === undefined) return;
+  taken.push(free);
+  write(on, scene, wanted, free, main);
 }
 
 const widths = new Map<string, number>();
@@ -160,11 +166,11 @@ function widthOf(on: Surface, font: string, text: string): number {
   return width;
 }
 
-function candidates({ x, y, away }: Wanted, width: number, height: number, most: number): Box[] {
+function candidates({ x, y, away, strays, first }: Wanted, width: number, height: number, most: number): Box[] {
   if (away === 0) {
     // Near an edge of the picture the label stands inside it.
     const inside = (left: number) => Math.max(3, Math.min(most - width - 3, left));
-    return NUDGES.map(([dx, dy]) => ({ x: inside(x - width / 2 + dx), y: y - height / 2 + dy, width, height }));
+    return (strays === false && !first ? NUDGES.slice(0, 1) : NUDGES).map(([dx, dy]) => ({ x: inside(x - width / 2 + dx), y: y - height / 2 + dy, width, height }));
   }
   return DIRECTIONS.map(([dx, dy]) => ({
     x: x + dx * (away + width / 2) - width / 2,

@@ -7,6 +7,7 @@ import type { MapState } from "../model/map_at";
 import type { Segment } from "../model/walls";
 import type { Regions } from "../model/regions";
 import type { LayerName, Thing } from "../state/store";
+import type { Box } from "./labels";
 import type { Palette } from "./palette";
 import type { View } from "./view";
 
@@ -46,6 +47,8 @@ export interface Scene {
   difference: { before: MapState; difference: MapDifference } | null;
   bridge: Bridge | null;
   lost: LostOverlay | null;
+  /** What lies over the map on the screen, where no label may be. */
+  controls: readonly Box[];
   /** Draws many keyframes at once, on a canvas only. */
   dots: (() => void) | null;
 }

@@ -2,6 +2,7 @@
 
 import { litObject } from "./lit";
 import { withAlpha } from "./palette";
+import { NEAR } from "./view";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { screenX, screenY } from "./view";
@@ -40,7 +41,7 @@ export function drawObjects(on: Surface, scene: Scene) {
     if (!lit && !scene.layers.once && confirmed[row] === 0) continue;
     const [x, y] = [screenX(view, xs[row]), screenY(view, ys[row])];
     if (!(x > -50 && y > -50 && x < width + 50 && y < height + 50)) continue;
-    if (scene.layers.ellipses && !Number.isNaN(xx[row])) drawEllipse(on, scene, row, x, y, lit);
+    if (scene.layers.ellipses && (lit || view.k >= NEAR) && !Number.isNaN(xx[row])) drawEllipse(on, scene, row, x, y, lit);
     on.beginPath(); // a diamond: dots are keyframes
     on.moveTo(x, y - size * 1.25);
     on.lineTo(x + size * 1.25, y);

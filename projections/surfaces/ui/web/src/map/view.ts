@@ -9,6 +9,9 @@ export interface View {
   y: number;
 }
 
+/** Pixels to a metre from which there is room for more than the names of places. */
+export const NEAR = 18;
+
 export const screenX = (view: View, x: number) => x * view.k + view.x;
 export const screenY = (view: View, y: number) => view.y - y * view.k;
 export const mapX = (view: View, x: number) => (x - view.x) / view.k;

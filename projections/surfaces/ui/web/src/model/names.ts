@@ -52,6 +52,23 @@ export function shortPlace(history: History, place: number): string {
   return found[place];
 }
 
+const commonStarts = new WeakMap<History, number>();
+
+/** The short id without what all ids of places begin with: `a_p7` for `house-a_p7`. */
+export function labelOfPlace(history: History, place: number): string {
+  const short = shortPlace(history, place);
+  const ids = history.placeIds;
+  if (short !== ids[place]) return short;
+  let start = commonStarts.get(history);
+  if (start === undefined) {
+    let same = 0;
+    while (same < ids[0].length && ids.every((id) => id[same] === ids[0][same])) same++;
+    start = (/^.*[-_:/.]/.exec(ids[0].slice(0, same))?.[0] ?? "").length;
+    commonStarts.set(history, start);
+  }
+  return short.slice(start);
+}
+
 /** `obj-` and six digits, as in commands. */
 export const shortObject = (id: string) => id.slice(0, 10);
 
