@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
 from eventsrc.base.progress import report_progress
-from eventsrc.base.text import advised
+from eventsrc.base.text import advised, counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from .event import Event
@@ -70,6 +70,9 @@ class LogReader:
         self._found, self._unreadable_end = _open_last(path, segments_of(path), end)
         self.log_id = self._last.log_id
         """From its last segment; reading stops at a segment with another id."""
+
+    def __repr__(self) -> str:
+        return f"<LogReader {self.path}: {counted(self.readable_end, 'event')}>"
 
     @property
     def _last(self) -> OpenSegment:

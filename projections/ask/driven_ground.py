@@ -65,6 +65,10 @@ class GoalPose:
     keyframe_id: int | None
     frame_id: str = "map"
 
+    def __repr__(self) -> str:
+        at = f"({self.x:.2f}, {self.y:.2f}) facing {math.degrees(self.yaw):.0f}°"
+        return f"<goal at {at}, {self.distance_m:.2f} m away, {self.ground} ground>"
+
     def document(self) -> dict[str, Any]:
         """As JSON."""
         return asdict(self)

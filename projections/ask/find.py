@@ -188,6 +188,10 @@ class FoundObject:
     moved_from: tuple[float, float] | None
     offsets: tuple[int, ...]
 
+    def __repr__(self) -> str:
+        at = f"({self.x:.2f}, {self.y:.2f})"
+        return f"<{visible(self.class_name)} {self.object_id} at {at}, seen {self.obs_count:,}×>"
+
     def document(self) -> dict[str, Any]:
         """As JSON."""
         return asdict(self)
@@ -205,6 +209,9 @@ class FoundObjects:
     count: int
     unconfirmed: int
     answers: tuple[FoundObject, ...]
+
+    def __repr__(self) -> str:
+        return f"<{len(self.answers):,} of {self.count:,} found: {list(self.answers[:3])}>"
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
@@ -240,7 +247,7 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
 
     def order(each: ObjectRecord) -> tuple[float, float, bool, int, int]:
         way = 0.0 if ways is None else way_to[each.ordinal]
-        distance = 0.0 if spot is None else _distance(each.spot, spot)
+        distance = 0.0 if spot is None else math.dist(each.spot, spot)
         return (
             math.inf if way is None else way,
             distance,
@@ -260,11 +267,6 @@ def robot_seconds(text: str) -> float:
     if time_ns is None:
         raise MisuseError(f"{text!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
     return time_ns / 1e9
-
-
-def _distance(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Metres."""
-    return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2)
 
 
 def _meant(
@@ -373,7 +375,7 @@ def answer_of(
         x=x,
         y=y,
         sigma_m=None if at is None else at.est_sigma_m,
-        distance_m=None if spot is None else _distance(each.spot, spot),
+        distance_m=None if spot is None else math.dist(each.spot, spot),
         way_m=way_m,
         obs_count=each.obs_count,
         confirmed=each.confirmed,

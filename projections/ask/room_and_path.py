@@ -50,6 +50,11 @@ class Room(NamedPlace):
     objects: tuple[FoundObject, ...]
     unconfirmed: int
 
+    def __repr__(self) -> str:
+        word = self.name or self.type
+        called = visible(self.place_id if word is None else f"{self.place_id} {word}")
+        return f"<{called}: {len(self.objects):,} objects, {len(self.neighbours):,} neighbours>"
+
     def document(self) -> dict[str, Any]:
         """As JSON."""
         return asdict(self)
@@ -109,6 +114,10 @@ class DrivenPath:
     way_points: tuple[Spot, ...]
     goal: GoalPose | None
     offsets: tuple[int, ...]
+
+    def __repr__(self) -> str:
+        ends = f"{visible(self.start)} to {visible(self.end)}"
+        return f"<way from {ends}: {self.length_m:.2f} m, {len(self.way_points):,} way points>"
 
     def document(self) -> dict[str, Any]:
         """As JSON."""

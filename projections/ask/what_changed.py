@@ -53,6 +53,9 @@ class MapChange:
     seen: SeenAt
     sentence: str
 
+    def __repr__(self) -> str:
+        return f"<{self.sentence}>"
+
     def document(self) -> dict[str, Any]:
         """As JSON; ``from_`` is ``from``."""
         return {name.removesuffix("_"): value for name, value in asdict(self).items()}
@@ -67,6 +70,10 @@ class MapChanges:
     until: Offset
     changes: tuple[MapChange, ...]
     unsure: int
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{sum(c.kind == k for c in self.changes):,} {k}" for k in KINDS)
+        return f"<changes from {self.since:,} to {self.until:,}: {counts}, {self.unsure:,} unsure>"
 
     def document(self) -> dict[str, Any]:
         """As JSON, with the number of changes of each kind."""

@@ -19,5 +19,10 @@ if __name__ == "__main__":
 from projections.surfaces import python as api
 from projections.surfaces.python import *  # noqa: F403
 
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 __all__: list[str] = []
 __all__ += api.__all__

@@ -1,5 +1,5 @@
-"""Fifteen questions of a map whose truth is known, each one command: the command, Python and, for
-the live map, HTTP give the same JSON, and it is right.
+"""Fifteen questions of a map whose truth is known, each one command: the command, Python, an agent
+(MCP) and, for the live map, HTTP give the same JSON, and it is right.
 
 A robot drives past a chair, a table, a plant and a tv; a day later the plant is gone, the chair
 stands elsewhere, and a bed is new.
@@ -190,7 +190,52 @@ QUESTIONS: list[Question] = [
 
 
 def test_there_are_fifteen() -> None:
-    assert len(QUESTIONS) == 15
+    assert len(QUESTIONS) == len(BY_AGENT) == 15
+
+
+BY_AGENT: list[tuple[str, dict[str, Any]]] = [
+    ("find", {"what": "chairs"}),
+    ("find", {"room": "p0"}),
+    ("nearest", {"near": "6.0,1.5", "top": 2}),
+    ("nearest", {"near": "0,0", "by_way": True, "top": 1}),
+    ("find", {"what": "plant"}),
+    ("find", {"missing": True}),
+    ("find", {"moved": True}),
+    ("find", {"seen_since": BETWEEN}),
+    ("find", {"not_seen_since": BETWEEN}),
+    ("find", {"what": "tabel"}),
+    ("room", {"name": "p0"}),
+    ("path", {"start": "0,0", "end": "tv"}),
+    ("goal", {"thing": "bed"}),
+    ("find", {"what": "chair", "at": "a:95", "known_at": "end"}),
+    ("changes", {"since": "b"}),
+]
+"""The tool of `mapfold mcp` for each question, and its arguments."""
+
+
+@pytest.fixture(scope="module")
+def agent(log: Path) -> Iterator[Any]:
+    pytest.importorskip("mcp", reason="the extra [mcp] is not installed")
+    from projections.surfaces.mcp.agent_server import create_server
+    from projections.surfaces.mcp.cited_maps import LogMaps
+
+    with LogMaps(log, lambda _: SETTINGS) as maps:
+        yield create_server(maps)
+
+
+@pytest.mark.parametrize("number", range(15), ids=[question[0] for question in QUESTIONS])
+def test_an_agent_gets_what_the_command_prints(
+    number: int, mapfold: Commands, agent: Any, log: Path
+) -> None:
+    from tests.support.agents import tool
+
+    _, (name, *words), *_, is_right = QUESTIONS[number]
+    called, arguments = BY_AGENT[number]
+    answer = tool(agent, called, **arguments)
+    assert is_right(answer["answer"])
+    assert answer["answer"] == mapfold(name, log, *words, "--json").json
+    assert answer["offsets"]
+    assert answer["map"]["digest"]
 
 
 @pytest.mark.parametrize("question", QUESTIONS, ids=[question[0] for question in QUESTIONS])

@@ -55,6 +55,82 @@ def test_mapfold_has_every_name_of_the_api() -> None:
     assert all(getattr(public, name) is getattr(api, name) for name in api.__all__)
 
 
+def test_mapfold_lists_nothing_that_is_not_ours() -> None:
+    assert dir(public) == sorted(public.__all__)
+
+
+def test_what_is_found_says_what_it_is_in_one_line(house: Map) -> None:
+    known = fold(ROOT / "logs" / "sample")
+    oven = known.find("oven").answers[0]
+    with Timeline(SAMPLE, ROOMS, cache=False) as timeline, open_log(SAMPLE) as log:
+        shown = [
+            *(known.objects[0], known.places[1], known.objects, known.places),
+            *(oven, known.find("chairs"), known.room("kitchen"), known.path("kitchen", "oven")),
+            *(known.goal("oven"), known.changes(since=200), timeline, log),
+        ]
+    for each in shown:
+        assert repr(each)[0] in "<[", each
+        assert len(repr(each)) < 300, each
+    assert repr(timeline) == f"<Timeline of {SAMPLE}: 445 events>"
+    assert repr(log) == f"<LogReader {SAMPLE}: 445 events>"
+    assert repr(oven).startswith(f"<oven {oven.object_id} at (")
+    assert known.places[1].type == known.places[1]["type"] == "kitchen"
+    assert known.places[1].name is None
+    with pytest.raises(AttributeError, match="no 'colour' here; there are place_id"):
+        _ = known.places[1].colour
+
+
+def test_what_changed_since_a_moment_is_that_of_the_timeline() -> None:
+    sample = ROOT / "logs" / "sample"
+    by_map = fold(sample).changes(since=200)
+    with Timeline(sample, cache=False) as timeline:
+        assert by_map == timeline.changes("200")
+        assert timeline.at().changes(timeline.at(200)).since == 200
+    with pytest.raises(MisuseError, match="give an earlier map"):
+        Map(fold(sample).view).changes()
+
+
+def test_tables_and_graphs_are_those_of_the_state(
+    house: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = house.graph()
+    kinds = [values["kind"] for _, values in graph.nodes(data=True)]
+    assert (kinds.count("Place"), kinds.count("Object")) == (len(house.places), len(house.objects))
+    assert graph.number_of_edges() >= len(house.adjacency)
+    table = house.objects.to_pandas()
+    assert list(table["object_id"]) == [each.object_id for each in house.objects]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MisuseError, match="pip install pandas"):
+        house.objects.to_pandas()
+
+
+def test_a_notebook_keeps_at_most_60_kb_of_a_large_map() -> None:
+    """Hundreds of places with long names, and drives that fill the picture."""
+    view = fold(ROOT / "logs" / "sample").view
+    whole = Map(view)
+    assert len(whole._repr_html_().encode()) <= 60_000
+    assert "<img" in whole._repr_html_()
+    for place in view.places.values():
+        place.name = "<&>" * 85
+    assert len(Map(view)._repr_html_().encode()) <= 60_000
+
+
+@pytest.mark.seconds
+def test_a_notebook_keeps_as_little_of_a_map_with_a_thousand_places(tmp_path: Path) -> None:
+    spots = [(4.0 * (n % 32), 4.0 * (n // 32)) for n in range(1024)]
+    drive = [
+        envelope(3 * n + again, x + 0.1 * again, y, detections=[detection()])
+        for n, (x, y) in enumerate(spots)
+        for again in range(3)
+    ]
+    large = fold(write_log(tmp_path / "large", drive))
+    assert len(large.places) == 1024
+    shown = large._repr_html_()
+    assert len(shown.encode()) <= 60_000
+    assert "<img" in shown
+    assert "more places" in shown
+
+
 def test_python_m_mapfold_is_the_program(tmp_path: Path) -> None:
     said = subprocess.run(
         [sys.executable, "-m", "mapfold", "log", "info", SAMPLE, "--json"],

@@ -6,8 +6,10 @@ the *robot* when it saw them. Their labels are moved to stay legible, and a thin
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Final, overload
 
 from eventsrc.base.text import counted
+from eventsrc.envelope.grey_images import with_few_colours
 from projections.adapters import palette
 from projections.adapters.scene import (
     HousePlan,
@@ -74,9 +76,22 @@ def draw_map(
     compose(view, title, plan or HousePlan(), lost, marks, shown).save(out)
 
 
-def map_png(view: MapView, title: str) -> bytes:
-    """``view`` drawn as a PNG."""
-    return compose(view, title, HousePlan()).png()
+_SMALLER_DPI: Final = (90, 65, 45, 30)
+_FEW_COLOURS: Final = 64
+
+
+@overload
+def map_png(view: MapView, title: str) -> bytes: ...
+@overload
+def map_png(view: MapView, title: str, most_bytes: int) -> bytes | None: ...
+def map_png(view: MapView, title: str, most_bytes: int | None = None) -> bytes | None:
+    """``view`` drawn as a PNG; with ``most_bytes`` in few colours and as sharp as it can be, None
+    if none is so small."""
+    sheet = compose(view, title, HousePlan())
+    if most_bytes is None:
+        return sheet.png()
+    pictures = (with_few_colours(sheet.png(dpi), _FEW_COLOURS) for dpi in _SMALLER_DPI)
+    return next((picture for picture in pictures if len(picture) <= most_bytes), None)
 
 
 def compose(

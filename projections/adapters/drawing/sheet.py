@@ -183,15 +183,15 @@ class Sheet:
         undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
         write_files({out: self._drawn(suffix[1:], undated.get(suffix))})
 
-    def png(self) -> bytes:
+    def png(self, dpi: int = _DPI) -> bytes:
         """The picture as a PNG."""
-        return self._drawn("png")
+        return self._drawn("png", dpi=dpi)
 
-    def _drawn(self, kind: str, metadata: dict[str, None] | None = None) -> bytes:
+    def _drawn(self, kind: str, metadata: dict[str, None] | None = None, dpi: int = _DPI) -> bytes:
         self._take_texts_literally()
         out = BytesIO()
         with _drawing():
-            self.figure.savefig(out, dpi=_DPI, format=kind, metadata=metadata)
+            self.figure.savefig(out, dpi=dpi, format=kind, metadata=metadata)
         return out.getvalue()
 
     def _take_texts_literally(self) -> None:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _NOT_IN_XML: Final = re.compile("[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def _graph(view: MapView) -> "networkx.Graph":
+def graph_of(view: MapView) -> "networkx.Graph":
+    """The graph."""
     import networkx  # here: it takes longer to import than most commands take to run
 
     graph, regions = networkx.Graph(), place_regions(view)
@@ -79,7 +80,7 @@ def graphml(view: MapView) -> str:
     or does not keep (tabs, line breaks) are written as escapes (``\\x1b``), backslashes doubled."""
     import networkx
 
-    graph = _graph(view)
+    graph = graph_of(view)
     ids = {node: _in_xml(node) for node in graph}
     for _, values in graph.nodes(data=True):
         values.update({k: _in_xml(v) for k, v in values.items() if isinstance(v, str)})
@@ -94,7 +95,7 @@ def _in_xml(text: str) -> str:
 def dot(view: MapView) -> str:
     """DOT of Graphviz. ``neato`` keeps each Place at its centroid, a metre as an inch, and arranges
     the Objects around the Place that they are in."""
-    graph = _graph(view)
+    graph = graph_of(view)
     lines = [
         "graph semantic_map {",
         "  graph [outputorder=edgesfirst, overlap=true];",  # any other value moves Places too

@@ -8,12 +8,15 @@ from eventsrc.log import Event, LogReader
 from projections.fold.settings import Settings
 from projections.localize.relocalize import Answer, Question
 
+from .known_things import KnownObject, KnownPlace
 from .map import Map, fold, open_log, relocalize
 from .past_maps import Timeline
 
 __all__ = [
     "Answer",
     "Event",
+    "KnownObject",
+    "KnownPlace",
     "LogReader",
     "Map",
     "Question",

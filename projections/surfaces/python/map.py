@@ -24,6 +24,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import CameraConstants, Settings, preset_assignments, read_settings
+from projections.history import LogTimeline
 from projections.localize.relocalize import (
     Answer,
     ExactIndex,
@@ -41,7 +42,11 @@ from projections.map.own_events import read_corrections
 from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
 
+from .known_things import KnownObject, KnownPlace, KnownThings
+
 _MOST_ROWS = 50
+_HTML_BYTES, _TABLE_BYTES = 60_000, 15_000
+"""A notebook keeps what it shows: at most so many bytes of a map, and of its table."""
 
 
 class Map:
@@ -77,34 +82,41 @@ class Map:
         return state_document(self.view, self.digest, self._known_at)
 
     @property
-    def places(self) -> list[dict[str, Any]]:
+    def places(self) -> KnownThings[KnownPlace]:
         """The Places, in the order in which they were founded."""
-        return list(self.state["places"])
+        return KnownThings.of(KnownPlace, self.state["places"])
 
     @property
-    def objects(self) -> list[dict[str, Any]]:
-        """The Objects, in the order in which they were found."""
-        return list(self.state["objects"])
+    def objects(self) -> KnownThings[KnownObject]:
+        """The Objects, in the order in which they were found; ``to_pandas()`` makes a table."""
+        return KnownThings.of(KnownObject, self.state["objects"])
+
+    def graph(self) -> Any:
+        """A `networkx.Graph` of Places and Objects, as GraphML has it: ``kind``, ``label``, ``x``
+        and ``y`` of nodes, and ``label`` of edges, ADJACENT_TO or LOCATED_IN."""
+        from projections.adapters.export.graphs import graph_of  # networkx takes long to import
+
+        return graph_of(self.view)
 
     @property
     def adjacency(self) -> list[dict[str, Any]]:
         """Pairs of neighbouring Places, each with its number of transitions."""
         return list(self.state["adjacency"])
 
-    def place(self, text: str) -> dict[str, Any]:
+    def place(self, text: str) -> KnownPlace:
         """The Place that ``text`` names: an id, a given name, ``p3``, or a type of room that only
         one has. Raises NoSuchThing with the nearest names, and SeveralThings.
         """
         wanted = thing_called(text, things_of(self.view), ("place",))
         id_ = self.view.place_id(self.view.survivors.find(PlaceOrdinal(wanted.ordinal)))
-        return next(each for each in self.state["places"] if each["place_id"] == id_)
+        return next(each for each in self.places if each["place_id"] == id_)
 
-    def object(self, text: str) -> dict[str, Any]:
+    def object(self, text: str) -> KnownObject:
         """The Object that ``text`` names: an id, its first six characters or more, or a class that
         only one has. Raises NoSuchThing with the nearest names, and SeveralThings."""
         wanted = ObjectOrdinal(thing_called(text, things_of(self.view), ("object",)).ordinal)
         id_ = self.view.all_objects[self.view.object_survivors.find(wanted)].object_id
-        return next(each for each in self.state["objects"] if each["object_id"] == id_)
+        return next(each for each in self.objects if each["object_id"] == id_)
 
     def find(
         self,
@@ -190,10 +202,17 @@ class Map:
         there is none, also NoSuchThing and SeveralThings."""
         return goal_of(self.view, thing, clearance_m)
 
-    def changes(self, since: "Map") -> MapChanges:
-        """What changed for sure since an earlier map of the same log, folded by evidence; see also
-        `Timeline.changes`."""
-        return map_changes(since.view, self.view)
+    def changes(self, since: "Map | int | str | None" = None) -> MapChanges:
+        """What changed for sure since an earlier map of the same log, or a day, a run or another
+        moment of it, by default since the last run began; for these the log is folded again, by
+        `Timeline.changes` only once. Raises MisuseError for a map without evidence."""
+        if isinstance(since, Map):
+            return map_changes(since.view, self.view)
+        if self._log is None:
+            raise MisuseError("this map was not folded from a log; give an earlier map as since")
+        with LogTimeline(self._log, self.view.settings, cache=False) as timeline:
+            start = None if since is None else timeline.moment(str(since), is_end=False)
+            return timeline.changes(start, self.view.next_offset, known_at=self._known_at)
 
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
@@ -219,19 +238,25 @@ class Map:
     def _repr_html_(self) -> str:
         from projections.adapters.drawing import map_png  # see `draw`
 
-        picture = b64encode(map_png(self.view, self._title)).decode("ascii")
         names = ("place_id", "name", "type", "keyframe_count", "centroid_x", "centroid_y")
         head = "".join(f"<th>{name}</th>" for name in names)
-        rows = "".join(
+        rows = [
             f"<tr>{''.join(f'<td>{_cell(place.get(name))}</td>' for name in names)}</tr>"
             for place in self.places[:_MOST_ROWS]
-        )
-        more = len(self.places) - _MOST_ROWS
+        ]
+        while sum(len(row.encode()) for row in rows) > _TABLE_BYTES:
+            rows.pop()
+        more = len(self.places) - len(rows)
         rest = f"<p>and {more} more places</p>" if more > 0 else ""
+        table = f"<table><tr>{head}</tr>{''.join(rows)}</table>{rest}"
+        left = _HTML_BYTES - 500 - len(table.encode())
+        picture = map_png(self.view, self._title, most_bytes=left * 3 // 4)
+        if picture is None:
+            return f"<p>{html.escape(repr(self))}</p>{table}"
+        source = b64encode(picture).decode("ascii")
+        alt = html.escape(repr(self))
         return (
-            f'<img alt="{html.escape(repr(self))}" style="max-width:100%"'
-            f' src="data:image/png;base64,{picture}">'
-            f"<table><tr>{head}</tr>{rows}</table>{rest}"
+            f'<img alt="{alt}" style="max-width:100%" src="data:image/png;base64,{source}">{table}'
         )
 
 

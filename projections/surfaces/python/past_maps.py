@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from eventsrc.log.seek import resolve
 from projections import history
@@ -61,6 +62,9 @@ class Timeline:
         self._log = Path(log)
         self._chosen = settings_from(settings, preset)
         self._timeline = history.LogTimeline(self._log, self._settings, cache=cache)
+
+    def __repr__(self) -> str:
+        return f"<Timeline of {self._log}: {counted(self._timeline.reader.readable_end, 'event')}>"
 
     def __enter__(self) -> "Timeline":
         return self
