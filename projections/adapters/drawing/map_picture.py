@@ -76,8 +76,8 @@ def draw_map(
     compose(view, title, plan or HousePlan(), lost, marks, shown).save(out)
 
 
-_SMALLER_DPI: Final = (90, 65, 45, 30)
-_FEW_COLOURS: Final = 64
+_SMALLER: Final = ((90, 64), (65, 64), (45, 64), (30, 64), (20, 16))
+"""Dots per inch and colours of pictures with fewer and fewer bytes."""
 
 
 @overload
@@ -90,7 +90,7 @@ def map_png(view: MapView, title: str, most_bytes: int | None = None) -> bytes |
     sheet = compose(view, title, HousePlan())
     if most_bytes is None:
         return sheet.png()
-    pictures = (with_few_colours(sheet.png(dpi), _FEW_COLOURS) for dpi in _SMALLER_DPI)
+    pictures = (with_few_colours(sheet.png(dpi), colours) for dpi, colours in _SMALLER)
     return next((picture for picture in pictures if len(picture) <= most_bytes), None)
 
 
