@@ -247,7 +247,7 @@ def test_a_class_is_no_likeness(seed: int, all_classes: bool) -> None:
     found = posterior_of(asked, replace(candidates, matches=rows))
     if all_classes:
         assert found.features.likeness is found.features.margin is None
-        assert found.confidence == pytest.approx(found.features.mass)
+        assert found.confidence == pytest.approx(found.features.mass**2 / 2)
     else:
         alone = Question((replace(view, crops=view.crops[1:]),))
         expected = posterior_of(alone, replace(candidates, matches=rows[1:]))

@@ -18,7 +18,9 @@ candidates show that, so `thinness` costs a question nothing.
 
 In the fit of `confidence`, an answer to crops of things that the map lacks counts as wrong. Where
 only classes are known, there is no likeness by which to decide whether the things are those of the
-map; `confidence` is then the posterior's weight near the answer, which assumes that they are.
+map: `known` is one half. The posterior's weight near the answer assumes that they are, and is too
+large; `confidence` is half its square, which was chosen on generated buildings
+(docs/decisions/relocalization.md).
 """
 
 import math
@@ -204,7 +206,8 @@ def _margin(landmarks: Landmarks) -> float:
 def confidence_of(features: Features, constants: LocalizerConstants) -> float:
     """The probability that the pose is within 1.5 m."""
     if features.likeness is None:
-        return min(features.mass, 1.0)
+        mass = min(features.mass, 1.0)
+        return _NO_LOOK * mass * mass
     logit = logit_of(CONFIDENCE_WEIGHTS, astuple(features))
     score = constants.confidence_scale * logit + constants.confidence_shift
     return 1.0 / (1.0 + math.exp(-max(-40.0, min(40.0, score))))
