@@ -6,10 +6,8 @@ before it and raises LogDamaged; with ``on_gap`` it reports what is missing and 
 whose last segment cannot be opened is read up to there, and raises when its end is asked for.
 
 `follow` polls the commit marks of the file: while nothing comes, one `pread` of some 80 bytes and
-five `stat` for the next segment every 5 ms. That costs one to two percent of a core (58 to 86 µs a
-poll, most of it waking up), needs nothing from the platform, and works across processes. A chunk
-damaged before it was read looks like one that is being written, so it checks once a second whether
-recorded events come after it.
+five `stat` for the next segment every 5 ms, at one to two percent of a core. A chunk damaged before
+it was read looks like one that is being written, so it checks once a second whether events follow.
 """
 
 import contextlib

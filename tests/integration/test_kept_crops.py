@@ -9,12 +9,11 @@ from urllib.error import HTTPError
 from urllib.parse import quote
 from urllib.request import Request, urlopen
 
-import cv2
 import numpy as np
 import pytest
 
 from eventsrc.adapters.detector.keyframes import crops_of_message
-from eventsrc.adapters.detector.vision import decode
+from eventsrc.adapters.detector.vision import decode, encode_jpeg
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.crops import CROPS_TOPIC, decode_crop
 from eventsrc.record.importers.ros_bags import BagReport
@@ -51,7 +50,7 @@ from tests.support.serve_questions import DEADLINE_S, http_at
 COMPRESSED, IMAGE = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 DRIVE = Drive(12)
 SIZE = 480, 640
-FIRST = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+FIRST = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
 
 
 def colour(number: int, index: int) -> tuple[int, int, int]:
@@ -79,10 +78,6 @@ def raw(stamp_ns: int, shown: np.ndarray[Any, Any], **wrong: Any) -> Any:
     return make(IMAGE, header=ros.header(stamp_ns, "camera_optical"), **fields)
 
 
-def jpeg(shown: np.ndarray[Any, Any]) -> bytes:
-    return bytes(cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
-
-
 def boxes_of(message: Any) -> list[list[float]]:
     found = []
     for each in message.detections:
@@ -105,7 +100,7 @@ def with_pictures(made: Callable[[int, int, list[list[float]]], Any]) -> Iterato
 
 
 def compressed_pictures() -> Iterator[Recorded]:
-    return with_pictures(lambda n, stamp, boxes: compressed(stamp, jpeg(pixels(n, boxes))))
+    return with_pictures(lambda n, stamp, boxes: compressed(stamp, encode_jpeg(pixels(n, boxes))))
 
 
 def raw_pictures() -> Iterator[Recorded]:
@@ -162,11 +157,11 @@ def test_without_keeping_them_pictures_are_not_used(tmp_path: Path) -> None:
 
 def hostile(number: int, stamp_ns: int, boxes: list[list[float]]) -> Any:
     good = pixels(number, boxes)
-    bomb = bytearray(jpeg(good))
+    bomb = bytearray(encode_jpeg(good))
     at = bomb.index(b"\xff\xc0") + 5
     bomb[at : at + 4] = b"\xff\xff\xff\xff"
     return [
-        lambda: compressed(stamp_ns, jpeg(good)[:-500]),
+        lambda: compressed(stamp_ns, encode_jpeg(good)[:-500]),
         lambda: compressed(stamp_ns, bytes(bomb)),
         lambda: compressed(stamp_ns, b""),
         lambda: raw(stamp_ns, good, step=5),
@@ -175,7 +170,7 @@ def hostile(number: int, stamp_ns: int, boxes: list[list[float]]) -> Any:
         lambda: raw(stamp_ns, good, encoding="16UC1"),
         lambda: Raw(IMAGE, b"\0\1"),
         lambda: Raw(IMAGE, b"no cdr at all"),
-        lambda: compressed(stamp_ns + SECOND, jpeg(good)),
+        lambda: compressed(stamp_ns + SECOND, encode_jpeg(good)),
     ][number % 10]()
 
 
@@ -195,7 +190,7 @@ def test_hostile_pictures_are_counted_and_the_import_goes_on(
                     return shown
                 return raw(stamp + SECOND, pixels(number, boxes))
             good = pixels(number, boxes)
-            return compressed(stamp, jpeg(good)) if kinds[0] == 0 else raw(stamp, good)
+            return compressed(stamp, encode_jpeg(good)) if kinds[0] == 0 else raw(stamp, good)
 
         for topic, received_ns, message in with_pictures(made):
             yield (name if topic == "/camera/image" else topic), received_ns, message
@@ -214,7 +209,7 @@ def test_hostile_pictures_are_counted_and_the_import_goes_on(
 
 
 def test_a_box_outside_the_picture_has_no_crop() -> None:
-    message = compressed(1, jpeg(np.full((40, 60, 3), 200, np.uint8)))
+    message = compressed(1, encode_jpeg(np.full((40, 60, 3), 200, np.uint8)))
     payload = bytes(TYPES.encode(message, COMPRESSED))
     crops = crops_of_message(payload, [[70, 10, 90, 20], [-5, -5, 10, 10], [50, 30, 1e9, 1e9]])
     assert crops[0] is None
@@ -319,7 +314,7 @@ def test_a_bridge_cuts_crops_and_does_not_keep_the_pictures(
             stamp = message.header.stamp
             stamp_ns = stamp.sec * SECOND + stamp.nanosec
             shown = np.full((*SIZE, 3), 90, np.uint8)
-            sent.append(("/image", compressed(stamp_ns, jpeg(shown))))
+            sent.append(("/image", compressed(stamp_ns, encode_jpeg(shown))))
         sent.append((topic, message))
     ros_recording, topics = recording_of(choice(keep_crops=True, images="/image"), 0, None)
     own = Bridge(ros_recording, topics, TYPES, cut=crops_of_message)
