@@ -1,5 +1,5 @@
 """Fifteen questions of a map whose truth is known, each one command: the command, Python, an agent
-(MCP) and, for the live map, HTTP give the same JSON, and it is right.
+(MCP) and HTTP give the same JSON, and it is right.
 
 A robot drives past a chair, a table, a plant and a tv; a day later the plant is gone, the chair
 stands elsewhere, and a bed is new.
@@ -22,7 +22,7 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.python import Map, Timeline, fold
 from projections.surfaces.serve import Answerer, FairQueue, Pools
-from projections.surfaces.serve.asked import ChangesQuery, NotInMapError, ServedLog
+from projections.surfaces.serve.asked import ChangesQuery, FindQuery, NotInMapError, ServedLog
 from tests.support.commands import Commands
 from tests.support.logs import append_command, command, write_log
 from tests.support.serve_questions import DEADLINE_S, http_at
@@ -71,9 +71,7 @@ def classes(document: Any) -> list[str]:
     return [answer["class_name"] for answer in document["answers"]]
 
 
-Question = tuple[
-    str, tuple[str, ...], Callable[[Map], Any], str | None, Callable[[dict[str, Any]], bool]
-]
+Question = tuple[str, tuple[str, ...], Callable[[Map], Any], str, Callable[[dict[str, Any]], bool]]
 QUESTIONS: list[Question] = [
     (
         "where is a chair?",
@@ -166,14 +164,14 @@ QUESTIONS: list[Question] = [
         "where do I stand to see the bed?",
         ("find", "bed", "--goal", "json"),
         lambda house: house.goal("bed"),
-        None,
+        "/objects/bed/goal",
         lambda d: d["ground"] == "seen" and near(d, LATER["bed"], 2.6),
     ),
     (
         "where was the chair yesterday?",
         ("find", "chair", "--at", "a:95", "--known-at", "end"),
         lambda _: None,
-        None,
+        "/find?what=chair&at=a:95&known_at=end",
         lambda d: near(d["answers"][0], ROOM["chair"]),
     ),
     (
@@ -253,11 +251,10 @@ def test_each_is_answered_rightly_and_alike_everywhere(
     else:
         by_python = in_python(house)
     assert json.loads(json.dumps(by_python.document())) == by_command
-    if url is not None:
-        with urllib.request.urlopen(http + url, timeout=DEADLINE_S) as answer:
-            by_http = json.loads(answer.read())
-        by_http.pop("next", None)
-        assert by_http == by_command
+    with urllib.request.urlopen(http + url, timeout=DEADLINE_S) as answer:
+        by_http = json.loads(answer.read())
+    by_http.pop("next", None)
+    assert by_http == by_command
 
 
 @pytest.mark.parametrize(
@@ -270,6 +267,8 @@ def test_each_is_answered_rightly_and_alike_everywhere(
         ("/find?seen_since=yesterday", "'yesterday' is no time"),
         ("/changes?since=yesterday", "no run 'yesterday'"),
         ("/changes?until=999", "999"),
+        ("/find?what=chair&at=999", "999"),
+        ("/objects/xyzzy/goal", "no object 'xyzzy'"),
     ],
 )
 def test_what_the_map_does_not_have_is_refused_in_one_form(http: str, path: str, said: str) -> None:
@@ -300,6 +299,8 @@ def test_without_the_log_the_databases_do_not_know_what_changed(
     with Pools(module_database, 1) as pools:
         with pytest.raises(NotInMapError, match="start the service with --log LOG"):
             Answerer(pools, per_second=1000.0).changes(ChangesQuery())
+        with pytest.raises(NotInMapError, match="start the service with --log LOG"):
+            Answerer(pools, per_second=1000.0).find(FindQuery(known_at="end"))
         other = write_log(tmp_path / "other", run("a", ROOM))
         with closing(ServedLog(other)) as beside:
             with pytest.raises(ProjectionMismatch, match="give that log"):
@@ -307,6 +308,8 @@ def test_without_the_log_the_databases_do_not_know_what_changed(
             strange = Answerer(pools, per_second=1000.0, log=beside)
             with pytest.raises(ProjectionMismatch, match="give that log"):
                 strange.changes(ChangesQuery())
+            with pytest.raises(ProjectionMismatch, match="give that log"):
+                strange.find(FindQuery(at="1"))
 
 
 def test_pages_follow_each_other(http: str, house: Map) -> None:

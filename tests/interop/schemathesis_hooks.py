@@ -28,7 +28,7 @@ def before_call(
         return
     if case.operation.path == "/relocalize":
         _fit(case.body)
-    if case.operation.path == "/objects/{name}":
+    if case.operation.path in ("/objects/{name}", "/objects/{name}/goal"):
         case.path_parameters["name"] = OBJECT
     if case.operation.path == "/crops/{name}":
         case.path_parameters["name"] = "shown"

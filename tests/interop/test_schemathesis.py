@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "0123456789abcdef-not-a-secret"
 PROGRAM = Path(sys.executable).with_name("schemathesis")
-OPERATIONS = 10
+OPERATIONS = 11
 ARGS = ("--no-zenoh", "--http", "127.0.0.1:0", "--rate", "100000")
 
 

@@ -41,7 +41,9 @@ from projections.postgres.queries.live_view import LiveView
 from .asked import (
     NO_LOG,
     NO_LOG_OF_CROPS,
+    NO_LOG_OF_THE_PAST,
     ChangesQuery,
+    FindQuery,
     MapQuestion,
     NotInMapError,
     ServedLog,
@@ -202,7 +204,7 @@ class Answerer:
     """Answers questions from the live databases; safe to use from many threads.
 
     ``note`` gets a line for people when a question fails because of the database. Without a ``log``
-    beside them, `changes` and `crop` are refused.
+    beside them, `changes`, `crop` and past maps are refused.
     """
 
     def __init__(
@@ -264,6 +266,12 @@ class Answerer:
     def ask(self, question: MapQuestion) -> dict[str, Any]:
         """The answer to a question of the map. Raises NotInMapError."""
         return asked(question, self._view())
+
+    def find(self, query: FindQuery) -> dict[str, Any]:
+        """The Objects that are asked for, in a past map by the log. Raises NotInMapError."""
+        if query.at is None and query.known_at is None:
+            return self.ask(query.question())
+        return self._ask_log(NO_LOG_OF_THE_PAST, lambda log, view: log.find(view, query))
 
     def changes(self, query: ChangesQuery) -> dict[str, Any]:
         """A page of what changed in the building. Raises NotInMapError."""

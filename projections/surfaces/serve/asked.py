@@ -20,7 +20,7 @@ from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_views
 from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find, robot_seconds
-from projections.ask.room_and_path import path, room
+from projections.ask.room_and_path import goal_of, path, room
 from projections.ask.what_changed import ChangeKind
 from projections.fold.deltas import ObjectOrdinal
 from projections.fold.map_errors import LogPointError, ProjectionMismatch, QuestionError
@@ -90,6 +90,8 @@ class FindQuery(BaseModel):
     seen_since: _Text | None = Field(None, description="ISO time: seen then or later.")
     not_seen_since: _Text | None = Field(None, description="ISO time: last seen earlier.")
     every: _Flag = Field("false", alias="all", description="Also what was seen once.")
+    at: _Text | None = Field(None, description="A past map: its last event; needs --log.")
+    known_at: _Text | None = Field(None, description="Under the corrections known then.")
     limit: Annotated[int, Field(ge=1, le=MAX_PAGE)] = Field(10, description="Most answers.")
     cursor: Annotated[str, Field(pattern=CURSOR)] = Field(
         "0", description="`next` of the page before."
@@ -193,6 +195,24 @@ class ServedLog:
         views = best_views(view, view.all_objects[found], self._crops)
         return next((each.jpeg for each in views), None)
 
+    def find(self, served: LiveView, query: FindQuery) -> dict[str, Any]:
+        """`find` in a past map. Raises NotInMapError, and ProjectionMismatch."""
+        with self._lock:
+            self.refuse_other(served)
+            self._settings = served.settings
+            self._timeline.refresh()
+            try:
+                end = served.next_offset
+                if query.at is not None:
+                    end = self._timeline.moment(query.at, is_end=True)
+                known_at = end
+                if query.known_at is not None:
+                    known_at = self._timeline.moment(query.known_at, is_end=True)
+                view = self._timeline.at(end, known_at=known_at)
+                return query.question()(view)
+            except (MisuseError, LogPointError) as error:
+                raise NotInMapError(str(error)) from None
+
     def changes(self, view: LiveView, asked: ChangesQuery) -> dict[str, Any]:
         """A page of what changed. Raises NotInMapError, and ProjectionMismatch."""
         with self._lock:
@@ -215,6 +235,9 @@ class ServedLog:
 
 
 NO_LOG_OF_CROPS: Final = "the databases keep no crops; start the service with --log LOG"
+NO_LOG_OF_THE_PAST: Final = (
+    "the databases have one map, and only the log knows past ones; start the service with --log LOG"
+)
 NO_LOG: Final = (
     "the databases have one map, and only the log knows what changed since another; start the"
     " service with --log LOG, or run `mapfold changes LOG`"
@@ -229,6 +252,16 @@ def room_question(name: str) -> MapQuestion:
 def path_question(start: str, end: str, clearance: float = CLEARANCE_M) -> MapQuestion:
     """The way from one thing to another."""
     return lambda view: path(view, start, end, clearance).document()
+
+
+def goal_question(name: str, clearance: float = CLEARANCE_M) -> MapQuestion:
+    """The pose from which to see an Object."""
+
+    def answer(view: MapView) -> dict[str, Any]:
+        meant = thing_called(name, things_of(view), ["object"])
+        return goal_of(view, meant.id, clearance).document()
+
+    return answer
 
 
 def object_question(name: str) -> MapQuestion:

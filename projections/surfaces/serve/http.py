@@ -22,7 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.record.metrics import METRICS_TYPE
-from projections.ask.driven_ground import CLEARANCE_M
+from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObject
 from projections.ask.room_and_path import DrivenPath, Room
 from projections.fold.map_errors import QuestionError
@@ -36,6 +36,7 @@ from .asked import (
     ChangesQuery,
     FindQuery,
     FoundPageShape,
+    goal_question,
     object_question,
     path_question,
     room_question,
@@ -50,6 +51,7 @@ from .states import State, refuse_unknown
 _DRAIN_FACTOR: Final = 8
 _KEPT: Final = "private, max-age=3600"
 _NAME: Final = Path(min_length=1, max_length=MOST_TEXT)
+_CLEARANCE = Annotated[float, Query(ge=0, le=100, description="Metres of a goal from walls.")]
 _END: Final = "X,Y in metres, a Place or an Object; the way to an Object ends at its goal."
 _RETRY_AFTER: Final = {"Retry-After": "1"}
 _ABOUT: Final = """Answers come from the map as it is in the databases when they are asked; what
@@ -148,7 +150,7 @@ def create_app(
         dependencies=[only(*FIND_NAMES)],
     )
     async def find(request: Request, wanted: Annotated[FindQuery, Query()]) -> Response:
-        return await answered(request, "find", lambda: answerer.ask(wanted.question()))
+        return await answered(request, "find", lambda: answerer.find(wanted))
 
     @app.get(
         "/rooms/{name}",
@@ -171,6 +173,19 @@ def create_app(
         return await answered(request, "object", lambda: answerer.ask(object_question(name)))
 
     @app.get(
+        "/objects/{name}/goal",
+        summary="The pose from which a robot sees an Object",
+        response_model=GoalPose,
+        responses=refusals(asking=True),
+        dependencies=[only("clearance")],
+    )
+    async def goal(
+        request: Request, name: Annotated[str, _NAME], clearance: _CLEARANCE = CLEARANCE_M
+    ) -> Response:
+        question = goal_question(name, clearance)
+        return await answered(request, "goal", lambda: answerer.ask(question))
+
+    @app.get(
         "/path",
         summary="The way over driven ground between two points, Places or Objects",
         response_model=DrivenPath,
@@ -185,9 +200,7 @@ def create_app(
         end: Annotated[
             str, Query(alias="to", min_length=1, max_length=MOST_TEXT, description=_END)
         ],
-        clearance: Annotated[
-            float, Query(ge=0, le=100, description="Metres of a goal from walls.")
-        ] = CLEARANCE_M,
+        clearance: _CLEARANCE = CLEARANCE_M,
     ) -> Response:
         question = path_question(start, end, clearance)
         return await answered(request, "path", lambda: answerer.ask(question))

@@ -16,7 +16,10 @@ from .fair_queue import FairQueue
 
 _BUCKETS_S: Final = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 20.0)
 _QUESTIONS: Final = frozenset(
-    {"relocalize", "places", "objects", "health", "find", "room", "path", "object"}
+    {
+        *("relocalize", "places", "objects", "health"),
+        *("find", "room", "path", "object", "goal", "changes", "crop"),
+    }
 )
 
 

@@ -74,7 +74,7 @@ class ZenohService:
         if query.key == RELOCALIZE:
             return RELOCALIZE, self._answerer.relocalize(query.payload, options)
         if query.key == FIND:
-            return FIND, self._answerer.ask(FindQuery.read(options).question())
+            return FIND, self._answerer.find(FindQuery.read(options))
         return query.key, self._answerer.state(query.key.removeprefix(f"{STATE}/"), options)
 
     def __enter__(self) -> Self:
