@@ -5,6 +5,8 @@ used are received and forgotten: their frames say which camera belongs to which 
 (`eventsrc.record.importers.bag_streams`).
 """
 
+import contextlib
+import functools
 import threading
 import time
 from collections.abc import Callable
@@ -15,10 +17,12 @@ from eventsrc.base.text import counted, visible
 from eventsrc.ros import messages as ros
 from eventsrc.ros.library import BagTopic, MessageTypes
 from eventsrc.ros.named_classes import nearest
+from eventsrc.ros.pictures import IMAGES
+from eventsrc.ros.stream import Stream
 from eventsrc.ros.wire import RmwWire
 
 from .importers.bag_files import BagContents, sampled
-from .importers.bag_streams import BagOptions, Choice, Chooser
+from .importers.bag_streams import NONE, TF_POSE, BagOptions, Choice, Chooser
 from .transport.session import Received, Session
 
 _TOKENS_S: Final = 2.0
@@ -29,6 +33,8 @@ _SAMPLES_S: Final = 5.0
 _MOST_TOPICS: Final = 10_000
 _MOST_SAMPLES: Final = 300
 MAP_FRAME: Final = "map"
+_GRID: Final = "/map"
+_TRANSFORMS: Final = ("/tf", "/tf_static")
 
 
 def find_topics(
@@ -44,26 +50,46 @@ def find_topics(
     """The topics to record and their uses, as soon as somebody publishes detections under
     ``namespace``; None if ``stop`` is set before.
 
-    ``note`` is called with a line while nobody does. The frame of the map is ``map`` unless the
-    options name another: a localiser may publish it later. Raises MisuseError for an option that
-    names a topic that nobody publishes, or one of another type.
+    ``note`` is called with a line while nobody does. What may come later is recorded too: poses are
+    those of transforms in the frame ``map`` where there is a topic of transforms, or none of poses,
+    and the walls those on ``/map`` where there is no topic of grids. Raises MisuseError for an
+    option that names a topic that nobody publishes, or one of another type.
     """
     name = namespace.strip("/").replace("/", "-") or "ros"
     under = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
     contents = _announced(session, wire, options, under, stop=stop, note=note)
-    if contents is None or not _sample(session, wire, contents, stop):
+    if contents is None or not _sample(session, wire, contents, options, stop):
         return None
     contents.first_ns = time.time_ns()
     given = tuple(options.detections) or tuple(
         sorted(topic for topic in _of_type(contents, ros.DETECTIONS) if topic.startswith(under))
     )
-    chosen = replace(options, detections=given, map_frame=options.map_frame or MAP_FRAME)
+    by_transforms = TF_POSE if _of_type(contents, ros.TF) else None
+    chosen = replace(
+        options,
+        detections=given,
+        pose=options.pose or by_transforms,
+        map_frame=options.map_frame or MAP_FRAME,
+    )
     choice = Chooser(name, contents, types, chosen, "the graph").choose()
-    choice.streams = [
-        replace(stream, classes=_class_topics(stream.detections, contents, options))
-        for stream in choice.streams
-    ]
+    choice.streams = [_with_later(stream, contents, options, choice) for stream in choice.streams]
+    if options.grid is None and not _of_type(contents, ros.GRID):
+        choice.grids = [_GRID]
+        choice.use(_GRID, "map, from when somebody publishes it")
     return choice
+
+
+def _with_later(
+    stream: Stream, contents: BagContents, options: BagOptions, choice: Choice
+) -> Stream:
+    """A stream with the topics that nobody publishes yet, and those of later names of classes."""
+    classes = _class_topics(stream.detections, contents, options)
+    tf, tf_static = stream.tf, stream.tf_static
+    if options.pose != NONE and stream.pose is None:
+        tf, tf_static = tf or _TRANSFORMS[0], tf_static or _TRANSFORMS[1]
+        for topic in {tf, tf_static} - contents.topics.keys():
+            choice.use(topic, "transforms, from when somebody publishes them")
+    return replace(stream, classes=classes, tf=tf, tf_static=tf_static)
 
 
 def _announced(
@@ -77,13 +103,10 @@ def _announced(
 ) -> BagContents | None:
     """The topics that have publishers, as soon as the detections' are among them."""
     waiting = False
+    contents = BagContents()
     while not stop.is_set():
-        topics: dict[str, BagTopic] = {}
-        for token in session.tokens(wire.all_tokens(), timeout_s=_TOKENS_S)[:_MOST_TOPICS]:
-            found = wire.read_token(token)
-            if found is not None:
-                topics.setdefault(found.topic, BagTopic(found.topic, found.type_name, "", "", 0))
-        contents = BagContents(topics)
+        _add_announced(session, wire, contents)
+        topics = contents.topics
         there = _of_type(contents, ros.DETECTIONS)
         wanted = options.detections or [each for each in there if each.startswith(under)]
         if wanted and all(topic in topics for topic in wanted):
@@ -93,6 +116,15 @@ def _announced(
             note(_waiting(wire, options, under, topics))
         stop.wait(_LOOK_EVERY_S)
     return None
+
+
+def _add_announced(session: Session, wire: RmwWire, contents: BagContents) -> None:
+    """Add the topics that have publishers now."""
+    for token in session.tokens(wire.all_tokens(), timeout_s=_TOKENS_S):
+        found = wire.read_token(token)
+        if found is not None and len(contents.topics) < _MOST_TOPICS:
+            topic = BagTopic(found.topic, found.type_name, "", "", 0)
+            contents.topics.setdefault(found.topic, topic)
 
 
 def _waiting(wire: RmwWire, options: BagOptions, under: str, topics: dict[str, BagTopic]) -> str:
@@ -106,35 +138,49 @@ def _waiting(wire: RmwWire, options: BagOptions, under: str, topics: dict[str, B
     )
 
 
-def _sample(session: Session, wire: RmwWire, contents: BagContents, stop: threading.Event) -> bool:
-    """Receive the samples that `Chooser` needs; False if ``stop`` is set before."""
-    wanted = [topic for topic in contents.topics.values() if sampled(topic.type_name, 0)]
-
-    def keep(topic: BagTopic) -> Callable[[Received], None]:
-        def receive(message: Received) -> None:
-            if len(topic.samples) < _MOST_SAMPLES and sampled(topic.type_name, topic.count):
-                topic.samples.append(message.payload)
-            topic.count += 1
-
-        return receive
-
-    subscriptions = [session.subscribe(wire.key(each.name), keep(each)) for each in wanted]
-    try:
-        session.confirm()
-        for topic in wanted:
-            for selector in wire.cache_selectors(topic.name):
-                for message in session.cached(selector, timeout_s=_TOKENS_S, most=_MOST_SAMPLES):
-                    keep(topic)(message)
-        began = time.monotonic()
+def _sample(
+    session: Session,
+    wire: RmwWire,
+    contents: BagContents,
+    options: BagOptions,
+    stop: threading.Event,
+) -> bool:
+    """Receive the samples that `Chooser` needs, also of topics that are announced meanwhile; False
+    if ``stop`` is set before."""
+    wanted: list[BagTopic] = []
+    began = time.monotonic()
+    with contextlib.ExitStack() as subscriptions:
         while (looked_s := time.monotonic() - began) < _SAMPLES_S:
+            _add_announced(session, wire, contents)
+            new = [each for each in contents.topics.values() if _is_wanted(each, options)]
+            for topic in new[len(wanted) :]:  # they are added behind those that are there
+                wanted.append(topic)
+                keep = functools.partial(_keep, topic)
+                subscription = session.subscribe(wire.key(topic.name), keep)
+                subscriptions.callback(subscription.close)
+                for selector in wire.cache_selectors(topic.name):
+                    for message in session.cached(
+                        selector, timeout_s=_TOKENS_S, most=_MOST_SAMPLES
+                    ):
+                        keep(message)
             if looked_s > _SETTLED_S and all(topic.samples for topic in wanted):
                 break
-            if stop.wait(_LOOK_EVERY_S / 5):
+            if stop.wait(_LOOK_EVERY_S):
                 return False
-    finally:
-        for subscription in subscriptions:
-            subscription.close()
     return True
+
+
+def _is_wanted(topic: BagTopic, options: BagOptions) -> bool:
+    """Whether messages of a topic say what it may be used for; of pictures only for crops."""
+    is_unused_picture = topic.type_name in IMAGES and options.cut is None
+    return sampled(topic.type_name, 0) and not is_unused_picture
+
+
+def _keep(topic: BagTopic, message: Received) -> None:
+    """Keep a message as a sample if it is one; called by Zenoh's threads."""
+    if len(topic.samples) < _MOST_SAMPLES and sampled(topic.type_name, topic.count):
+        topic.samples.append(message.payload)
+    topic.count += 1
 
 
 def _of_type(contents: BagContents, type_name: str) -> list[str]:
@@ -145,6 +191,6 @@ def _class_topics(detections: str, contents: BagContents, options: BagOptions) -
     """The topics whose later messages name classes: those of the options, else the one LabelInfo
     nearest to the detections."""
     if options.classes:
-        return options.classes
+        return tuple(topic for topic in options.classes if topic != NONE)
     near = nearest(detections, _of_type(contents, ros.LABELS))
     return tuple(near) if len(near) == 1 else ()

@@ -39,9 +39,16 @@ def views_in_order(view: MapView, found: ObjectRecord) -> list[ObservationRecord
     return sorted((view.observations[number] for number in found.observations), key=order)
 
 
-def best_views(view: MapView, found: ObjectRecord, crops: KeptCrops) -> Iterator[View]:
-    """The crops that a log keeps of an Object, the best view first."""
-    for seen in views_in_order(view, found)[:_MOST_TRIED]:
+def best_view(view: MapView, found: ObjectRecord, crops: KeptCrops) -> View | None:
+    """The best of an Object's views that a log keeps a crop of, among the first `_MOST_TRIED`."""
+    return next(best_views(view, found, crops, _MOST_TRIED), None)
+
+
+def best_views(
+    view: MapView, found: ObjectRecord, crops: KeptCrops, most: int | None = None
+) -> Iterator[View]:
+    """The crops that a log keeps of an Object, of its ``most`` best views, the best first."""
+    for seen in views_in_order(view, found)[:most]:
         jpeg = crops.jpeg(seen.det_id, view.keyframes[seen.keyframe].offset)
         if jpeg is not None:
             yield View(seen.det_id, jpeg)

@@ -10,6 +10,7 @@ import math
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,13 @@ from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.surfaces.python import Map, Timeline, fold
 from projections.surfaces.serve import Answerer, FairQueue, Pools
-from projections.surfaces.serve.asked import ChangesQuery, FindQuery, NotInMapError, ServedLog
+from projections.surfaces.serve.asked import (
+    ChangesQuery,
+    FindQuery,
+    LogBusyError,
+    NotInMapError,
+    ServedLog,
+)
 from tests.support.commands import Commands
 from tests.support.logs import append_command, command, write_log
 from tests.support.serve_questions import DEADLINE_S, http_at
@@ -310,6 +317,16 @@ def test_without_the_log_the_databases_do_not_know_what_changed(
                 strange.changes(ChangesQuery())
             with pytest.raises(ProjectionMismatch, match="give that log"):
                 strange.find(FindQuery(at="1"))
+
+
+def test_a_second_question_of_the_log_does_not_wait_for_long(
+    log: Path, module_database: Targets
+) -> None:
+    with Pools(module_database, 1) as pools, closing(ServedLog(log)) as beside:
+        with beside._reading(view := pools.view()), ThreadPoolExecutor(1) as other:
+            refused = other.submit(beside.changes, view, ChangesQuery()).exception(DEADLINE_S)
+        assert isinstance(refused, LogBusyError)
+        assert beside.changes(view, ChangesQuery(since="b"))["changes"]
 
 
 def test_pages_follow_each_other(http: str, house: Map) -> None:

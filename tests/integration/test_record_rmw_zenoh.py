@@ -5,7 +5,7 @@ import itertools
 import json
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from eventsrc.log import LogWriter, follow
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.bridged import MAX_KEYS, Bridge
+from eventsrc.record.recorder.checking import CheckedMessage
 from eventsrc.record.recorder.queue import BridgedMessage
+from eventsrc.record.ros_graph import find_topics
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import Undecodable
 from eventsrc.ros.wire import KeyParts, PublisherToken, RmwWire
@@ -222,14 +224,20 @@ def test_a_definition_of_another_hash_is_kept_and_counted_and_not_read(
     assert len(verbatim(read_log(log_path))) == len(sent)
 
 
+def no_check(_: object) -> Iterator[CheckedMessage]:
+    return iter(())
+
+
 def test_made_up_keys_do_not_fill_the_memory() -> None:
     bridge = new_recording()
     batch = [
         BridgedMessage(f"3/tf/a::msg::dds_::B{number}_/{HASH}", b"x")
         for number in range(MAX_KEYS + 10)
     ]
-    bridge.take([*batch, BridgedMessage("3/other/x/y", b"")], START, lambda _: iter(()))
+    bridge.take([*batch, BridgedMessage("3/other/x/y", b"")], START, no_check)
     assert bridge.unknown_keys == 11
+    other = bridge.take([BridgedMessage(f"3/map/a::msg::dds_::B_/{HASH}", b"x")], START, no_check)
+    assert [message.key for message in other] == ["/map"]
 
 
 @pytest.mark.seconds
@@ -259,6 +267,42 @@ def test_the_command_finds_its_topics_by_itself(
     document = json.loads(program.output())
     assert (document["recorded"], document["messages"]) == (11, len(sent))
     assert [e.payload for e in envelopes(read_log(log))] == expected_envelopes(sent)
+
+
+@pytest.mark.seconds
+def test_what_may_come_later_is_recorded_and_other_robots_are_not(
+    endpoint: str, connected: Sessions
+) -> None:
+    with rmw.node(endpoint, 3, "/bot1") as one, rmw.node(endpoint, 3, "/bot2") as two:
+        for each in (one, two):
+            each.advertise("/detections", BOXES)
+        options = BagOptions(run_id="r", classes=("none",))
+        stop = threading.Event()
+        found = find_topics(
+            connected(), RmwWire(3), TYPES, options, "/bot1", stop=stop, note=pytest.fail
+        )
+    assert found is not None
+    (stream,) = found.streams
+    assert (stream.detections, stream.tf, stream.tf_static) == (
+        "/bot1/detections",
+        "/tf",
+        "/tf_static",
+    )
+    assert (found.grids, stream.classes, stream.pose) == (["/map"], (), None)
+    assert found.uses["/tf"] == "transforms, from when somebody publishes them"
+
+
+def test_the_search_ends_when_it_is_stopped(connected: Sessions) -> None:
+    stop = threading.Event()
+    said = list[str]()
+
+    def note(line: str) -> None:
+        said.append(line)
+        stop.set()
+
+    found = find_topics(connected(), RmwWire(3), TYPES, BagOptions(), "/bot1", stop=stop, note=note)
+    assert found is None
+    assert ["domain 3, under /bot1/" in line for line in said] == [True]
 
 
 def test_options_of_the_command(tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Ask `mapfold mcp` with the official client."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,10 +34,15 @@ def over_stdio(*words: str | Path) -> Any:
     return stdio_client(StdioServerParameters(command=str(PROGRAM), args=["mcp", *map(str, words)]))
 
 
-def with_token(url: str, token: str) -> Any:
+@asynccontextmanager
+async def with_token(url: str, token: str) -> AsyncIterator[Any]:
     """A transport over HTTP that sends a token."""
     headers = {"Authorization": f"Bearer {token}"}
-    return streamable_http_client(url, http_client=httpx2.AsyncClient(headers=headers))
+    async with (
+        httpx2.AsyncClient(headers=headers) as client,
+        streamable_http_client(url, http_client=client) as streams,
+    ):
+        yield streams
 
 
 def tool(connected: Any, name: str, /, **arguments: Any) -> Any:

@@ -16,7 +16,7 @@ nothing to do. A recording that has lost events to damage is left as it is.
 """
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -51,7 +51,8 @@ from .queue import BridgedMessage
 HOLD_NS: Final = 10_000_000_000
 HOLD_MESSAGES: Final = 4_096
 HOLD_BYTES: Final = 32 * 1024 * 1024
-MAX_KEYS: Final = 4_096
+MAX_KEYS: Final = 1_000
+"""Keys of a topic, one for each type and hash."""
 MAX_KEPT_NUMBERS: Final = 4_096
 _UNKNOWN: Final = MessageFormat(CDR)
 
@@ -87,9 +88,11 @@ class Bridge:
         self.topics = tuple(dict.fromkeys([*topics, *sorted(self.derivation.pictures)]))
         self.keys = tuple(map(self.wire.key, self.topics))
         self._topics: dict[str, str] = {}
+        self._key_counts = Counter[str]()
         self._types = types
         self._lock = threading.Lock()
         self._new_types: dict[str, str] = {}
+        self._latched: set[str] = set()
         self._new_latched: set[str] = set()
         self._kept_numbers: dict[SequenceNumber, None] = {}
         self._formats: dict[str, MessageFormat] = {}
@@ -151,6 +154,7 @@ class Bridge:
             with self._lock:
                 self._new_types[self.wire.key(found.topic)] = found.type_name
                 if found.is_latched:
+                    self._latched.add(found.topic)
                     self._new_latched.add(found.topic)
 
     def take(
@@ -192,10 +196,13 @@ class Bridge:
         return taken
 
     def _know(self, key: str) -> bool:
-        """Find the topic of a key, and the type if the key says it; whether it is recorded. No
-        publisher can make up so many keys that they fill the memory."""
+        """Find the topic of a key, and the type if the key says it; whether it is recorded. Made-up
+        types of one topic do not fill the memory, and are no loss for another."""
         parts = self.wire.read_key(key)
-        if parts is None or parts.topic not in self.topics or len(self._topics) >= MAX_KEYS:
+        if parts is None or parts.topic not in self.topics:
+            return False
+        self._key_counts[parts.topic] += 1
+        if self._key_counts[parts.topic] > MAX_KEYS:
             return False
         self._topics[key] = parts.topic
         if parts.type_name is not None:
@@ -204,9 +211,9 @@ class Bridge:
         return True
 
     def _is_kept_already(self, message: BridgedMessage) -> bool:
-        """Whether a message of a topic that publishers keep came before: both sent, and fetched."""
+        """Whether a message that its publisher keeps came before: both sent, and fetched."""
         number, kept = message.number, self._kept_numbers
-        if number is None or self._topics[message.key] not in self.latched_topics:
+        if number is None or self._topics[message.key] not in self._latched:
             return False
         known = number in kept
         kept[number] = None

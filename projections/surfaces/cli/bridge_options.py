@@ -17,7 +17,7 @@ from eventsrc.base.text import counted, visible
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
-from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.bag_streams import BagOptions, Choice
 from eventsrc.record.importers.label_files import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
@@ -115,7 +115,7 @@ class BridgeChoice:
             "--pose",
             "tf|TOPIC|none",
             "Where poses come from: transforms, or a topic of Odometry or "
-            f"PoseWithCovarianceStamped. [default: {TF_POSE}]",
+            f"PoseWithCovarianceStamped. [default: {TF_POSE}, with --ros2 if there are any]",
         ),
     ] = None
     covariance: Annotated[
@@ -146,7 +146,8 @@ class BridgeChoice:
         _option(
             "--grid",
             "TOPIC",
-            f"Topic of OccupancyGrid, for the map's walls; or none. [default: {_GRID}]",
+            "Topic of OccupancyGrid, for the map's walls; or none. "
+            f"[default: {_GRID}, with --ros2 the nearest of that name]",
         ),
     ] = None
     map_frame: Annotated[
@@ -155,7 +156,7 @@ class BridgeChoice:
     ] = None
     base_frame: Annotated[
         str | None,
-        _option("--base-frame", "FRAME", f"The robot's frame. [default: {_BASE_FRAME}]"),
+        _option("--base-frame", "FRAME", f"The robot's. [default: {_BASE_FRAME}, or as found]"),
     ] = None
     run_id: Annotated[
         str | None,
@@ -182,7 +183,7 @@ def check_unused(choice: BridgeChoice, domain: int | None, *, ros2: bool, ros2dd
     """Raise MisuseError if an option needs --ros2 or --ros2dds, which is not given, or both are."""
     if ros2 and ros2dds:
         raise MisuseError("--ros2 and --ros2dds: give the one that the robot has")
-    if not ros2 and domain is not None and os.environ.get(_DOMAIN_VARIABLE) != str(domain):
+    if not ros2 and domain is not None and _DOMAIN_VARIABLE not in os.environ:
         raise MisuseError("--domain goes with --ros2")
     if choice != BridgeChoice() and not (ros2 or ros2dds):
         raise MisuseError(
@@ -207,31 +208,35 @@ def topics_of_bridge(
 
 
 def find_topics_of_nodes(
-    choice: BridgeChoice,
-    session: Session,
-    domain: int,
-    types: MessageTypes,
-    ledger: GapLedger[RunId] | None,
-    stop: threading.Event,
-) -> RecordedRos | None:
-    """What of the nodes over rmw_zenoh is recorded, once somebody publishes detections; None if
-    ``stop`` is set before. Prints what is taken. Raises MisuseError."""
+    choice: BridgeChoice, session: Session, domain: int, types: MessageTypes, stop: threading.Event
+) -> Choice | None:
+    """The topics of nodes over rmw_zenoh and their uses, once somebody publishes detections; None
+    if ``stop`` is set before. Prints what is taken. Raises MisuseError."""
     wire, options = RmwWire(domain), as_of_a_bag(choice)
     made = find_topics(session, wire, types, options, choice.namespace, stop=stop, note=say)
     if made is None:
+        say("ended before anybody published detections; nothing is recorded")
         return None
     width = max(len(visible(topic)) for topic in made.uses)
     for topic in sorted(made.uses):
         say(f"  {visible(topic):{width}}  {visible(made.uses[topic])}")
     for note in made.notes:
         say(f"  note: {visible(note)}")
+    return made
+
+
+def topics_of_nodes(
+    choice: BridgeChoice, made: Choice, domain: int, ledger: GapLedger[RunId] | None
+) -> RecordedRos:
+    """What of the nodes over rmw_zenoh is recorded."""
     streams = tuple(
         dataclasses.replace(each, first_keyframe=_next_keyframe(ledger, RunId(each.run_id)))
         for each in made.streams
     )
     recording = RosRecording(key=DEFAULT_KEYS[0], streams=streams, grids=tuple(made.grids))
     others = (topic_of("", topic, "--topic") for topic in choice.topic or ())
-    return RecordedRos(recording, tuple(dict.fromkeys([*used_topics(recording), *others])), wire)
+    topics = dict.fromkeys([*used_topics(recording), *others])
+    return RecordedRos(recording, tuple(topics), RmwWire(domain))
 
 
 def as_of_a_bag(choice: BridgeChoice) -> BagOptions:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -15,7 +14,7 @@ from eventsrc.base.text import advised, counted, shorten_by, table, visible
 from eventsrc.base.user_files import written_whole
 from eventsrc.log import LogReader
 from eventsrc.record.kept_crops import KeptCrops
-from projections.ask.best_views import best_views
+from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find, robot_seconds
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
@@ -96,13 +95,14 @@ class AskedMap(FoldSettings):
         with LogReader(self.log or Path()) as reader:
             kept = KeptCrops(reader)
             for each in found.answers:
-                for best in islice(best_views(view, records[each.object_id], kept), 1):
+                best = best_view(view, records[each.object_id], kept)
+                if best is not None:
                     files[each.object_id] = str(folder / f"{each.object_id}.jpg")
                     with written_whole(Path(files[each.object_id])) as file:
                         file.write(best.jpeg)
         if len(files) < len(found.answers):
             count = counted(len(found.answers) - len(files), "answer")
-            say(f"{self.log} keeps no crop of {count}; `mapfold import --keep-crops` keeps them")
+            say(f"{self.log} keeps no crop of {count}; an import with --keep-crops keeps them")
         return files
 
     def _view(self) -> MapView:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -36,6 +36,7 @@ from .bridge_options import (
     recording_of,
     say_topics,
     topics_of_bridge,
+    topics_of_nodes,
     warn_of_silence,
 )
 from .folded_log import classes_advice
@@ -145,8 +146,14 @@ def record(
         RecorderSummary(log, json=json) as summary,
         stop_on_signals() as stop,
         open_session(options, mode=options.mode) as session,
-        LogWriter(log, fsync=policy, sealing_process=True) as writer,
+        ExitStack() as opened,
     ):
+        made = None
+        if ros2 and types is not None:
+            made = find_topics_of_nodes(choice, session, domain or 0, types, stop)
+            if made is None:
+                return
+        writer = opened.enter_context(LogWriter(log, fsync=policy, sealing_process=True))
         say_restart(log, writer)
         start = writer.next_offset
         LogStart.of(log, writer, new_log, is_ros=is_ros).record(writer)
@@ -155,11 +162,9 @@ def record(
         if types is not None:
             found = (
                 topics_of_bridge(choice, writer.now_ns(), ledger)
-                if ros2dds
-                else find_topics_of_nodes(choice, session, domain or 0, types, ledger, stop)
+                if made is None
+                else topics_of_nodes(choice, made, domain or 0, ledger)
             )
-            if found is None:
-                return
             bridge = open_bridge(choice, found, writer, types)
         recorder = Recorder(
             session,

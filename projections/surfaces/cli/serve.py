@@ -8,7 +8,7 @@ import dataclasses
 import os
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Self
@@ -17,6 +17,7 @@ import typer
 
 from eventsrc.base.errors import MisuseError, TransportError
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
+from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.surfaces.serve import Answerer, FairQueue, Pools, ZenohService
 from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
 from projections.surfaces.serve.asked import ServedLog
@@ -228,7 +229,8 @@ def serve(
         beside = None
         if log is not None:
             beside = stack.enter_context(closing(ServedLog(log, say)))
-            beside.refuse_other(pools.view())
+            with suppress(ProjectionMissing, DatabaseUnavailable):  # each question says it
+                beside.refuse_other(pools.view())
         answerer = Answerer(
             pools,
             per_second=rate,

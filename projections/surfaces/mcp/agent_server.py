@@ -234,8 +234,8 @@ class _Tools:
     ) -> dict[str, Any]:
         """Why a place or an object is what it is, event by event; with two keyframes, since when
         they are in one place."""
-        found = self._maps.why(thing, other, at, known_at)
-        return _answer(self._maps.map(at, known_at), found)
+        cited = self._maps.map(at, known_at)
+        return _answer(cited, self._maps.why(thing, other, *cited.moment(at, known_at)))
 
     def where_am_i(
         self,
@@ -255,7 +255,8 @@ class _Tools:
         `unknown` is true where the map may not have them."""
         question = read_question(crops)
         cited = self._maps.map(at, known_at)
-        found = rank(question, self._maps.candidates(question.crops, at, known_at), top=top)
+        similar = self._maps.candidates(question.crops, *cited.moment(at, known_at))
+        found = rank(question, similar, top=top)
         document = found.document()
         shown = {e["object_id"] for p in document["places"] for e in p["evidence"]}
         things = (each for each in cited.view.objects.values() if each.object_id in shown)

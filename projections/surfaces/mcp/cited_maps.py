@@ -45,6 +45,12 @@ class CitedMap(NamedTuple):
     view: MapView
     name: MapName
 
+    def moment(self, at: str, known_at: str | None) -> tuple[str, str | None]:
+        """``at`` and ``known_at`` of this map, also when the log has grown since."""
+        if self.name.known_at is None:
+            return at, known_at
+        return str(self.name.offset), str(self.name.known_at)
+
 
 class LogMaps:
     """The maps of a log; a context manager. ``issued_by`` gives the commands of `record`."""
@@ -166,7 +172,7 @@ class LiveMaps:
             raise MisuseError(f"the map at {at}, known at {known_at or at}, {_ONLY_LOG}")
 
 
-_ONLY_LOG = "is known only by the log; start `mapfold mcp LOG` instead of --db"
+_ONLY_LOG = "is known only by the log; start mcp with LOG instead of --db"
 
 
 def offsets_in(document: object) -> set[int]:

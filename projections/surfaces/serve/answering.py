@@ -44,6 +44,7 @@ from .asked import (
     NO_LOG_OF_THE_PAST,
     ChangesQuery,
     FindQuery,
+    LogBusyError,
     MapQuestion,
     NotInMapError,
     ServedLog,
@@ -183,6 +184,7 @@ DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (BusyError, "too_much", 503, None),
     (TooMuchError, "too_much", 429, None),
+    (LogBusyError, "too_much", 429, None),
     (NotInMapError, "bad_question", 404, None),
     (QuestionError, "bad_question", 400, None),
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),

@@ -6,18 +6,19 @@ map that does not change reads one row. Reading it keeps only one question waiti
 one map: what changed since another moment is asked of the log (`ServedLog`).
 """
 
+import contextlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NotRequired
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
-from eventsrc.base.errors import MisuseError
+from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised
 from eventsrc.record.kept_crops import KeptCrops
-from projections.ask.best_views import best_views
+from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find, robot_seconds
 from projections.ask.room_and_path import goal_of, path, room
@@ -37,11 +38,16 @@ MapQuestion = Callable[[MapView], dict[str, Any]]
 """A question of a map, which gives the answer as JSON. Raises MisuseError."""
 MOST_TEXT: Final = 256
 _Text = Annotated[str, Field(min_length=1, max_length=MOST_TEXT)]
+_WAIT_S: Final = 0.5
 _Flag = Literal["true", "false"]
 
 
 class NotInMapError(QuestionError):
     """The map does not have what is asked for."""
+
+
+class LogBusyError(MapfoldError):
+    """The log is being read for another question."""
 
 
 class MapMemory:
@@ -151,7 +157,9 @@ class ChangesQuery(BaseModel):
 
 class ServedLog:
     """The log beside the databases, for questions of several moments; for any thread. Past maps are
-    folded with the settings of the databases' map, and their history is kept beside the log."""
+    folded with the settings of the databases' map, and their history is kept beside the log. One
+    question is answered at a time: of others that come meanwhile each waits for `_WAIT_S`, and then
+    raises LogBusyError, so that they do not keep all workers from questions of the live map."""
 
     def __init__(self, log: Path, note: Callable[[str], None] = lambda _: None) -> None:
         self._lock, self._settings = threading.Lock(), Settings()
@@ -175,10 +183,7 @@ class ServedLog:
     def crop(self, served: LiveView, name: str) -> bytes:
         """The JPEG of a detection, by its det_id, or of an Object's best view, by its id. Raises
         NotInMapError."""
-        with self._lock:
-            self.refuse_other(served)
-            self._settings = served.settings
-            self._timeline.refresh()
+        with self._reading(served):
             found = self._crops.jpeg(name)
             if found is None and name.startswith("obj-"):
                 found = self._best_view(self._timeline.at(served.next_offset), name)
@@ -186,52 +191,52 @@ class ServedLog:
             raise NotInMapError(f"the log keeps no crop of {describe_value(name)}")
         return found
 
-    def _best_view(self, view: MapView, object_id: str) -> bytes | None:
-        try:
-            meant = thing_called(object_id, things_of(view), ["object"])
-        except MisuseError as error:
-            raise NotInMapError(str(error)) from None
-        found = view.object_survivors.find(ObjectOrdinal(meant.ordinal))
-        views = best_views(view, view.all_objects[found], self._crops)
-        return next((each.jpeg for each in views), None)
-
     def find(self, served: LiveView, query: FindQuery) -> dict[str, Any]:
-        """`find` in a past map. Raises NotInMapError, and ProjectionMismatch."""
-        with self._lock:
-            self.refuse_other(served)
-            self._settings = served.settings
-            self._timeline.refresh()
-            try:
-                end = served.next_offset
-                if query.at is not None:
-                    end = self._timeline.moment(query.at, is_end=True)
-                known_at = end
-                if query.known_at is not None:
-                    known_at = self._timeline.moment(query.known_at, is_end=True)
-                view = self._timeline.at(end, known_at=known_at)
-                return query.question()(view)
-            except (MisuseError, LogPointError) as error:
-                raise NotInMapError(str(error)) from None
+        """`find` in a past map. Raises NotInMapError."""
+        with self._reading(served):
+            end = served.next_offset
+            if query.at is not None:
+                end = self._timeline.moment(query.at, is_end=True)
+            known_at = end
+            if query.known_at is not None:
+                known_at = self._timeline.moment(query.known_at, is_end=True)
+            return query.question()(self._timeline.at(end, known_at=known_at))
 
-    def changes(self, view: LiveView, asked: ChangesQuery) -> dict[str, Any]:
-        """A page of what changed. Raises NotInMapError, and ProjectionMismatch."""
-        with self._lock:
-            self.refuse_other(view)
-            self._settings = view.settings
-            self._timeline.refresh()
-            try:
-                end, start = view.next_offset, None
-                if asked.until is not None:
-                    end = self._timeline.moment(asked.until, is_end=True)
-                if asked.since is not None:
-                    start = self._timeline.moment(asked.since, is_end=False)
-                found = self._timeline.changes(start, end)
-            except (MisuseError, LogPointError) as error:
-                raise NotInMapError(str(error)) from None
+    def changes(self, served: LiveView, asked: ChangesQuery) -> dict[str, Any]:
+        """A page of what changed. Raises NotInMapError."""
+        with self._reading(served):
+            end, start = served.next_offset, None
+            if asked.until is not None:
+                end = self._timeline.moment(asked.until, is_end=True)
+            if asked.since is not None:
+                start = self._timeline.moment(asked.since, is_end=False)
+            found = self._timeline.changes(start, end)
         first, until = int(asked.cursor), int(asked.cursor) + asked.limit
         more = {"next": str(until)} if len(found.changes) > until else {}
         document = found.document()
         return {**document, "changes": document["changes"][first:until], **more}
+
+    @contextlib.contextmanager
+    def _reading(self, served: LiveView) -> Iterator[None]:
+        """Read the log for one question. Raises LogBusyError, ProjectionMismatch, and NotInMapError
+        for what the log does not have."""
+        if not self._lock.acquire(timeout=_WAIT_S):
+            raise LogBusyError("the log is read for another question; ask again in a second")
+        try:
+            self.refuse_other(served)
+            self._settings = served.settings
+            self._timeline.refresh()
+            yield
+        except (MisuseError, LogPointError) as error:
+            raise NotInMapError(str(error)) from None
+        finally:
+            self._lock.release()
+
+    def _best_view(self, view: MapView, object_id: str) -> bytes | None:
+        meant = thing_called(object_id, things_of(view), ["object"])
+        found = view.object_survivors.find(ObjectOrdinal(meant.ordinal))
+        best = best_view(view, view.all_objects[found], self._crops)
+        return None if best is None else best.jpeg
 
 
 NO_LOG_OF_CROPS: Final = "the databases keep no crops; start the service with --log LOG"
@@ -240,7 +245,7 @@ NO_LOG_OF_THE_PAST: Final = (
 )
 NO_LOG: Final = (
     "the databases have one map, and only the log knows what changed since another; start the"
-    " service with --log LOG, or run `mapfold changes LOG`"
+    " service with --log LOG"
 )
 
 

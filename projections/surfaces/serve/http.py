@@ -49,7 +49,7 @@ from .service_metrics import ServiceMetrics
 from .states import State, refuse_unknown
 
 _DRAIN_FACTOR: Final = 8
-_KEPT: Final = "private, max-age=3600"
+_KEPT: Final = "private, no-cache"
 _NAME: Final = Path(min_length=1, max_length=MOST_TEXT)
 _CLEARANCE = Annotated[float, Query(ge=0, le=100, description="Metres of a goal from walls.")]
 _END: Final = "X,Y in metres, a Place or an Object; the way to an Object ends at its goal."
