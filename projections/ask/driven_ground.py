@@ -108,10 +108,15 @@ class DrivenGround:
         self.spots: list[Spot] = []
         self._of: dict[tuple[_Floor, int, int], int] = {}
         self._links: list[dict[int, float]] = []
-        self._standing: dict[tuple[int, int], list[ObjectRecord]] = {}
+        self._standing: dict[tuple[_Floor, int, int], list[ObjectRecord]] = {}
+        every_floor = {keyframe.floor for keyframe in view.keyframes}
         for each in view.objects.values():
             if each.confirmed and each.estimate is not None and each.missing_in is None:
-                self._standing.setdefault(_stand(each.spot), []).append(each)
+                floors = every_floor
+                if len(every_floor) > 1:  # without floors the sightings need not be read
+                    floors = {keyframe.floor for keyframe in view.sightings(each)}
+                for floor in floors:
+                    self._standing.setdefault((floor, *_stand(each.spot)), []).append(each)
         last: dict[int, tuple[int, int]] = {}
         posed = [k for k in view.keyframes if k.pose is not None]
         for keyframe in sorted(posed, key=lambda k: (k.run, k.keyframe_id)):
@@ -218,19 +223,19 @@ class DrivenGround:
         spot = _spot(keyframe)
         flaws = (
             keyframe.run != last,
-            self._is_taken(spot, found),
+            self._is_taken(keyframe.floor, spot, found),
             not self.is_free(keyframe.floor, spot, found.spot),
         )
         return _off_centre(keyframe, found.spot) + _WORSE * sum(flaws)
 
-    def _is_taken(self, spot: Spot, found: ObjectRecord) -> bool:
-        """Whether another Object than ``found`` stands at a spot."""
+    def _is_taken(self, floor: _Floor, spot: Spot, found: ObjectRecord) -> bool:
+        """Whether another Object than ``found`` stands at a spot of a floor."""
         column, row = _stand(spot)
         return any(
             other is not found and math.dist(other.spot, spot) < _STANDS_M
             for x in (column - 1, column, column + 1)
             for y in (row - 1, row, row + 1)
-            for other in self._standing.get((x, y), ())
+            for other in self._standing.get((floor, x, y), ())
         )
 
     def is_free(self, floor: _Floor, a: Spot, b: Spot) -> bool:

@@ -177,15 +177,13 @@ def keyframes_looking(
 ) -> list[KeyframeRecord]:
     """Those of some keyframes that should see an Object where it stands
     (`fold.presence.would_see`)."""
-    vantages = [
-        (k.pose.x_um / UM_PER_M, k.pose.y_um / UM_PER_M)
-        for k in view.sightings(record)
-        if k.pose is not None
-    ]
+    seen = [k for k in view.sightings(record) if k.pose is not None]
+    floors = {k.floor for k in seen}
+    vantages = {(k.pose.x_um / UM_PER_M, k.pose.y_um / UM_PER_M) for k in seen if k.pose}
     found = list[KeyframeRecord]()
     for keyframe in among:
         pose = keyframe.pose
-        if pose is None:
+        if pose is None or keyframe.floor not in floors:
             continue
         camera = camera_of(keyframe.camera, view.settings.camera)
         if any(would_see(pose, camera, record.spot, vantage) for vantage in vantages):
