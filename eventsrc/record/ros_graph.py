@@ -31,6 +31,7 @@ _SETTLED_S: Final = 1.0
 """How long the graph is looked at at least, for transforms of several nodes."""
 _SAMPLES_S: Final = 5.0
 _MOST_TOPICS: Final = 10_000
+_MOST_WANTED: Final = 1_000
 _MOST_SAMPLES: Final = 300
 MAP_FRAME: Final = "map"
 _GRID: Final = "/map"
@@ -85,7 +86,7 @@ def _with_later(
     """A stream with the topics that nobody publishes yet, and those of later names of classes."""
     classes = _class_topics(stream.detections, contents, options)
     tf, tf_static = stream.tf, stream.tf_static
-    if options.pose != NONE and stream.pose is None:
+    if options.pose != NONE and stream.pose is None and not _of_type(contents, ros.TF):
         tf, tf_static = tf or _TRANSFORMS[0], tf_static or _TRANSFORMS[1]
         for topic in {tf, tf_static} - contents.topics.keys():
             choice.use(topic, "transforms, from when somebody publishes them")
@@ -132,7 +133,7 @@ def _waiting(wire: RmwWire, options: BagOptions, under: str, topics: dict[str, B
     where = f"domain {wire.domain}" + ("" if under == "/" else f", under {visible(under)}")
     seen = counted(len(topics), "topic") if topics else "no topic at all"
     return (
-        f"waiting for a publisher of {what} in {where}; there is {seen} so far. If that stays so: "
+        f"waiting for a publisher of {what} in {where}; seen so far: {seen}. If that stays so: "
         "check --domain and --namespace, that the nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp,"
         " and that --connect names their router"
     )
@@ -153,7 +154,9 @@ def _sample(
         while (looked_s := time.monotonic() - began) < _SAMPLES_S:
             _add_announced(session, wire, contents)
             new = [each for each in contents.topics.values() if _is_wanted(each, options)]
-            for topic in new[len(wanted) :]:  # they are added behind those that are there
+            for topic in new[len(wanted) : _MOST_WANTED]:  # added behind those that are there
+                if stop.is_set():
+                    return False
                 wanted.append(topic)
                 keep = functools.partial(_keep, topic)
                 subscription = session.subscribe(wire.key(topic.name), keep)

@@ -270,6 +270,26 @@ def test_the_command_finds_its_topics_by_itself(
 
 
 @pytest.mark.seconds
+def test_of_several_topics_of_transforms_none_is_taken(endpoint: str, connected: Sessions) -> None:
+    with rmw.node(endpoint, 3) as node:
+        node.advertise("/detections", BOXES)
+        for topic in ("/bot1/tf", "/bot2/tf"):
+            node.advertise(topic, TF)
+        found = find_topics(
+            connected(),
+            RmwWire(3),
+            TYPES,
+            BagOptions(),
+            "",
+            stop=threading.Event(),
+            note=pytest.fail,
+        )
+    assert found is not None
+    assert (found.streams[0].tf, found.streams[0].tf_static) == (None, None)
+    assert any("/bot1/tf, /bot2/tf" in note for note in found.notes)
+
+
+@pytest.mark.seconds
 def test_what_may_come_later_is_recorded_and_other_robots_are_not(
     endpoint: str, connected: Sessions
 ) -> None:
@@ -307,10 +327,14 @@ def test_the_search_ends_when_it_is_stopped(connected: Sessions) -> None:
 
 def test_options_of_the_command(tmp_path: Path) -> None:
     run = Commands.in_folder(tmp_path)
+    for number in ("300", "x", "-1"):
+        elsewhere = Commands.in_folder(tmp_path, ROS_DOMAIN_ID=number)
+        assert f"ROS_DOMAIN_ID is {number}" in elsewhere("record", "L", "--ros2", code=2).err
     for wrong, said in (
         (["--ros2", "--ros2dds"], "give the one that the robot has"),
         (["--domain", "3"], "--domain goes with --ros2"),
         (["--ros2dds", "--domain", "3"], "--domain goes with --ros2"),
+        (["--ros2", "--namespace", "/a b"], "is no ROS 2 namespace"),
     ):
         assert said in run("record", "L", *wrong, code=2).err
     assert not (tmp_path / "L").exists()

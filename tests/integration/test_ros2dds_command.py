@@ -200,3 +200,29 @@ def test_messages_that_find_the_queue_full_are_counted_by_key() -> None:
         queue.put(BridgedMessage("bot1/tf", b"%d" % number))
     assert [m.payload for m in queue.get(9, 0.0)] == [b"0", b"1"]
     assert queue.drain_overflow() == {"bot1/tf": 3}
+
+
+@pytest.mark.seconds
+def test_keyframes_of_a_run_that_goes_on_after_a_kill_have_numbers_of_their_own(
+    tmp_path: Path, endpoint: str, start_code: Callable[..., Program]
+) -> None:
+    """Those that waited for a pose when the recorder was killed are made first, and count."""
+    log, sent = tmp_path / "log", drive(4)
+    with ros2dds.bridge(endpoint) as bridge:
+        announce_all(bridge)
+        for killed in (True, False):
+            program = start_code(
+                MAPFOLD, "record", str(log), "--connect", endpoint, "--ros2dds",
+                "--embeddings", "/embeddings", "--run-id", "r",
+            )  # fmt: skip
+            program.wait_for("Ctrl-C ends it")
+            send_all(bridge, sent[:-1] if killed else sent)  # without the last pose
+            last = "/embeddings" if killed else "/tf"
+            seen = 0
+            for event in follow(log, FIRST_OFFSET, stop=threading.Event()):
+                seen += event is not None and event.key == last
+                if seen == (4 if killed else 15):
+                    break
+            assert program.end(signal.SIGKILL if killed else signal.SIGINT) == -9 * killed
+    envelopes = [json.loads(e.payload) for e in read_log(log) if e.is_envelope]
+    assert [each["keyframe_id"] for each in envelopes] == [*range(8)]

@@ -127,7 +127,7 @@ class Chooser:
         map_frame, base_frame = self._map_and_base(tree, camera_frame)
         found = any(tree.is_connected(map_frame, each) for each in (base_frame, camera_frame))
         pose = self._pose(topic, has_transforms=found)
-        if pose == TF_POSE and tf is None and tf_static is None:
+        if pose == TF_POSE and not self._of_type(ros.TF):
             raise MisuseError(f"--pose {TF_POSE}: {self._source} has no topic of {ros.TF}")
         if pose is None:  # without a topic of poses a stream takes those of its transforms
             tf = tf_static = None

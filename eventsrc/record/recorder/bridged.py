@@ -94,7 +94,7 @@ class Bridge:
         self._new_types: dict[str, str] = {}
         self._latched: set[str] = set()
         self._new_latched: set[str] = set()
-        self._kept_numbers: dict[SequenceNumber, None] = {}
+        self._kept_numbers: dict[tuple[SequenceNumber, int], None] = {}
         self._formats: dict[str, MessageFormat] = {}
         self._undefined: dict[str, str] = {}
         """Why messages of a key cannot be read, though their type is known by name."""
@@ -215,8 +215,9 @@ class Bridge:
         number, kept = message.number, self._kept_numbers
         if number is None or self._topics[message.key] not in self._latched:
             return False
-        known = number in kept
-        kept[number] = None
+        sent = number, hash(message.payload)
+        known = sent in kept
+        kept[sent] = None
         if len(kept) > MAX_KEPT_NUMBERS:
             del kept[next(iter(kept))]
         return known

@@ -70,8 +70,7 @@ DomainOption = Annotated[
         metavar="N",
         min=0,
         max=MAX_DOMAIN,
-        envvar=_DOMAIN_VARIABLE,
-        help="The domain of the nodes, with --ros2. [default: 0]",
+        help="The domain of the nodes, with --ros2. [default: ROS_DOMAIN_ID, else 0]",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -88,8 +87,7 @@ Ros2ddsOption = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeChoice:
-    """The options of `mapfold record` that go with ``--ros2`` and ``--ros2dds``; what is None
-    follows from the graph with the first, is `recording_of`'s default with the second."""
+    """Options that go with ``--ros2``, where None is what the graph says, and ``--ros2dds``."""
 
     namespace: Annotated[
         str,
@@ -183,13 +181,25 @@ def check_unused(choice: BridgeChoice, domain: int | None, *, ros2: bool, ros2dd
     """Raise MisuseError if an option needs --ros2 or --ros2dds, which is not given, or both are."""
     if ros2 and ros2dds:
         raise MisuseError("--ros2 and --ros2dds: give the one that the robot has")
-    if not ros2 and domain is not None and _DOMAIN_VARIABLE not in os.environ:
+    if not ros2 and domain is not None:
         raise MisuseError("--domain goes with --ros2")
     if choice != BridgeChoice() and not (ros2 or ros2dds):
         raise MisuseError(
             "--namespace, --detections, --pose and the other options for messages of ROS go with "
             "--ros2 or --ros2dds"
         )
+
+
+def domain_of(domain: int | None) -> int:
+    """``--domain``, or that of ROS's environment. Raises MisuseError."""
+    if domain is not None:
+        return domain
+    said = os.environ.get(_DOMAIN_VARIABLE) or "0"
+    if not (said.isascii() and said.isdecimal() and len(said) < 9 and int(said) <= MAX_DOMAIN):
+        raise MisuseError(
+            f"{_DOMAIN_VARIABLE} is {visible(said)[:80]}, not 0 to {MAX_DOMAIN}; give --domain N"
+        )
+    return int(said)
 
 
 class RecordedRos(NamedTuple):
@@ -218,8 +228,8 @@ def find_topics_of_nodes(
         say("ended before anybody published detections; nothing is recorded")
         return None
     width = max(len(visible(topic)) for topic in made.uses)
-    for topic in sorted(made.uses):
-        say(f"  {visible(topic):{width}}  {visible(made.uses[topic])}")
+    for topic, use in sorted(made.uses.items()):
+        say(f"  {visible(topic):{width}}  {visible(use)}")
     for note in made.notes:
         say(f"  note: {visible(note)}")
     return made
@@ -245,6 +255,7 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
     def full(topic: str | None, option: str) -> str | None:
         return topic if topic in (None, NONE, TF_POSE) else topic_of("", topic, option)
 
+    topic_of(choice.namespace, "topic", "--namespace")
     detections = (topic_of("", topic, "--detections") for topic in choice.detections or ())
     classes = (full(topic, "--classes") or "" for topic in choice.classes or ())
     return BagOptions(
@@ -267,12 +278,8 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
     )
 
 
-def open_bridge(
-    choice: BridgeChoice, found: RecordedRos, writer: LogWriter, types: MessageTypes
-) -> Bridge:
-    """The recorder of what was found. First makes the envelopes that a killed recorder left
-    out."""
-    cut = crop_cutter(choice.keep_crops, choice.images)
+def finish_last_recording(writer: LogWriter, types: MessageTypes) -> None:
+    """Make the envelopes that a killed recorder left out, before those of this one are numbered."""
     try:
         with LogReader(writer.path) as reader:
             made = append_missing(reader, writer, types)
@@ -284,7 +291,6 @@ def open_bridge(
                 f"{writer.path}: the last recording of ROS did not finish; made "
                 f"{counted(made, 'event')} from its messages"
             )
-    return Bridge(found.recording, found.topics, types, found.wire, cut)
 
 
 def _next_keyframe(ledger: GapLedger[RunId] | None, run_id: RunId) -> int:
@@ -377,8 +383,7 @@ def say_topics(log: Path, bridge: Bridge) -> None:
 def warn_of_silence(
     bridge: Bridge, watch: Callable[[RecorderReport], None], every_s: float
 ) -> Callable[[RecorderReport], None]:
-    """``watch``, plus one warning if no bridge has announced a topic some seconds after the
-    start."""
+    """``watch``, and one warning if no bridge announces a topic for some seconds."""
     calls = 0
 
     def watching(report: RecorderReport) -> None:

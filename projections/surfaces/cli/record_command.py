@@ -15,6 +15,7 @@ from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTE
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter, parse_fsync
 from eventsrc.record.gap_history import fold_and_save_ledger
+from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.recorder.edits import EDIT_PREFIX, Edits, KnownCommands, edit_key
 from eventsrc.record.recorder.queue import DEFAULT_QUEUE_SIZE
 from eventsrc.record.recorder.recorder import DEFAULT_CROPS, DEFAULT_KEYS, Recorder
@@ -23,7 +24,7 @@ from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes
 from projections.fold.corrections import check_settings
 
-from .bag_text import stream_lines
+from .bag_text import crop_cutter, stream_lines
 from .bridge_options import (
     BridgeChoice,
     DomainOption,
@@ -31,8 +32,9 @@ from .bridge_options import (
     Ros2Option,
     as_of_a_bag,
     check_unused,
+    domain_of,
     find_topics_of_nodes,
-    open_bridge,
+    finish_last_recording,
     recording_of,
     say_topics,
     topics_of_bridge,
@@ -137,6 +139,7 @@ def record(
     check_keys(keys)
     crop_keys = _crop_keys(crops)
     types = MessageTypes() if is_ros else None
+    number = domain_of(domain) if ros2 else 0
     if ros2dds:
         recording_of(choice, 0, None)
     if is_ros:
@@ -150,22 +153,25 @@ def record(
     ):
         made = None
         if ros2 and types is not None:
-            made = find_topics_of_nodes(choice, session, domain or 0, types, stop)
+            made = find_topics_of_nodes(choice, session, number, types, stop)
             if made is None:
                 return
         writer = opened.enter_context(LogWriter(log, fsync=policy, sealing_process=True))
         say_restart(log, writer)
         start = writer.next_offset
         LogStart.of(log, writer, new_log, is_ros=is_ros).record(writer)
+        if types is not None:
+            finish_last_recording(writer, types)
         ledger = _gap_history(log)
         bridge = None
         if types is not None:
             found = (
                 topics_of_bridge(choice, writer.now_ns(), ledger)
                 if made is None
-                else topics_of_nodes(choice, made, domain or 0, ledger)
+                else topics_of_nodes(choice, made, number, ledger)
             )
-            bridge = open_bridge(choice, found, writer, types)
+            cut = crop_cutter(choice.keep_crops, choice.images)
+            bridge = Bridge(found.recording, found.topics, types, found.wire, cut)
         recorder = Recorder(
             session,
             writer,

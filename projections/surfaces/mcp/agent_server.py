@@ -15,7 +15,8 @@ from mcp.server.mcpserver.exceptions import ResourceError, ToolError
 from mcp.server.transport_security import TransportSecuritySettings
 from mcp_types import CallToolResult, InputRequiredResult, ToolAnnotations
 from pydantic import Field
-from starlette.types import ASGIApp
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from projections.ask.driven_ground import CLEARANCE_M
@@ -101,14 +102,22 @@ def create_server(maps: LogMaps | LiveMaps, *, allow_edits: bool = False) -> MCP
 
 def http_app(server: MCPServer[Any]) -> ASGIApp:
     """The server over HTTP at `PATH`, with no session: each request is answered by itself. Who may
-    ask is checked by `serve.guard`."""
-    return server.streamable_http_app(
+    ask is checked by `serve.guard`. A GET, which would be a stream without end, is refused."""
+    app = server.streamable_http_app(
         streamable_http_path=PATH,
         json_response=True,
         stateless_http=True,
         max_request_body_size=MOST_BYTES,
         transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),
     )
+
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["method"] == "GET":
+            await Response(status_code=405, headers={"Allow": "POST"})(scope, receive, send)
+        else:
+            await app(scope, receive, send)
+
+    return answer
 
 
 def _guarded(

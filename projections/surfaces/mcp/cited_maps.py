@@ -10,9 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from eventsrc.base.errors import MisuseError
+from eventsrc.base.errors import LogError, MisuseError
+from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
+from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
+from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.edit.record import MakeCommand, OpenSession, record_command, recorded_document
 from projections.history import LogTimeline
@@ -104,7 +107,7 @@ class LogMaps:
 
     def changes(self, since: str | None, until: str) -> tuple[CitedMap, dict[str, Any]]:
         """The later map, and what changed in the building until it, as ``changes --json``."""
-        self._timeline.refresh()
+        self._refresh()
         end = self._timeline.moment(until, is_end=True)
         start = None if since is None else self._timeline.moment(since, is_end=False)
         return self._at(end, end), self._timeline.changes(start, end).document()
@@ -120,14 +123,29 @@ class LogMaps:
         """Record a command, as ``edit --json``. Raises MisuseError, LogError, TransportError."""
         if self._open_session is None:
             raise MisuseError("the log is not to be changed; start with --allow-edits")
+
+        def checked(current: MapToEdit, stamp: Stamp) -> Command:
+            self._refuse_other(current.reader)
+            return make(current, stamp)
+
         stamp = Stamp(uuid.uuid4().hex, self._issued_by, reason)
         made = record_command(
-            self._log, make, stamp, self._settings, self._open_session, self._note
+            self._log, checked, stamp, self._settings, self._open_session, self._note
         )
         return recorded_document(made)
 
-    def _moment(self, at: str, known_at: str | None) -> tuple[Offset, Offset]:
+    def _refresh(self) -> None:
+        """Include events recorded since. Raises LogError where another log, or none, is there."""
+        with LogReader(self._log) as there:
+            self._refuse_other(there)
         self._timeline.refresh()
+
+    def _refuse_other(self, there: LogReader) -> None:
+        if there.log_id != self._timeline.reader.log_id:
+            raise LogError(f"there is another log at {self._log} now; start mapfold mcp again")
+
+    def _moment(self, at: str, known_at: str | None) -> tuple[Offset, Offset]:
+        self._refresh()
         end = resolve(self._timeline.reader, at)
         return end, end if known_at is None else resolve(self._timeline.reader, known_at)
 

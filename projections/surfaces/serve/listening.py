@@ -19,6 +19,7 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from eventsrc.base.errors import MisuseError, TransportError
+from eventsrc.base.text import visible
 from eventsrc.base.user_files import FileFault, open_file
 
 from .answering import RepeatFilter
@@ -41,10 +42,11 @@ def bind(host: str, port: int, option: str = "--http") -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-    except OSError as error:
+    except (OSError, TypeError, UnicodeError) as error:  # the latter for what is no name of a host
         listener.close()
+        reason = getattr(error, "strerror", None) or error
         raise TransportError(
-            f"cannot listen on {host}:{port}: {error.strerror or error}; give another {option}"
+            f"cannot listen on {visible(host)}:{port}: {reason}; give another {option}"
         ) from None
     return listener
 
