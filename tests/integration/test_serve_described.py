@@ -93,7 +93,7 @@ def test_the_description_is_made_of_these_models(described: Any) -> None:
         for operation in operations.values()
     }
     refs = re.findall(r"schemas/(\w+)", json.dumps(answers))
-    asked = ["ChangesPage", "DrivenPath", "FoundObject", "FoundPage", "Room"]
+    asked = ["ChangesPage", "DrivenPath", "FoundObject", "FoundPage", "GoalPose", "Room"]
     assert sorted(refs) == sorted(["Answer", "Health", "Objects", "Places", *asked])
 
 
