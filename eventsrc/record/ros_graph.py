@@ -51,10 +51,11 @@ def find_topics(
     """The topics to record and their uses, as soon as somebody publishes detections under
     ``namespace``; None if ``stop`` is set before.
 
-    ``note`` is called with a line while nobody does. What may come later is recorded too: poses are
-    those of transforms in the frame ``map`` where there is a topic of transforms, or none of poses,
-    and the walls those on ``/map`` where there is no topic of grids. Raises MisuseError for an
-    option that names a topic that nobody publishes, or one of another type.
+    ``note`` is called once with a line if the topic of detections has no publisher yet. Topics
+    without a publisher yet are recorded, too: poses come from transforms in the frame ``map`` if
+    there is a topic of transforms or no topic of poses, walls from ``/map`` if there is no topic of
+    grids. Raises MisuseError for an option that names a topic without a publisher, or one of
+    another type.
     """
     name = namespace.strip("/").replace("/", "-") or "ros"
     under = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
@@ -74,22 +75,28 @@ def find_topics(
     )
     choice = Chooser(name, contents, types, chosen, "the graph").choose()
     choice.streams = [_with_later(stream, contents, options, choice) for stream in choice.streams]
+    if len(contents.topics) >= _MOST_TOPICS or _wanted_topics(contents, options)[_MOST_WANTED:]:
+        choice.notes.append(
+            f"there are very many topics; only the first {_MOST_TOPICS:,}, and messages of"
+            f" {_MOST_WANTED:,}, were looked at: name the topics by options"
+        )
     if options.grid is None and not _of_type(contents, ros.GRID):
         choice.grids = [_GRID]
-        choice.use(_GRID, "map, from when somebody publishes it")
+        choice.use(_GRID, "map, as soon as it has a publisher")
     return choice
 
 
 def _with_later(
     stream: Stream, contents: BagContents, options: BagOptions, choice: Choice
 ) -> Stream:
-    """A stream with the topics that nobody publishes yet, and those of later names of classes."""
+    """The stream, with ``/tf`` and ``/tf_static`` if no topic of transforms has a publisher yet,
+    and with the topics that name classes."""
     classes = _class_topics(stream.detections, contents, options)
     tf, tf_static = stream.tf, stream.tf_static
     if options.pose != NONE and stream.pose is None and not _of_type(contents, ros.TF):
         tf, tf_static = tf or _TRANSFORMS[0], tf_static or _TRANSFORMS[1]
         for topic in {tf, tf_static} - contents.topics.keys():
-            choice.use(topic, "transforms, from when somebody publishes them")
+            choice.use(topic, "transforms, as soon as it has a publisher")
     return replace(stream, classes=classes, tf=tf, tf_static=tf_static)
 
 
@@ -153,8 +160,8 @@ def _sample(
     with contextlib.ExitStack() as subscriptions:
         while (looked_s := time.monotonic() - began) < _SAMPLES_S:
             _add_announced(session, wire, contents)
-            new = [each for each in contents.topics.values() if _is_wanted(each, options)]
-            for topic in new[len(wanted) : _MOST_WANTED]:  # added behind those that are there
+            there = _wanted_topics(contents, options)  # new ones are behind those of before
+            for topic in there[len(wanted) : _MOST_WANTED]:
                 if stop.is_set():
                     return False
                 wanted.append(topic)
@@ -173,10 +180,14 @@ def _sample(
     return True
 
 
-def _is_wanted(topic: BagTopic, options: BagOptions) -> bool:
-    """Whether messages of a topic say what it may be used for; of pictures only for crops."""
-    is_unused_picture = topic.type_name in IMAGES and options.cut is None
-    return sampled(topic.type_name, 0) and not is_unused_picture
+def _wanted_topics(contents: BagContents, options: BagOptions) -> list[BagTopic]:
+    """The topics whose messages say what they may be used for; those of pictures only for crops."""
+    unused = IMAGES if options.cut is None else ()
+    return [
+        topic
+        for topic in contents.topics.values()
+        if sampled(topic.type_name, 0) and topic.type_name not in unused
+    ]
 
 
 def _keep(topic: BagTopic, message: Received) -> None:

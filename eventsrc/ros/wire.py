@@ -27,6 +27,7 @@ with the four bytes of encapsulation before it, in both ways:
 """
 
 import re
+from collections.abc import Callable
 from typing import Final, NamedTuple, Protocol
 
 from eventsrc.base.errors import MisuseError
@@ -72,8 +73,10 @@ class PublisherToken(NamedTuple):
 class Wire(Protocol):
     """Keys, tokens and caches of one of the two ways."""
 
-    has_attachments: bool
-    """Whether messages have attachments with their numbers."""
+    @property
+    def read_attachment(self) -> Callable[[bytes], tuple[str, int] | None] | None:
+        """Gives the publisher and the number of the message with an attachment, None if it has
+        neither. None where numbers are those of Zenoh's advanced publishers."""
 
     def key(self, topic: str) -> str:
         """The key expression of a topic's messages."""
@@ -90,14 +93,11 @@ class Wire(Protocol):
     def cache_selectors(self, topic: str) -> tuple[str, ...]:
         """The queries for the messages that publishers of a topic keep for late subscribers."""
 
-    def read_attachment(self, attachment: bytes) -> tuple[str, int] | None:
-        """Publisher and number of the message with this attachment; None if it has neither."""
-
 
 class BridgeWire:
     """Messages from a zenoh-bridge-ros2dds."""
 
-    has_attachments = False
+    read_attachment = None
 
     def key(self, topic: str) -> str:
         """`Wire.key`."""
@@ -125,15 +125,9 @@ class BridgeWire:
         key = self.key(topic)
         return f"{key}/@adv/pub/**{_ANY_KEY}", f"@/*/@ros2_pub_cache/{key}{_ANY_KEY}"
 
-    def read_attachment(self, attachment: bytes) -> tuple[str, int] | None:  # noqa: ARG002
-        """`Wire.read_attachment`; a bridge's numbers are those of Zenoh's advanced publishers."""
-        return None
-
 
 class RmwWire:
     """Messages from nodes over rmw_zenoh, in one domain."""
-
-    has_attachments = True
 
     def __init__(self, domain: int = 0) -> None:
         self.domain = domain

@@ -129,9 +129,9 @@ class Wanted:
 
     ``what`` is None for everything. ``room`` is the Place that it is in, ``near`` a point ``X,Y``
     in metres, or an Object or Place, by any of its names; so is ``start``, from which the way over
-    driven ground counts instead of the straight line. Times are robot seconds since the epoch:
-    last seen at ``seen_since`` or later, and before ``not_seen_since``. There are at most ``top``
-    answers, Objects that were seen once among them only with ``every``.
+    driven ground counts instead of the straight line. Times are ISO 8601, or robot seconds since
+    the epoch: last seen at ``seen_since`` or later, and before ``not_seen_since``. There are at
+    most ``top`` answers, Objects that were seen once among them only with ``every``.
     """
 
     what: str | None = None
@@ -140,8 +140,8 @@ class Wanted:
     start: str | None = None
     missing: bool = False
     moved: bool = False
-    seen_since: float | None = None
-    not_seen_since: float | None = None
+    seen_since: float | str | None = None
+    not_seen_since: float | str | None = None
     top: int = 10
     every: bool = False
 
@@ -238,6 +238,9 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
     ways = None if wanted.start is None else _Ways(view, spot_of(wanted.start, things))
     match, objects = _meant(view, wanted.what, things)
     classes = tuple(sorted({each.class_name for each in objects}))
+    since, before = _seconds(wanted.seen_since), _seconds(wanted.not_seen_since)
+    objects = [o for o in objects if since is None or o.last_seen >= since]
+    objects = [o for o in objects if before is None or o.last_seen < before]
     found = [each for each in objects if _is_wanted(each, wanted, room)]
     kept = found
     if match != "id" and not wanted.every:
@@ -261,11 +264,13 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
     return FoundObjects(match, classes, len(kept), len(found) - len(kept), tuple(answers))
 
 
-def robot_seconds(text: str) -> float:
-    """An ISO time in seconds since the epoch. Raises MisuseError."""
-    time_ns = time_of(text)
+def _seconds(time: float | str | None) -> float | None:
+    """A time in seconds since the epoch. Raises MisuseError for a text that is not ISO 8601."""
+    if not isinstance(time, str):
+        return time
+    time_ns = time_of(time)
     if time_ns is None:
-        raise MisuseError(f"{text!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
+        raise MisuseError(f"{time!r} is no time; give it with its date, as 2026-03-24T13:00:00Z")
     return time_ns / 1e9
 
 
@@ -330,11 +335,7 @@ def _is_wanted(each: ObjectRecord, wanted: Wanted, room: PlaceOrdinal | None) ->
         return False
     if wanted.missing and each.missing_in is None:
         return False
-    if wanted.moved and not each.relocations:
-        return False
-    if wanted.seen_since is not None and each.last_seen < wanted.seen_since:
-        return False
-    return wanted.not_seen_since is None or each.last_seen < wanted.not_seen_since
+    return not wanted.moved or bool(each.relocations)
 
 
 class _Ways:

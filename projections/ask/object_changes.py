@@ -152,17 +152,20 @@ def became(
     is_forward = first.next_offset <= second.next_offset
     found = object_changes(before, after, changed, joined, is_forward=is_forward)
     later = second if is_forward else first
+    records = {each.object_id: each for each in later.objects.values()} if found.missing else {}
     return replace(
-        found, missing=tuple(_checked(later, is_forward, each) for each in found.missing)
+        found,
+        missing=tuple(
+            each
+            if not each.sure or each.back is is_forward
+            else _checked(later, records[each.after.object_id], each)
+            for each in found.missing
+        ),
     )
 
 
-def _checked(later: MapView, is_forward: bool, absence: ObjectAbsence) -> ObjectAbsence:
-    """An absence, sure only where the keyframes of the later map leave no doubt."""
-    if not absence.sure or absence.back is is_forward:
-        return absence
-    wanted = absence.after.object_id
-    record = next(each for each in later.objects.values() if each.object_id == wanted)
+def _checked(later: MapView, record: ObjectRecord, absence: ObjectAbsence) -> ObjectAbsence:
+    """An absence of an Object of the later map, sure only if its keyframes leave no doubt."""
     seen = {keyframe.offset: keyframe for keyframe in later.sightings(record)}
     if any(keyframe.run == record.missing_in for keyframe in seen.values()):
         return replace(absence, sure=False)

@@ -171,7 +171,7 @@ def test_missing_numbers_are_losses_of_their_publisher(
         send_all(node, drive(3))
         node.lose("/tf", 4)
         node.send("/tf", tf())
-        with rmw.node(endpoint, 3) as other:  # its numbers begin anew
+        with rmw.node(endpoint, 3) as other:  # its sequence numbers start at 1 again
             other.advertise("/tf", TF)
             wait_for_recorder(other, "/tf")
             other.send("/tf", tf())
@@ -309,7 +309,7 @@ def test_what_may_come_later_is_recorded_and_other_robots_are_not(
         "/tf_static",
     )
     assert (found.grids, stream.classes, stream.pose) == (["/map"], (), None)
-    assert found.uses["/tf"] == "transforms, from when somebody publishes them"
+    assert found.uses["/tf"] == "transforms, as soon as it has a publisher"
 
 
 def test_the_search_ends_when_it_is_stopped(connected: Sessions) -> None:

@@ -56,7 +56,7 @@ def test_moved_missing_and_new_are_told_apart() -> None:
 
 
 def test_what_the_later_run_saw_once_more_is_not_surely_missing() -> None:
-    """The look may be of another thing in its place, so nobody knows."""
+    """The later run's only detection may be of another plant at that spot, so it is not sure."""
     glimpse = next(
         document
         for document in run("b", ROOM)

@@ -1,4 +1,5 @@
-"""Record messages of a zenoh-bridge-ros2dds verbatim, and the envelopes that they complete.
+"""Record messages of ROS verbatim, of a zenoh-bridge-ros2dds or of nodes over rmw_zenoh, and the
+envelopes that they complete.
 
 Zenoh's threads put messages into the queue and note tokens of types. The writer thread
 gives the messages to `Bridge.take`, which finds the type of each and returns what is to be
@@ -66,7 +67,8 @@ class _Held(NamedTuple):
 
 
 class Bridge:
-    """The topics of a bridge that are recorded, with the types and held messages of each.
+    """The topics that are recorded of a bridge, or of nodes, with the types and held messages of
+    each. ``wire`` is how their messages come.
 
     Only the writer thread changes it, except by `note_token`. ``topics`` are all that are recorded,
     also those from which ``recording`` makes no envelope. ``cut`` cuts the crops of detections that

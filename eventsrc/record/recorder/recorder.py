@@ -111,7 +111,7 @@ class Recorder:
                     key,
                     self._receive_bridged,
                     in_order=True,
-                    read_attachment=wire.read_attachment if wire.has_attachments else None,
+                    read_attachment=wire.read_attachment,
                 ),
                 session.subscribe_heartbeats(key, self._queue.put_heartbeat),
             ]
@@ -127,7 +127,7 @@ class Recorder:
                 selector,
                 timeout_s=_CACHE_TIMEOUT_S,
                 most=_MAX_CACHED,
-                read_attachment=wire.read_attachment if wire.has_attachments else None,
+                read_attachment=wire.read_attachment,
             ):
                 self._receive_bridged(message)
 

@@ -170,8 +170,10 @@ class Session:
             replies = self.raw.get(selector, timeout=timeout_s)
         samples = (reply.ok for reply in replies)
         for sample in itertools.islice((sample for sample in samples if sample is not None), most):
-            number = read_attachment and sequence_number(sample, read_attachment)
-            yield Received(str(sample.key_expr), sample.payload.to_bytes(), number or None)
+            number = None
+            if read_attachment is not None:
+                number = sequence_number(sample, read_attachment)
+            yield Received(str(sample.key_expr), sample.payload.to_bytes(), number)
 
     def send(self, key: str, payload: bytes) -> None:
         """Send one message without blocking; it is dropped if the network is full."""

@@ -49,21 +49,17 @@ def model_option(panel: str) -> typer.models.OptionInfo:
 
 def heights_option(panel: str) -> typer.models.OptionInfo:
     """``--heights``."""
-    option: typer.models.OptionInfo = typer.Option(
-        "--heights",
-        help="State the robot's height in envelopes; it separates floors.",
-        rich_help_panel=panel,
-    )
-    return option
+    return _flag(panel, "--heights", "State the robot's height in envelopes; it separates floors.")
 
 
 def keep_crops_option(panel: str) -> typer.models.OptionInfo:
     """``--keep-crops``."""
-    option: typer.models.OptionInfo = typer.Option(
-        "--keep-crops",
-        help="Keep the crop of each detection, cut from its picture; needs mapfold[detector].",
-        rich_help_panel=panel,
-    )
+    text = "Keep the crop of each detection, cut from its picture; needs mapfold[detector]."
+    return _flag(panel, "--keep-crops", text)
+
+
+def _flag(panel: str, name: str, text: str) -> typer.models.OptionInfo:
+    option: typer.models.OptionInfo = typer.Option(name, help=text, rich_help_panel=panel)
     return option
 
 

@@ -16,14 +16,14 @@ from eventsrc.log import LogReader
 from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
-from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find, robot_seconds
+from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
 from projections.map.naming import ShortIds, things_of
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 
 from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
-from .options import Databases, JsonOption
+from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument
 from .terminal import display, emit, say
 
 
@@ -56,21 +56,11 @@ ClearanceOption = Annotated[
 class AskedMap(FoldSettings):
     """The map that is asked: a log folded to a point, or with ``--db`` that of the databases."""
 
-    log: Annotated[
-        Path | None,
-        typer.Argument(metavar="LOG", help="The log's folder; leave it out with --db."),
-    ] = None
+    log: LogOrDbArgument = None
     at: FoldToOption = "end"
     known_at: KnownAtOption = None
     no_cache: NoCacheOption = False
-    db: Annotated[
-        str | None,
-        typer.Option(
-            "--db",
-            metavar="URL",
-            help="Ask this database's live map, not a log; '' is the embedded server.",
-        ),
-    ] = None
+    db: LiveDbOption = None
 
     def words(self, *given: str | None) -> list[str | None]:
         """The arguments after LOG; with ``--db`` LOG is the first of them. Raises MisuseError."""
@@ -206,8 +196,8 @@ def find_things(
         start=start,
         missing=missing,
         moved=moved,
-        seen_since=None if seen_since is None else robot_seconds(seen_since),
-        not_seen_since=None if not_seen_since is None else robot_seconds(not_seen_since),
+        seen_since=seen_since,
+        not_seen_since=not_seen_since,
         top=top,
         every=every,
     )

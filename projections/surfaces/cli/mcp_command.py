@@ -1,7 +1,6 @@
 """``mapfold mcp``: the map for agents, over stdin and stdout or over HTTP."""
 
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,7 +8,7 @@ import typer
 from eventsrc.base.errors import MisuseError
 
 from .folded_log import FoldSettings, NoCacheOption
-from .options import ZenohClient, user_at_host
+from .options import LiveDbOption, LogOrDbArgument, VectorsOption, ZenohClient, user_at_host
 from .serve import HttpEndpoint, HttpOptions
 from .signals import stop_on_signals
 from .terminal import say
@@ -17,24 +16,9 @@ from .terminal import say
 
 def mcp(
     *,
-    log: Annotated[
-        Path | None,
-        typer.Argument(metavar="LOG", help="The log's folder; leave it out with --db."),
-    ] = None,
-    db: Annotated[
-        str | None,
-        typer.Option(
-            "--db",
-            metavar="URL",
-            help="Ask this database's live map, not a log; '' is the embedded server.",
-        ),
-    ] = None,
-    vector_db: Annotated[
-        str | None,
-        typer.Option(
-            "--vector-db", metavar="URL", help="The database of the vectors [default: --db]."
-        ),
-    ] = None,
+    log: LogOrDbArgument = None,
+    db: LiveDbOption = None,
+    vector_db: VectorsOption = None,
     http: Annotated[
         str | None,
         typer.Option(

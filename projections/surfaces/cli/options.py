@@ -44,6 +44,21 @@ VectorDbOption = Annotated[
         help="PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
     ),
 ]
+LogOrDbArgument = Annotated[
+    Path | None, typer.Argument(metavar="LOG", help="The log's folder; leave it out with --db.")
+]
+LiveDbOption = Annotated[
+    str | None,
+    typer.Option(
+        "--db",
+        metavar="URL",
+        help="Ask this database's live map, not a log; '' is the embedded server.",
+    ),
+]
+VectorsOption = Annotated[
+    str | None,
+    typer.Option("--vector-db", metavar="URL", help="The database of the vectors [default: --db]."),
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 
 from .folded_log import CachedLog, FoldSettings, W, point
-from .options import ZenohClient
+from .options import VectorsOption, ZenohClient
 from .signals import stop_on_signals
 from .terminal import say
 
@@ -73,12 +73,7 @@ def ui(
         str | None,
         typer.Option(metavar="URL", help="Show how far behind this database is."),
     ] = None,
-    vector_db: Annotated[
-        str | None,
-        typer.Option(
-            "--vector-db", metavar="URL", help="The database of the vectors [default: --db]."
-        ),
-    ] = None,
+    vector_db: VectorsOption = None,
     client: ZenohClient,
     source: CachedLog,
 ) -> None:

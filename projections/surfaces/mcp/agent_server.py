@@ -20,7 +20,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from projections.ask.driven_ground import CLEARANCE_M
-from projections.ask.find import Wanted, find, robot_seconds
+from projections.ask.find import Wanted, find
 from projections.ask.room_and_path import goal_of, path, room
 from projections.edit.make import name_place, undo
 from projections.localize.relocalize import rank, read_question
@@ -137,7 +137,7 @@ def _guarded(
 
 
 class _Tools:
-    """What only reads. The docstrings are what an agent is told."""
+    """The read-only tools. Their docstrings are the descriptions that an agent gets."""
 
     def __init__(self, maps: LogMaps | LiveMaps) -> None:
         self.lock = threading.Lock()
@@ -169,8 +169,8 @@ class _Tools:
             start=start,
             missing=missing,
             moved=moved,
-            seen_since=None if seen_since is None else robot_seconds(seen_since),
-            not_seen_since=None if not_seen_since is None else robot_seconds(not_seen_since),
+            seen_since=seen_since,
+            not_seen_since=not_seen_since,
             top=top,
             every=every,
         )
@@ -309,7 +309,7 @@ class _Tools:
 
 
 def _edits(maps: LogMaps) -> tuple[Callable[..., Any], ...]:
-    """What records commands."""
+    """The tools that record commands."""
 
     def name_a_place(
         place: Annotated[_Text, Field(description="Its id, name or type.")],

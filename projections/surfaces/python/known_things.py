@@ -20,7 +20,7 @@ class _Thing(dict[str, Any]):
 
 
 class KnownPlace(_Thing):
-    """A Place; metres. What is not known, such as a name that nobody gave it, is None."""
+    """A Place, in metres. Unknown values, such as the name of an unnamed Place, are None."""
 
     place_id: str
     centroid_x: float
@@ -39,7 +39,7 @@ class KnownPlace(_Thing):
 
 
 class KnownObject(_Thing):
-    """An Object; metres. What is not known, such as an estimated position, is None."""
+    """An Object, in metres. Unknown values, such as an estimated position, are None."""
 
     object_id: str
     class_name: str

@@ -17,7 +17,7 @@ from eventsrc.log.seek import resolve
 from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_views
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
-from projections.ask.find import FoundObjects, Wanted, find, robot_seconds
+from projections.ask.find import FoundObjects, Wanted, find
 from projections.ask.room_and_path import DrivenPath, Room, goal_of, path, room
 from projections.ask.what_changed import MapChanges, map_changes
 from projections.fold.corrections import Corrections
@@ -153,8 +153,8 @@ class Map:
                 start=None if start is None else _text(start),
                 missing=missing,
                 moved=moved,
-                seen_since=_seconds(seen_since),
-                not_seen_since=_seconds(not_seen_since),
+                seen_since=seen_since,
+                not_seen_since=not_seen_since,
                 top=top,
                 every=every,
             ),
@@ -262,10 +262,6 @@ class Map:
 
 def _text(spot: str | tuple[float, float]) -> str:
     return spot if isinstance(spot, str) else f"{spot[0]},{spot[1]}"
-
-
-def _seconds(time: float | str | None) -> float | None:
-    return robot_seconds(time) if isinstance(time, str) else time
 
 
 def _cell(value: object) -> str:

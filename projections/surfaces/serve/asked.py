@@ -20,7 +20,7 @@ from eventsrc.base.text import advised
 from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M
-from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find, robot_seconds
+from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find
 from projections.ask.room_and_path import goal_of, path, room
 from projections.ask.what_changed import ChangeKind
 from projections.fold.deltas import ObjectOrdinal
@@ -125,8 +125,8 @@ class FindQuery(BaseModel):
                 start=self.start,
                 missing=self.missing == "true",
                 moved=self.moved == "true",
-                seen_since=_seconds(self.seen_since),
-                not_seen_since=_seconds(self.not_seen_since),
+                seen_since=self.seen_since,
+                not_seen_since=self.not_seen_since,
                 top=until,
                 every=self.every == "true",
             )
@@ -278,10 +278,6 @@ def object_question(name: str) -> MapQuestion:
         return answer_of(view, view.all_objects[found], "id").document()
 
     return answer
-
-
-def _seconds(time: str | None) -> float | None:
-    return None if time is None else robot_seconds(time)
 
 
 _Place = Annotated[str | None, Field(description="Where it is, or, missing, was.")]
