@@ -16,6 +16,7 @@ The socket folder is in ``/tmp``, where every user may make folders, so no name 
 import contextlib
 import os
 import pwd
+import shutil
 import stat
 import subprocess
 import tempfile
@@ -40,14 +41,24 @@ def _ensure_system_user() -> None:
     try:
         pwd.getpwnam(SYSTEM_USER)
     except KeyError:
-        command: Sequence[str] = ("useradd", "--system", "--user-group", SYSTEM_USER)
+        command: Sequence[str] = (_useradd(), "--system", "--user-group", SYSTEM_USER)
         try:
             subprocess.run(command, check=True, capture_output=True)  # noqa: S603
         except (OSError, subprocess.CalledProcessError) as error:
+            with contextlib.suppress(KeyError):
+                pwd.getpwnam(SYSTEM_USER)
+                return  # another process has made it meanwhile
             raise EmbeddedServerError(
                 f"PostgreSQL does not run as root and the system user {SYSTEM_USER} cannot be made"
                 f" ({error}); run mapfold as another user, or give a database with --db"
             ) from None
+
+
+def _useradd() -> str:
+    """The program that makes users, also where the PATH lacks the folders of an administrator's
+    programs, as under cron."""
+    path = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
+    return shutil.which("useradd", path=path) or "useradd"
 
 
 def server_uid() -> int | None:

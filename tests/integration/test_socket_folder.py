@@ -17,6 +17,7 @@ import psycopg
 import pytest
 
 from projections.fold.map_errors import DatabaseUnavailable, EmbeddedServerError
+from projections.postgres import server_user
 from projections.postgres.connection import connect
 from projections.postgres.embedded import EmbeddedServer
 from tests.support.servers import furnish
@@ -261,6 +262,21 @@ def test_another_users_data_folder_is_refused(short_home: Path) -> None:
     with pytest.raises(EmbeddedServerError, match=refused):
         _ = EmbeddedServer(short_home).running
     os.chown(server.data, owner, owner)
+
+
+@needs_root
+def test_the_user_of_the_server_is_made_where_the_path_lacks_useradd(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    name = f"pgserver-test-{os.getpid()}"
+    monkeypatch.setattr(server_user, "SYSTEM_USER", name)
+    with monkeypatch.context() as patched:
+        patched.setenv("PATH", "/bin-of-nobody")
+        try:
+            assert server_user.server_identity()["user"] == name
+            assert pwd.getpwnam(name).pw_uid == server_user.server_uid()
+        finally:
+            subprocess.run(["/usr/sbin/userdel", name], check=True, capture_output=True)
 
 
 @pytest.mark.slow
