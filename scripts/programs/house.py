@@ -125,7 +125,7 @@ def jobs() -> Iterator[tuple[str, int, int, int, int]]:
         work = Path(folder)
         copytree(ROOT / "logs" / "sample", work / "log")
         payload = subprocess.run(
-            [sys.executable, "-c", RUN, "log", "cat", "log", "--json"],
+            [sys.executable, "-c", RUN, "log", "cat", "log", "--json", "--key", "tb/detections"],
             cwd=work, capture_output=True, check=True, text=True,
         ).stdout.partition("\n")[0]  # fmt: skip
         (work / "one.jsonl").write_text(json.dumps(json.loads(payload)["payload"]) + "\n", "utf-8")

@@ -27,11 +27,10 @@ import tempfile
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, fields
 from itertools import count
 from pathlib import Path
-from typing import Self
 
 from eventsrc.base.errors import TransportError
 from eventsrc.envelope.commands import Command, parse_command
@@ -53,6 +52,7 @@ LONGEST_LIFE_S = 0.6
 LONGEST_RECOVERY_S = 0.06
 PATIENCE_S = 120.0
 COMMANDS_A_SECOND = 8.0
+FAR = Offset(10**9)
 EXPECTED = ("duplicate", "loss")
 """Findings about envelopes that were sent again, and about keyframes that came late."""
 KEY = "tb/detections"
@@ -169,9 +169,7 @@ class Editor:
                 given: Command = name_place(self._rng.randrange(60), f"room {number}")
                 while not self._stop.is_set():
                     try:
-                        answer = send_command(
-                            session, self._log_id, given, Offset(10**9), timeout_s=0.5
-                        )
+                        answer = send_command(session, self._log_id, given, FAR, timeout_s=0.5)
                     except TransportError:
                         self._stop.wait(0.05)  # no recorder now; the answer may be lost too
                         continue
@@ -225,8 +223,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 class Ordeal:
-    """One log behind a router, its robot, its editor, and one recorder after the other; a context
-    manager."""
+    """One log behind a router, its robot, its editor, and one recorder after the other."""
 
     def __init__(
         self, endpoint: str, folder: Path, rate: float, rng: random.Random, name: str = "a"
@@ -333,12 +330,6 @@ class Ordeal:
             self._editor.finish()
         self._robot.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def kill_side_by_side(
     folder: Path, times: int, *, lanes: int = 1, rate: float = 300.0, seed: str
@@ -353,7 +344,8 @@ def kill_side_by_side(
             own = folder / f"lane-{lane}"
             own.mkdir()
             rng = random.Random(f"{seed}/{lane}")
-            ordeals.append(stack.enter_context(Ordeal(endpoint, own, rate, rng, f"r{lane}")))
+            ordeal = Ordeal(endpoint, own, rate, rng, f"r{lane}")
+            ordeals.append(stack.enter_context(closing(ordeal)))
         with ThreadPoolExecutor(lanes) as threads:
             for part in threads.map(Ordeal.kill, ordeals, shares):
                 tally.add(part)
@@ -378,9 +370,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--batch", type=int, default=100, help="kills in a batch")
     parser.add_argument("--lanes", type=int, default=4, help="recorders side by side")
-    parser.add_argument(
-        "--rate", type=float, default=30.0, help="keyframes a second, of each robot"
-    )
+    parser.add_argument("--rate", type=float, default=30.0, help="keyframes a second of a robot")
     parser.add_argument("--seed", type=int, default=20260324)
     parser.add_argument("--progress", type=Path, help="file of finished batches; it goes on there")
     args = parser.parse_args()
@@ -390,13 +380,8 @@ def main() -> int:
     print(f"seed {args.seed}, after {batch} batches: {total}", flush=True)
     while total.kills < args.kills and total.good:
         folder = Path(tempfile.mkdtemp(prefix="mapfold-kills-"))
-        tally = kill_side_by_side(
-            folder,
-            min(args.batch, args.kills - total.kills),
-            lanes=args.lanes,
-            rate=args.rate,
-            seed=f"{args.seed}/{batch}",
-        )
+        share, seed = min(args.batch, args.kills - total.kills), f"{args.seed}/{batch}"
+        tally = kill_side_by_side(folder, share, lanes=args.lanes, rate=args.rate, seed=seed)
         total.add(tally)
         batch += 1
         if args.progress is not None:
