@@ -14,21 +14,11 @@ from typing import Any, Final
 
 from pydantic import BaseModel, TypeAdapter
 
+from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import COMMAND
 from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.envelope.occupancy_map import OccupancyMapEvent
 from eventsrc.envelope.readers import EnvelopeModel
-from eventsrc.envelope.system_events import (
-    COMMAND_KEY,
-    EMBEDDINGS_KEY,
-    LOSS_KEY,
-    MAP_KEY,
-    REJECTED_KEY,
-    Embeddings,
-    Loss,
-    RejectedPayload,
-    is_system_key,
-)
 
 from .event import MessageFormat
 from .mcap_records import Channel, Schema
@@ -40,18 +30,18 @@ events are read and not folded."""
 _VERSION = re.compile(r"[0-9]{1,9}")
 
 _SYSTEM_MODELS: dict[str, type[BaseModel]] = {
-    REJECTED_KEY: RejectedPayload,
-    LOSS_KEY: Loss,
-    MAP_KEY: OccupancyMapEvent,
-    EMBEDDINGS_KEY: Embeddings,
+    system_events.REJECTED_KEY: system_events.RejectedPayload,
+    system_events.LOSS_KEY: system_events.Loss,
+    system_events.MAP_KEY: OccupancyMapEvent,
+    system_events.EMBEDDINGS_KEY: system_events.Embeddings,
 }
 
 
 def schema_of(key: str) -> tuple[str, bytes]:
     """Name and JSON schema text of the payloads under ``key``."""
-    if not is_system_key(key):
+    if not system_events.is_system_key(key):
         return "mapfold.Envelope", _json_schema(EnvelopeModel)
-    if key == COMMAND_KEY:
+    if key == system_events.COMMAND_KEY:
         return "mapfold.Command", _json_schema(COMMAND)
     model = _SYSTEM_MODELS.get(key)
     if model is None:
@@ -114,7 +104,7 @@ def message_format(channel: Channel, schema: Schema | None) -> MessageFormat:
 
 def carries_envelopes(channel: Channel) -> bool:
     """Whether the messages of a channel are envelopes, of any version."""
-    return not (is_system_key(channel.topic) or is_verbatim(channel))
+    return not (system_events.is_system_key(channel.topic) or is_verbatim(channel))
 
 
 _Schema = dict[str, Any]

@@ -19,18 +19,6 @@ from eventsrc.envelope.model import Offset
 from . import mcap_records as _mcap
 from .channels import NO_SCHEMA, is_verbatim
 from .format import end_in, is_metadata_of
-from .mcap_records import (
-    BadRecord,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Metadata,
-    MetadataIndex,
-    Opcode,
-    Schema,
-    Statistics,
-)
 from .segment import ChunkRef, SegmentFile
 
 SEAL_METADATA = "mapfold.seal"
@@ -47,8 +35,8 @@ class SealedFile(SegmentFile):
 
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, _mcap.Channel] = {}
+        self.schemas: dict[int, _mcap.Schema] = {}
         """The schemas of verbatim messages, by id."""
         try:
             self._read_summary()
@@ -62,28 +50,30 @@ class SealedFile(SegmentFile):
             self.close()
             raise
 
-    def channels_of(self, body: bytes) -> dict[int, Channel]:  # noqa: ARG002
+    def channels_of(self, body: bytes) -> dict[int, _mcap.Channel]:  # noqa: ARG002
         """All channels, from the summary."""
         return self.channels
 
-    def schemas_of(self, body: bytes) -> dict[int, Schema]:  # noqa: ARG002
+    def schemas_of(self, body: bytes) -> dict[int, _mcap.Schema]:  # noqa: ARG002
         """All schemas of verbatim messages, from the summary."""
         return self.schemas
 
     def _read_summary(self) -> None:
         size = self.size()
         tail = os.pread(self._fd, _mcap.TAIL_BYTES, max(0, size - _mcap.TAIL_BYTES))
-        if not tail.endswith(_mcap.MAGIC) or tail[0] != Opcode.FOOTER:
-            raise BadRecord("no footer")
-        footer = _mcap.decode_as(Footer, tail[_mcap.FRAME.size :])
+        if not tail.endswith(_mcap.MAGIC) or tail[0] != _mcap.Opcode.FOOTER:
+            raise _mcap.BadRecord("no footer")
+        footer = _mcap.decode_as(_mcap.Footer, tail[_mcap.FRAME.size :])
         if not 0 < footer.summary_start <= size - _mcap.TAIL_BYTES:
-            raise BadRecord("the footer points outside the file")
+            raise _mcap.BadRecord("the footer points outside the file")
         length = size - _mcap.TAIL_BYTES - footer.summary_start
         if length > _mcap.MAX_SUMMARY_BYTES:
-            raise BadRecord(f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}")
+            raise _mcap.BadRecord(
+                f"a summary of {length:,} bytes, more than {_mcap.MAX_SUMMARY_BYTES:,}"
+            )
         summary = os.pread(self._fd, length, footer.summary_start)
         if crc32(tail[: _mcap.FOOTER_BYTES - 4], crc32(summary)) != footer.summary_crc:
-            raise BadRecord("the summary does not match its CRC")
+            raise _mcap.BadRecord("the summary does not match its CRC")
         self._parse_summary(summary, size)
 
     def _parse_summary(self, summary: bytes, size: int) -> None:
@@ -92,27 +82,27 @@ class SealedFile(SegmentFile):
         statistics, seal = None, None
         definitions = 0
         for opcode, content in _mcap.records(summary):
-            if opcode == Opcode.CHUNK_INDEX:
-                indexes.append(_chunk_position(_mcap.decode_as(ChunkIndex, content), size))
+            if opcode == _mcap.Opcode.CHUNK_INDEX:
+                indexes.append(_chunk_position(_mcap.decode_as(_mcap.ChunkIndex, content), size))
                 if len(indexes) > _MAX_CHUNKS:
-                    raise BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
-            elif opcode == Opcode.SCHEMA:
+                    raise _mcap.BadRecord(f"an index of more than {_MAX_CHUNKS:,} chunks")
+            elif opcode == _mcap.Opcode.SCHEMA:
                 schemas.append(content)
-            elif opcode == Opcode.CHANNEL:
+            elif opcode == _mcap.Opcode.CHANNEL:
                 definitions += len(content)
                 _mcap.check_definitions(definitions)
-                channel = _mcap.decode_as(Channel, content)
+                channel = _mcap.decode_as(_mcap.Channel, content)
                 self.channels[channel.id] = channel
-            elif opcode == Opcode.STATISTICS:
-                statistics = _mcap.decode_as(Statistics, content)
-            elif opcode == Opcode.METADATA_INDEX:
-                index = _mcap.decode_as(MetadataIndex, content)
+            elif opcode == _mcap.Opcode.STATISTICS:
+                statistics = _mcap.decode_as(_mcap.Statistics, content)
+            elif opcode == _mcap.Opcode.METADATA_INDEX:
+                index = _mcap.decode_as(_mcap.MetadataIndex, content)
                 if is_metadata_of(SEAL_METADATA, index.name):
                     seal = self._metadata(index, size)
         if statistics is None or seal is None:
-            raise BadRecord("no statistics or no seal")
+            raise _mcap.BadRecord("no statistics or no seal")
         if not self.channels.keys() >= statistics.channel_message_counts.keys():
-            raise BadRecord("statistics of channels that nothing defines")
+            raise _mcap.BadRecord("statistics of channels that nothing defines")
         self._keep_schemas(schemas)
         self.statistics, self.seal = statistics, seal
         self.first_stamp_ns = int(seal["first_stamp_ns"])
@@ -125,22 +115,22 @@ class SealedFile(SegmentFile):
         if not wanted:
             return
         _mcap.check_definitions(sum(map(len, contents)))
-        schemas = (_mcap.decode_as(Schema, content) for content in contents)
+        schemas = (_mcap.decode_as(_mcap.Schema, content) for content in contents)
         self.schemas = {schema.id: schema for schema in schemas if schema.id in wanted}
 
-    def _metadata(self, index: MetadataIndex, size: int) -> dict[str, str]:
+    def _metadata(self, index: _mcap.MetadataIndex, size: int) -> dict[str, str]:
         if index.length > _mcap.MAX_DEFINITIONS_BYTES or index.offset + index.length > size:
-            raise BadRecord("the seal is out of bounds")
+            raise _mcap.BadRecord("the seal is out of bounds")
         record = os.pread(self._fd, index.length, index.offset)
         content = record[_mcap.FRAME.size :]
-        return _mcap.checked_metadata(_mcap.decode_as(Metadata, content))
+        return _mcap.checked_metadata(_mcap.decode_as(_mcap.Metadata, content))
 
     def _set_chunks(self, indexes: list[tuple[int, int, frozenset[int]]]) -> None:
         edges = sealed_edges(self.seal["chunk_edges"], self.base)
         if len(edges) != len(indexes) + 1:
-            raise BadRecord("the seal does not fit the index")
+            raise _mcap.BadRecord("the seal does not fit the index")
         if end_in(self.head, edges[-1]) != edges[-1]:
-            raise BadRecord("the seal does not fit the head")
+            raise _mcap.BadRecord("the seal does not fit the head")
         self.chunks = [
             ChunkRef(position, length, first, following, channels)
             for (position, length, channels), (first, following) in zip(
@@ -154,15 +144,15 @@ def sealed_edges(text: str, base: Offset) -> list[Offset]:
     ValueError."""
     edges = [Offset(base + int(number)) for number in text.split(",")]
     if edges[0] != base or any(one >= other for one, other in pairwise(edges)):
-        raise BadRecord("the chunk edges in the seal do not ascend")
+        raise _mcap.BadRecord("the chunk edges in the seal do not ascend")
     return edges
 
 
-def _chunk_position(index: ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
+def _chunk_position(index: _mcap.ChunkIndex, size: int) -> tuple[int, int, frozenset[int]]:
     """Position, length and channels of a chunk. Raises BadRecord if it is not in the file."""
     position, length = index.chunk_start_offset, index.chunk_length
     if position + length > size:
-        raise BadRecord(
+        raise _mcap.BadRecord(
             f"a chunk of {length:,} bytes at byte {position:,} of a file of {size:,} bytes"
         )
     return position, length, frozenset(index.message_index_offsets)
@@ -217,7 +207,7 @@ def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
 
 
 def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
-    if os.pread(fd, _DATA_END_BYTES, at) != _mcap.encode(DataEnd(crc)):
+    if os.pread(fd, _DATA_END_BYTES, at) != _mcap.encode(_mcap.DataEnd(crc)):
         return "the data section does not match its CRC"
     return None
 

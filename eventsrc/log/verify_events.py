@@ -28,6 +28,7 @@ from typing import Final, Literal, NamedTuple, TypeVar
 from pydantic import ValidationError
 
 from eventsrc.base.text import visible
+from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
 from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope.forms import read_envelope
@@ -35,16 +36,6 @@ from eventsrc.envelope.gaps import Gap, GapLedger, gap_of
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap, decode_map
-from eventsrc.envelope.system_events import (
-    COMMAND_KEY,
-    EMBEDDINGS_KEY,
-    LOSS_KEY,
-    MAP_KEY,
-    REJECTED_KEY,
-    ROS_KEY,
-    Loss,
-    RejectedPayload,
-)
 
 from .event import Event
 
@@ -184,10 +175,10 @@ def _read_recording(payload: bytes) -> object:
 
 
 _READERS: Final[dict[str, Callable[[bytes], object]]] = {
-    REJECTED_KEY: RejectedPayload.model_validate_json,
-    MAP_KEY: decode_map,
-    ROS_KEY: _read_recording,
-    EMBEDDINGS_KEY: decode_embeddings,
+    system_events.REJECTED_KEY: system_events.RejectedPayload.model_validate_json,
+    system_events.MAP_KEY: decode_map,
+    system_events.ROS_KEY: _read_recording,
+    system_events.EMBEDDINGS_KEY: decode_embeddings,
 }
 """By key, what reads events that need no further check."""
 
@@ -226,13 +217,13 @@ class EventFindings:
 
     def check(self, event: Event) -> None:
         """Check the next event."""
-        if event.key != MAP_KEY:
+        if event.key != system_events.MAP_KEY:
             if event.logged_ns < self._logged_ns:
                 self._add("time", "", event.offset, _BACKWARDS)
             self._logged_ns = event.logged_ns
-        if event.key == LOSS_KEY:
+        if event.key == system_events.LOSS_KEY:
             self._check_loss(event)
-        elif event.key == COMMAND_KEY:
+        elif event.key == system_events.COMMAND_KEY:
             self._check_command(event)
         elif event.key in _READERS:
             self._read(_READERS[event.key], event)
@@ -254,7 +245,7 @@ class EventFindings:
             self._add("schema", what, event.offset, what)
 
     def _check_loss(self, event: Event) -> None:
-        loss = self._read(Loss.model_validate_json, event)
+        loss = self._read(system_events.Loss.model_validate_json, event)
         gap = None if loss is None else gap_of(loss)
         if gap is not None:
             self._gaps.add_report(event.offset, gap)

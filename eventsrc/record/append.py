@@ -14,26 +14,9 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from eventsrc.envelope import crops, grid_messages, ingest
 from eventsrc.envelope.cdr import is_cdr
-from eventsrc.envelope.crops import (
-    CROP_ENCODING,
-    CROP_SCHEMA,
-    CROP_SCHEMA_ENCODING,
-    CROP_SCHEMA_TEXT,
-)
 from eventsrc.envelope.forms import PendingEvent, check_envelopes, detect_version
-from eventsrc.envelope.grid_messages import (
-    NO_GRID,
-    is_grid_message,
-    names_grid,
-    read_grid_message,
-)
-from eventsrc.envelope.ingest import (
-    DEFAULT_MAX_PAYLOAD_BYTES,
-    CheckedEnvelope,
-    Rejected,
-    abbreviate,
-)
 from eventsrc.envelope.model import Offset, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap
 from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
@@ -42,7 +25,7 @@ from eventsrc.log import LogWriter, MessageFormat, NewEvent
 from .transport.config import key_fault
 
 CROP_FORMAT: Final = MessageFormat(
-    CROP_ENCODING, CROP_SCHEMA, CROP_SCHEMA_ENCODING, CROP_SCHEMA_TEXT
+    crops.CROP_ENCODING, crops.CROP_SCHEMA, crops.CROP_SCHEMA_ENCODING, crops.CROP_SCHEMA_TEXT
 )
 """The format of crops of detections in a log."""
 
@@ -53,7 +36,7 @@ class NewMap(NamedTuple):
     event: bytes
 
 
-Result = CheckedEnvelope | NewMap | Rejected
+Result = ingest.CheckedEnvelope | NewMap | ingest.Rejected
 
 
 class Checked(msgspec.Struct, frozen=True, gc=False):
@@ -65,7 +48,7 @@ class Checked(msgspec.Struct, frozen=True, gc=False):
     @property
     def stamp_ns(self) -> int | None:
         """The robot's time; None if the payload is no envelope or its version has no time."""
-        if not isinstance(self.result, CheckedEnvelope) or not has_keyframe_id(self.version):
+        if not isinstance(self.result, ingest.CheckedEnvelope) or not has_keyframe_id(self.version):
             return None
         return self.result.stamp_ns
 
@@ -76,7 +59,7 @@ def append_payload(
     payload: bytes,
     *,
     logged_ns: int | None = None,
-    max_bytes: int = DEFAULT_MAX_PAYLOAD_BYTES,
+    max_bytes: int = ingest.DEFAULT_MAX_PAYLOAD_BYTES,
 ) -> Result:
     """Append ``payload``, received under ``key``, and return the result of its validation.
 
@@ -96,7 +79,7 @@ def append_payload(
 def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
     """The event to append for a payload received under ``key``, by the result of its check."""
     version, result = checked.version, checked.result
-    if isinstance(result, Rejected):
+    if isinstance(result, ingest.Rejected):
         return rejected_event(key, payload, result.reason, logged_ns)
     if isinstance(result, NewMap):
         return map_event(result.event, logged_ns)
@@ -128,31 +111,33 @@ def check_payloads(
         PendingEvent(offset, key, logged_ns, payload, version or detect_version(payload))
         for offset, (key, payload) in enumerate(messages, first)
     ]
-    results: list[CheckedEnvelope | NewMap | Rejected] = [
+    results: list[ingest.CheckedEnvelope | NewMap | ingest.Rejected] = [
         *check_envelopes(pending, max_bytes=max_bytes)
     ]
     keys = {event.key for event in pending}  # usually one
     faults = {key: fault for key in keys if (fault := key_fault(key)) is not None}
     for index, event in enumerate(pending if faults else ()):
         if event.key in faults:
-            results[index] = Rejected(f"key {abbreviate(event.key)} {faults[event.key]}")
+            results[index] = ingest.Rejected(
+                f"key {ingest.abbreviate(event.key)} {faults[event.key]}"
+            )
     for index, result in enumerate(results):
-        if isinstance(result, Rejected) and pending[index].key not in faults:
+        if isinstance(result, ingest.Rejected) and pending[index].key not in faults:
             results[index] = _as_map(pending[index], max_bytes, are_grids) or result
     return [Checked(event.version, result) for event, result in zip(pending, results, strict=True)]
 
 
-def _as_map(event: PendingEvent, max_bytes: int, is_grid: bool) -> NewMap | Rejected | None:
+def _as_map(event: PendingEvent, max_bytes: int, is_grid: bool) -> NewMap | ingest.Rejected | None:
     """The occupancy map in a payload that is no envelope, or the reason why its grid is refused;
     None if the payload does not look like a grid."""
-    if len(event.payload) > max_bytes or not is_grid_message(event.payload):
+    if len(event.payload) > max_bytes or not grid_messages.is_grid_message(event.payload):
         return None
-    if is_cdr(event.payload) and not is_grid and not names_grid(event.key):
-        return Rejected(NO_GRID)
+    if is_cdr(event.payload) and not is_grid and not grid_messages.names_grid(event.key):
+        return ingest.Rejected(grid_messages.NO_GRID)
     try:
-        return NewMap(read_grid_message(event.payload, event.key).encode())
+        return NewMap(grid_messages.read_grid_message(event.payload, event.key).encode())
     except InvalidMap as error:
-        return Rejected(str(error))
+        return ingest.Rejected(str(error))
 
 
 def map_event(event: bytes, logged_ns: int) -> NewEvent:

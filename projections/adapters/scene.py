@@ -14,13 +14,8 @@ from eventsrc.envelope.model import RunId
 from projections.adapters import palette
 from projections.fold.deltas import Pose
 from projections.fold.exact import UM_PER_M
+from projections.map import records
 from projections.map.place_regions import Region, place_regions
-from projections.map.records import (
-    EstimatedPosition,
-    KeyframeRecord,
-    ObjectRecord,
-    PlaceRecord,
-)
 from projections.map.view import MapView
 
 if TYPE_CHECKING:
@@ -44,7 +39,7 @@ class ShownPlace:
     """A place: its region, where walls are known, and the corners of the hull of its poses, none
     where these are on one line; ``label`` is its name or likely type, and its id."""
 
-    record: PlaceRecord
+    record: records.PlaceRecord
     floor: str | None
     region: Region | None
     hull: tuple[Point, ...]
@@ -73,7 +68,7 @@ class ShownObject:
     """An object where it stands, on the floor that it was first seen from; ``label`` is its class,
     and whether it is missing."""
 
-    record: ObjectRecord
+    record: records.ObjectRecord
     floor: str | None
     missing: bool
 
@@ -123,7 +118,7 @@ def ways_of(view: MapView, places: Iterable[ShownPlace]) -> list[Way]:
     return [Way((by_ordinal[a], by_ordinal[b]), count) for a, b, count in view.edges()]
 
 
-def robot_of(view: MapView) -> KeyframeRecord | None:
+def robot_of(view: MapView) -> records.KeyframeRecord | None:
     """The latest keyframe that has a pose."""
     return next((k for k in reversed(view.keyframes) if k.pose is not None), None)
 
@@ -203,7 +198,7 @@ class ObjectGroup:
     class_name: str
     place: int | None
     missing: bool
-    members: tuple[ObjectRecord, ...]
+    members: tuple[records.ObjectRecord, ...]
 
     @property
     def obs_count(self) -> int:
@@ -223,9 +218,11 @@ class ObjectGroup:
         return sum(xs) / len(xs), sum(ys) / len(ys)
 
 
-def object_groups(objects: Iterable[ObjectRecord]) -> list[ObjectGroup]:
+def object_groups(objects: Iterable[records.ObjectRecord]) -> list[ObjectGroup]:
     """The objects by place and class; most seen first."""
-    grouped: dict[tuple[int | None, str, bool], list[list[ObjectRecord]]] = defaultdict(list)
+    grouped: dict[tuple[int | None, str, bool], list[list[records.ObjectRecord]]] = defaultdict(
+        list
+    )
     for found in objects:
         _add_to_group(grouped[found.place, found.class_name, found.missing_in is not None], found)
     groups = [
@@ -238,7 +235,7 @@ def object_groups(objects: Iterable[ObjectRecord]) -> list[ObjectGroup]:
 
 def objects_shown(
     view: MapView, *, everything: bool = False, min_observations: int = 1
-) -> list[ObjectRecord]:
+) -> list[records.ObjectRecord]:
     """The confirmed objects, or with ``everything`` all, that were seen at least that often."""
     return [
         found
@@ -247,7 +244,7 @@ def objects_shown(
     ]
 
 
-def two_sigma(at: EstimatedPosition) -> tuple[float, float, float]:
+def two_sigma(at: records.EstimatedPosition) -> tuple[float, float, float]:
     """The ellipse of two standard errors around an estimate: full width and height in metres, and
     the angle from the x axis to the width, in degrees."""
     half = (at.var_xx_um2 + at.var_yy_um2) / 2
@@ -257,7 +254,7 @@ def two_sigma(at: EstimatedPosition) -> tuple[float, float, float]:
     return wide, high, math.degrees(math.atan2(across, apart) / 2)
 
 
-def _add_to_group(clumps: list[list[ObjectRecord]], found: ObjectRecord) -> None:
+def _add_to_group(clumps: list[list[records.ObjectRecord]], found: records.ObjectRecord) -> None:
     """Add an object to the first clump whose first member is near, else begin another."""
     for clump in clumps:
         if math.dist(clump[0].spot, found.spot) <= _NEAR_M:
@@ -300,7 +297,7 @@ def _cut(name: str) -> str:
     return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 1]}…"
 
 
-def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
+def spot_of(keyframe: records.KeyframeRecord) -> tuple[float, float] | None:
     """A keyframe's position, None without a pose."""
     if keyframe.pose is None:
         return None
@@ -309,7 +306,7 @@ def spot_of(keyframe: KeyframeRecord) -> tuple[float, float] | None:
 
 def drives(view: MapView) -> list[tuple[RunId, list[tuple[float, float]]]]:
     """Per run its id and its positions, in keyframe_id order."""
-    by_run: dict[int, list[KeyframeRecord]] = defaultdict(list)
+    by_run: dict[int, list[records.KeyframeRecord]] = defaultdict(list)
     for keyframe in view.keyframes:
         by_run[keyframe.run].append(keyframe)
     result = []

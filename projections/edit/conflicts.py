@@ -6,15 +6,7 @@ from typing import TypeVar
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, visible
-from eventsrc.envelope.commands import (
-    Command,
-    DifferentObjects,
-    DropDetection,
-    DropObject,
-    ForgetKeyframes,
-    ForgetRun,
-    SameObject,
-)
+from eventsrc.envelope import commands
 from eventsrc.envelope.model import DetId, KeyframeId, RunId
 from projections.fold.corrections import Keyframe, RecordedCommand
 from projections.fold.pair_groups import ApartPairs
@@ -115,7 +107,7 @@ def check_same(current: MapToEdit, first: DetId, second: DetId) -> None:
     groups = [_made_one(corrections.same, det_id).keys() for det_id in (first, second)]
     object_of = partial(_object, current)
     for pair in _pairs_apart(corrections.different, (first, second), groups, object_of):
-        found = _objects_command(current, DifferentObjects, pair)
+        found = _objects_command(current, commands.DifferentObjects, pair)
         _refuse("these objects are kept apart", found, current)
 
 
@@ -123,13 +115,13 @@ def check_different(current: MapToEdit, first: DetId, second: DetId) -> None:
     """Raises EditRefused if the two observations are made one by commands."""
     pair = _made_one(current.corrections.same, first).get(second)
     if pair is not None:
-        found = _objects_command(current, SameObject, pair)
+        found = _objects_command(current, commands.SameObject, pair)
         _refuse("these objects are made one", found, current)
 
 
 def _objects_command(
     current: MapToEdit,
-    kind: type[SameObject] | type[DifferentObjects],
+    kind: type[commands.SameObject] | type[commands.DifferentObjects],
     pair: tuple[DetId, DetId],
 ) -> RecordedCommand | None:
     return _last(current, lambda c: isinstance(c, kind) and {*c.det_ids} == {*pair})
@@ -145,7 +137,9 @@ def check_not_dropped(current: MapToEdit, det_id: DetId) -> None:
     if det_id in current.corrections.dropped:
         found = _last(
             current,
-            lambda c: isinstance(c, DropObject | DropDetection) and det_id in c.det_ids,
+            lambda c: (
+                isinstance(c, commands.DropObject | commands.DropDetection) and det_id in c.det_ids
+            ),
         )
         if found is not None:
             raise EditRefused(f"detection {det_id!r} is left out already, by {describe(found)}")
@@ -153,7 +147,7 @@ def check_not_dropped(current: MapToEdit, det_id: DetId) -> None:
 
 def check_run_in_map(current: MapToEdit, run_id: str) -> None:
     """Raises EditRefused if the whole run is left out already."""
-    found = _last(current, lambda c: isinstance(c, ForgetRun) and c.run_id == run_id)
+    found = _last(current, lambda c: isinstance(c, commands.ForgetRun) and c.run_id == run_id)
     if found is not None:
         raise refusal(f"run {run_id!r} is left out of the map", found, current.reader.path)
 
@@ -163,7 +157,7 @@ def forgetting(current: MapToEdit, run_id: RunId, first: KeyframeId, last: Keyfr
     found = _last(
         current,
         lambda c: (
-            isinstance(c, ForgetKeyframes)
+            isinstance(c, commands.ForgetKeyframes)
             and c.run_id == run_id
             and c.first <= last
             and first <= c.last
@@ -172,6 +166,6 @@ def forgetting(current: MapToEdit, run_id: RunId, first: KeyframeId, last: Keyfr
     return "" if found is None else f"; some are left out already by {describe(found)}"
 
 
-def _last(current: MapToEdit, holds: Callable[[Command], bool]) -> RecordedCommand | None:
+def _last(current: MapToEdit, holds: Callable[[commands.Command], bool]) -> RecordedCommand | None:
     in_force = reversed(current.corrections.in_force)
     return next((each for each in in_force if holds(each.command)), None)

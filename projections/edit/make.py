@@ -37,18 +37,7 @@ from projections.fold.corrections import Keyframe, RecordedCommand, compile_corr
 from projections.fold.settings import Settings
 from projections.map.naming import NoSuchThing
 
-from .conflicts import (
-    EditRefused,
-    check_apart,
-    check_different,
-    check_join,
-    check_not_dropped,
-    check_run_in_map,
-    check_same,
-    describe,
-    forgetting,
-    refusal,
-)
+from . import conflicts
 from .current import MapToEdit
 
 _C = TypeVar("_C", bound=Command)
@@ -86,7 +75,7 @@ def name_place(current: MapToEdit, stamp: Stamp, place: str, name: str) -> NameP
     if any(known.place_id == name for known in current.view.all_places):
         raise MisuseError(f"{name!r} is the id of a place; give another name")
     if number is not None and current.view.all_places[number].name == name:
-        raise EditRefused(f"{current.place_name(anchor)} is called {name!r} already")
+        raise conflicts.EditRefused(f"{current.place_name(anchor)} is called {name!r} already")
     return build(NamePlace, stamp, place=_anchor(anchor), name=name)
 
 
@@ -94,15 +83,15 @@ def keep_apart(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Kee
     """The command that keeps two places apart."""
     pair = _two_places(current, first, second)
     if pair in current.corrections.apart:
-        raise EditRefused(f"{first} and {second} are kept apart already")
-    check_apart(current, pair)
+        raise conflicts.EditRefused(f"{first} and {second} are kept apart already")
+    conflicts.check_apart(current, pair)
     return build(KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
 
 
 def undo_merge(current: MapToEdit, stamp: Stamp, offset: int) -> UndoMerge:
     """The command that keeps apart the places merged at ``offset``."""
     anchors = merged_at(current, offset)
-    check_apart(current, anchors)
+    conflicts.check_apart(current, anchors)
     return build(
         UndoMerge, stamp, merge_offset=offset, places=tuple(_anchor(each) for each in anchors)
     )
@@ -112,11 +101,11 @@ def join(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Join:
     """The command that joins two places."""
     pair = _two_places(current, first, second)
     if current.place_of(pair[0]) == current.place_of(pair[1]):
-        raise EditRefused(
+        raise conflicts.EditRefused(
             f"{first} and {second} are one place already, {current.place_name(pair[0])}"
         )
     _check_floor(f"{first} and {second}", *(current.keyframes[each].floor for each in pair))
-    check_join(current, *pair)
+    conflicts.check_join(current, *pair)
     return build(Join, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
 
 
@@ -124,13 +113,15 @@ def _check_floor(what: str, one: str | None, other: str | None) -> None:
     """Raise EditRefused for things on two floors, which can never be one."""
     if one != other:
         names = " and ".join("none" if name is None else repr(name) for name in (one, other))
-        raise EditRefused(f"{what} are on two floors, {names}; nothing on two floors is ever one")
+        raise conflicts.EditRefused(
+            f"{what} are on two floors, {names}; nothing on two floors is ever one"
+        )
 
 
 def _two_places(current: MapToEdit, first: str, second: str) -> tuple[Keyframe, Keyframe]:
     pair = current.find_place(first), current.find_place(second)
     if pair[0] == pair[1]:
-        raise EditRefused(
+        raise conflicts.EditRefused(
             f"{first} and {second} are the same place; name two, or two keyframes of it "
             f"(`{advised('merges')}` lists which places merged)"
         )
@@ -145,13 +136,13 @@ def same_object(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Sa
     """The command that makes two objects one."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.object == other.object:
-        raise EditRefused(f"{first} and {second} are one object already")
+        raise conflicts.EditRefused(f"{first} and {second} are one object already")
     floors = (current.view.keyframes[each.keyframe].floor for each in (one, other))
     _check_floor(f"{first} and {second}", *floors)
-    check_same(current, one.det_id, other.det_id)
+    conflicts.check_same(current, one.det_id, other.det_id)
     is_voted = current.settings.fusion == "evidence"  # then classes of one object may differ
     if one.class_name != other.class_name and not is_voted:
-        raise EditRefused(
+        raise conflicts.EditRefused(
             f"{first} is of class {one.class_name!r}, {second} of {other.class_name!r}; only"
             " objects of one class can be one"
         )
@@ -165,13 +156,13 @@ def different_objects(
     det_ids."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.det_id == other.det_id:
-        raise EditRefused(
+        raise conflicts.EditRefused(
             f"{first} and {second} are the same observation; name two objects, or two of the "
             f"det_ids of one (`{advised('state', '--json')}` has them)"
         )
     if (one.det_id, other.det_id) in current.corrections.different:
-        raise EditRefused(f"{first} and {second} are kept apart already")
-    check_different(current, one.det_id, other.det_id)
+        raise conflicts.EditRefused(f"{first} and {second} are kept apart already")
+    conflicts.check_different(current, one.det_id, other.det_id)
     return build(DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))
 
 
@@ -187,14 +178,14 @@ def drop_detection(current: MapToEdit, stamp: Stamp, det_ids: Sequence[str]) -> 
     named = tuple(dict.fromkeys(map(DetId, det_ids)))
     for det_id in named:
         if det_id not in current.observations:
-            check_not_dropped(current, det_id)
+            conflicts.check_not_dropped(current, det_id)
             raise NoSuchThing("observation", det_id, current.observations)
     return build(DropDetection, stamp, det_ids=named)
 
 
 def forget_run(current: MapToEdit, stamp: Stamp, run_id: str) -> ForgetRun:
     """The command that leaves a run out of every fold."""
-    check_run_in_map(current, run_id)
+    conflicts.check_run_in_map(current, run_id)
     current.run(run_id)
     return build(ForgetRun, stamp, run_id=run_id)
 
@@ -210,10 +201,10 @@ def forget_keyframes(current: MapToEdit, stamp: Stamp, run_id: str, span: str) -
     first, last = KeyframeId(int(found[1])), KeyframeId(int(found[2]))
     if last < first:
         raise MisuseError(f"{span}: {first} is more than {last}; write it as {last}..{first}")
-    check_run_in_map(current, run_id)
+    conflicts.check_run_in_map(current, run_id)
     keyframes = current.run(run_id)
     if not any(first <= k.keyframe_id <= last for k in keyframes):
-        already = forgetting(current, RunId(run_id), first, last)
+        already = conflicts.forgetting(current, RunId(run_id), first, last)
         raise MisuseError(
             f"no keyframe of {run_id} in {span}{already}; {keyframes_of(current, run_id)}"
         )
@@ -250,7 +241,7 @@ def relabel(
     labels = {**listed, **given}
     named = current.corrections.labels
     if all(named.get(label, label) == name for label, name in labels.items()):
-        raise EditRefused("these labels have these names already")
+        raise conflicts.EditRefused("these labels have these names already")
     recorded = _recorded_labels(current)
     for label in given:
         if label not in recorded:
@@ -290,7 +281,7 @@ def _no_label(
     of = next((each for each in recorded if named.get(each) == label), None)
     if of is None:
         return NoSuchThing("label", label, recorded)
-    return EditRefused(
+    return conflicts.EditRefused(
         f"{label!r} is no label, but the name of {of!r}; `{of}={name}` gives that another name"
     )
 
@@ -298,7 +289,7 @@ def _no_label(
 def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> UseSettings:
     """The command that changes the settings of the map from here on."""
     if settings == (current.corrections.settings or Settings()):
-        raise EditRefused("these are the settings of the log already")
+        raise conflicts.EditRefused("these are the settings of the log already")
     plain = settings.model_dump()
     return build(UseSettings, stamp, settings=plain)
 
@@ -310,9 +301,9 @@ def undo(current: MapToEdit, stamp: Stamp, command_id: str) -> Undo:
         raise NoSuchThing("command", command_id, (c.command.command_id for c in current.commands))
     by = undone_by(current.commands).get(command_id)
     if by is not None:
-        raise EditRefused(
-            f"command {visible(command_id)} is undone already, by {describe(by)}; undo that to "
-            "restore it"
+        raise conflicts.EditRefused(
+            f"command {visible(command_id)} is undone already, by {conflicts.describe(by)}; undo"
+            " that to restore it"
         )
     return build(Undo, stamp, undone=command_id)
 
@@ -353,13 +344,13 @@ def merged_at(current: MapToEdit, offset: int) -> tuple[Keyframe, ...]:
     if not merged:
         for recorded in reversed(current.corrections.in_force):
             if recorded.command.kind == "join":
-                raise refusal(
+                raise conflicts.refusal(
                     f"the places of the merge at {offset} are joined", recorded, current.reader.path
                 )
     if len(merged) != 1:
         ids = current.view.place_id
         parts = "; ".join(" with ".join(str(ids(p)) for p in places) for places in merged)
-        raise EditRefused(
+        raise conflicts.EditRefused(
             f"{len(merged)} merges happened at offset {offset}: {parts}; say which with "
             f"`{advised('edit', current.reader.path, 'keep-apart', 'PLACE', 'PLACE')}`"
         )
@@ -370,7 +361,9 @@ def _check_not_undone(current: MapToEdit, offset: int) -> None:
     for recorded in current.corrections.in_force:
         command = recorded.command
         if isinstance(command, UndoMerge) and command.merge_offset == offset:
-            raise EditRefused(f"the merge at {offset} is undone already, by {describe(recorded)}")
+            raise conflicts.EditRefused(
+                f"the merge at {offset} is undone already, by {conflicts.describe(recorded)}"
+            )
 
 
 def _nothing_merged(current: MapToEdit, offset: int) -> str:

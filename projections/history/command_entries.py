@@ -8,17 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from eventsrc.base.text import counted
-from eventsrc.envelope.commands import (
-    Anchor,
-    CorrectPoses,
-    DifferentObjects,
-    Join,
-    KeepApart,
-    NamePlace,
-    Relabel,
-    SameObject,
-    UndoMerge,
-)
+from eventsrc.envelope import commands
 from eventsrc.envelope.model import FIRST_OFFSET, KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader
@@ -102,25 +92,25 @@ def _place_texts(
     ``end``."""
     command = recorded.command
     match command:
-        case NamePlace() if _place_of(history, command.place, moment) == place:
+        case commands.NamePlace() if _place_of(history, command.place, moment) == place:
             replaced = history.places[place].name(moment) != command.name
             yield f'named "{command.name}"' + (" until a later name," if replaced else "")
-        case KeepApart() | UndoMerge():
+        case commands.KeepApart() | commands.UndoMerge():
             own, others = _divided(history, command.places, place, moment)
             if own:
                 yield _apart_text(history, own, others, moment)
-        case Join():
+        case commands.Join():
             own, others = _divided(history, command.places, place, moment)
             if own:
                 yield _join_text(history, command, end)
-        case CorrectPoses():
+        case commands.CorrectPoses():
             moved = _moved(command, members.get(command.run_id, ()))
             if moved:
                 yield f"{counted(moved, 'keyframe')} of it moved"
 
 
 def _apart_text(
-    history: History, own: Sequence[Anchor], others: Sequence[Anchor], end: Offset
+    history: History, own: Sequence[commands.Anchor], others: Sequence[commands.Anchor], end: Offset
 ) -> str:
     """The text of a command that keeps anchors apart; ``own`` are in the explained place."""
     if others:
@@ -138,7 +128,7 @@ def _apart_text(
     return f"{text}, without effect here as no command divides a cell of core points,"
 
 
-def _join_text(history: History, command: Join, end: Offset) -> str:
+def _join_text(history: History, command: commands.Join, end: Offset) -> str:
     """The text of a join of anchors, with its effect after ``end`` events."""
     one, other = command.places
     text = f"joined {_both(command.places)}"
@@ -154,7 +144,7 @@ def _join_text(history: History, command: Join, end: Offset) -> str:
     return text
 
 
-def _both(anchors: Sequence[Anchor]) -> str:
+def _both(anchors: Sequence[commands.Anchor]) -> str:
     return " and ".join(f"{anchor.run_id}:{anchor.keyframe_id}" for anchor in anchors)
 
 
@@ -166,10 +156,12 @@ def object_commands(
     entries = []
     for recorded in history.corrections.in_force:
         command = recorded.command
-        if isinstance(command, SameObject | DifferentObjects) and own & set(command.det_ids):
-            word = "fused" if isinstance(command, SameObject) else "kept apart"
+        if isinstance(command, commands.SameObject | commands.DifferentObjects) and own & set(
+            command.det_ids
+        ):
+            word = "fused" if isinstance(command, commands.SameObject) else "kept apart"
             entries.append(maker.entry(recorded, f"{word} {' and '.join(command.det_ids)}"))
-        elif isinstance(command, Relabel):
+        elif isinstance(command, commands.Relabel):
             labels = history.corrections.labels
             given = [a for a, b in command.labels if b == class_name == labels[a] != a]
             if given:
@@ -191,11 +183,11 @@ def same_place_commands(
     entries = []
     for recorded in history.corrections.in_force:
         command = recorded.command
-        if not isinstance(command, KeepApart | UndoMerge | Join):
+        if not isinstance(command, commands.KeepApart | commands.UndoMerge | commands.Join):
             continue
         names = {_keyframe(anchor) for anchor in command.places}
         places = {_place_of(history, anchor, end) for anchor in command.places} - {None}
-        if isinstance(command, Join):
+        if isinstance(command, commands.Join):
             if asked <= names or (first == second and places == {first}):
                 entries.append(maker.entry(recorded, "joined"))
         elif asked <= names or (first != second and {first, second} <= places):
@@ -221,30 +213,32 @@ def _refusal_entry(history: History, refusal: RefusedMerge, place: PlaceOrdinal 
     )
 
 
-def _keyframe(anchor: Anchor) -> Keyframe:
+def _keyframe(anchor: commands.Anchor) -> Keyframe:
     return Keyframe(anchor.run_id, anchor.keyframe_id)
 
 
-def _place_of(history: History, anchor: Anchor, end: Offset) -> PlaceOrdinal | None:
+def _place_of(history: History, anchor: commands.Anchor, end: Offset) -> PlaceOrdinal | None:
     ordinal = history.keyframe_ordinals.get((anchor.run_id, anchor.keyframe_id))
     return None if ordinal is None else history.place_at(ordinal, end)
 
 
 def _divided(
-    history: History, anchors: Sequence[Anchor], place: PlaceOrdinal, end: Offset
-) -> tuple[list[Anchor], list[Anchor]]:
+    history: History, anchors: Sequence[commands.Anchor], place: PlaceOrdinal, end: Offset
+) -> tuple[list[commands.Anchor], list[commands.Anchor]]:
     """The anchors in a place, and the others."""
     own = [anchor for anchor in anchors if _place_of(history, anchor, end) == place]
     return own, [anchor for anchor in anchors if anchor not in own]
 
 
-def _are_apart(history: History, own: Sequence[Anchor], others: Sequence[Anchor]) -> bool:
+def _are_apart(
+    history: History, own: Sequence[commands.Anchor], others: Sequence[commands.Anchor]
+) -> bool:
     """Whether an own and another anchor are kept apart."""
     first, second = (map(_keyframe, anchors) for anchors in (own, others))
     return bool(history.corrections.apart.between(first, second))
 
 
-def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
+def _named(history: History, anchors: Sequence[commands.Anchor], end: Offset) -> str:
     """The places of anchors, or the keyframes that are in none."""
     named = (
         f"{anchor.run_id}:{anchor.keyframe_id}"
@@ -255,7 +249,7 @@ def _named(history: History, anchors: Sequence[Anchor], end: Offset) -> str:
     return ", ".join(dict.fromkeys(named))
 
 
-def _moved(command: CorrectPoses, keyframes: Collection[KeyframeId]) -> int:
+def _moved(command: commands.CorrectPoses, keyframes: Collection[KeyframeId]) -> int:
     """The number of keyframes, of some of the command's run, whose pose the command corrects."""
     correction = PoseCorrection.of(command)
     if command.transform is None:

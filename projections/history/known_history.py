@@ -16,16 +16,8 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError, LogPointError
 from projections.fold.settings import Settings
+from projections.map import naming
 from projections.map.fold import FoldedEvent, fold_events, new_map
-from projections.map.naming import (
-    Kind,
-    NoSuchThing,
-    SeveralThings,
-    ShortIds,
-    Thing,
-    thing_called,
-    things_of,
-)
 from projections.map.parsing import READ_AHEAD
 from projections.map.view import MapView
 from projections.store.history import History
@@ -35,17 +27,12 @@ from projections.store.history_records import Merge, ObjectMerge, RefusedMerge
 from projections.store.stored_view import StoredView
 from projections.store.timeline_cache import TimelineCache
 
+from . import names
 from .bisect import Search, Searcher
 from .command_entries import EntryMaker, object_commands, place_commands, same_place_commands
 from .condition_functions import CountIndex, HistoryFacts, Names
 from .conditions import Expression
 from .explanation import Explanation, explain_place, explain_same_place, with_entries
-from .names import (
-    find_keyframe,
-    id_of_place,
-    keyframe_ordinal,
-    things_at,
-)
 from .object_explanation import explain_object
 
 _Caused = TypeVar("_Caused", Merge, RefusedMerge, ObjectMerge)
@@ -88,7 +75,7 @@ class KnownHistory:
         self._recorder = HistoryRecorder(reader, settings, corrections, kept, progress)
         self._latest: StoredView | None = None
         self._index: tuple[History, CountIndex] | None = None
-        self._short: tuple[Offset, ShortIds] | None = None
+        self._short: tuple[Offset, naming.ShortIds] | None = None
         self._entries = EntryMaker(reader)
 
     @property
@@ -171,7 +158,7 @@ class KnownHistory:
         last = self._checked(end)
         history = self.covering(last)
         _refuse_keyframe(history, thing, last)
-        found = thing_called(thing, self.things(last), ("place", "object"))
+        found = naming.thing_called(thing, self.things(last), ("place", "object"))
         if found.kind == "object":
             seen = self._whole_view(history).observations.__getitem__
             explained = explain_object(history, seen, history.objects[found.ordinal], last)
@@ -183,16 +170,16 @@ class KnownHistory:
         commands = place_commands(self._entries, history, place, last)
         return with_entries(explain_place(history, place, last), commands)
 
-    def things(self, end: Offset) -> list[Thing]:
+    def things(self, end: Offset) -> list[naming.Thing]:
         """What may be called by a name after ``end`` events; see `things_at`."""
         history = self.covering(end)
-        return things_at(history, self._recorder.at(end))
+        return names.things_at(history, self._recorder.at(end))
 
-    def short_ids(self, end: Offset) -> ShortIds:
+    def short_ids(self, end: Offset) -> naming.ShortIds:
         """The short ids of the map after ``end`` events."""
         kept = self._short
         if kept is None or kept[0] != end:
-            self._short = kept = end, ShortIds.of(things_of(self.at(end)))
+            self._short = kept = end, naming.ShortIds.of(naming.things_of(self.at(end)))
         return kept[1]
 
     def shortened(self, text: str, end: Offset) -> str:
@@ -204,7 +191,7 @@ class KnownHistory:
         commands join them or keep them apart."""
         last = self._checked(end)
         history = self.covering(last)
-        a, b = (find_keyframe(history, text) for text in (first, second))
+        a, b = (names.find_keyframe(history, text) for text in (first, second))
         commands = same_place_commands(self._entries, history, (a, b), last)
         return with_entries(explain_same_place(history, a, b, last), commands)
 
@@ -239,18 +226,20 @@ class KnownHistory:
     def _find_names(self, expression: Expression, facts: HistoryFacts) -> None:
         """Tell ``facts`` what the names in a condition mean. Raises ExpressionError for one that
         is not in the log: a condition on it would never hold."""
-        things: list[Thing] | None = None
+        things: list[naming.Thing] | None = None
         for mention in expression.mentions():
             if facts.has(mention.kind, mention.text):
                 continue
             if mention.kind not in (Names.PLACE, Names.OBJECT):
-                error = NoSuchThing(mention.kind.value, mention.text, facts.names(mention.kind))
+                error = naming.NoSuchThing(
+                    mention.kind.value, mention.text, facts.names(mention.kind)
+                )
                 raise expression.error_at(mention.column, str(error))
             things = self.things(facts.end) if things is None else things
-            kind: Kind = "place" if mention.kind is Names.PLACE else "object"
+            kind: naming.Kind = "place" if mention.kind is Names.PLACE else "object"
             try:
-                found = thing_called(mention.text, things, (kind,))
-            except (NoSuchThing, SeveralThings) as unfound:
+                found = naming.thing_called(mention.text, things, (kind,))
+            except (naming.NoSuchThing, naming.SeveralThings) as unfound:
                 raise expression.error_at(mention.column, str(unfound)) from None
             facts.ids[mention.kind, mention.text] = found.id
 
@@ -264,10 +253,10 @@ def _before(records: Sequence[_Caused], end: Offset) -> list[_Caused]:
 
 def _refuse_keyframe(history: History, text: str, end: Offset) -> None:
     """Raise MisuseError if ``text`` is a keyframe: alone it has no explanation."""
-    keyframe = keyframe_ordinal(history, text)
+    keyframe = names.keyframe_ordinal(history, text)
     if keyframe is None:
         return
-    place = id_of_place(history, history.place_at(keyframe, end))
+    place = names.id_of_place(history, history.place_at(keyframe, end))
     raise MisuseError(
         f"{text} is a keyframe, in {place or 'no place'}; give a place, an object or two keyframes"
     )

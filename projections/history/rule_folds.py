@@ -17,15 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+from eventsrc.base import worker_process
 from eventsrc.base.errors import MapfoldError
 from eventsrc.base.machine import gc_paused, usable_processors
-from eventsrc.base.worker_process import (
-    Called,
-    ProcessGone,
-    ProcessKilled,
-    Report,
-    call_in_processes,
-)
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
@@ -273,18 +267,18 @@ def _in_processes(
         if progress is not None:
             progress(folded, total)
 
-    ended: dict[int, Called[list[FoldResult]]] = {}
+    ended: dict[int, worker_process.Called[list[FoldResult]]] = {}
     try:
-        for called in call_in_processes(calls, len(calls), report):
-            if isinstance(called.error, ProcessGone):
+        for called in worker_process.call_in_processes(calls, len(calls), report):
+            if isinstance(called.error, worker_process.ProcessGone):
                 raise called.error
             ended[called.number] = called
-    except ProcessKilled:
+    except worker_process.ProcessKilled:
         raise MapfoldError(
             f"{log}: a process that folded it was killed, perhaps for lack of memory; "
             "try fewer --processes"
         ) from None
-    except ProcessGone as error:
+    except worker_process.ProcessGone as error:
         raise MapfoldError(
             f"{log}: a process that folds it died or did not start: {error}; try --processes 1"
         ) from None
@@ -295,6 +289,6 @@ def _in_processes(
 
 
 def _fold_share(
-    log: Path, rules: list[Rules], end: Offset, report: Report, **more: Any
+    log: Path, rules: list[Rules], end: Offset, report: worker_process.Report, **more: Any
 ) -> list[FoldResult]:
     return fold_in_this_process(log, rules, end, progress=lambda folded, _: report(folded), **more)

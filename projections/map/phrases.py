@@ -6,21 +6,8 @@ from typing import Any
 
 from eventsrc.base.text import visible
 from eventsrc.envelope.commands import Command, Join, KeepApart, UndoMerge
+from projections.fold import deltas as d
 from projections.fold.corrections import Corrections, Keyframe, RecordedCommand
-from projections.fold.deltas import (
-    Delta,
-    MapGiven,
-    MergeRefused,
-    ObjectFound,
-    ObjectMissing,
-    ObjectOrdinal,
-    ObjectRelocated,
-    ObjectsMerged,
-    PlaceFormed,
-    PlaceNamed,
-    PlaceOrdinal,
-    PlacesMerged,
-)
 from projections.fold.exact import UM_PER_M
 
 from .view import MapView
@@ -78,43 +65,43 @@ def command_on(
     return None
 
 
-def change_lines(view: MapView, deltas: Iterable[Delta]) -> Iterator[str]:
+def change_lines(view: MapView, deltas: Iterable[d.Delta]) -> Iterator[str]:
     """A line for each change of a place, an object's identity or a map; ``view`` has the deltas
     applied."""
 
-    def place(ordinal: PlaceOrdinal) -> str:
+    def place(ordinal: d.PlaceOrdinal) -> str:
         return view.all_places[ordinal].place_id
 
-    def thing(ordinal: ObjectOrdinal) -> str:
+    def thing(ordinal: d.ObjectOrdinal) -> str:
         found = view.all_objects[ordinal]
         return f"{visible(found.class_name)} {found.object_id}"
 
     for delta in deltas:
         match delta:
-            case PlaceFormed():
+            case d.PlaceFormed():
                 yield f"place {delta.place_id} founded"
-            case PlacesMerged():
+            case d.PlacesMerged():
                 bridge = view.keyframes[delta.bridge]
                 absorbed = ", ".join(map(place, delta.absorbed))
                 yield (
                     f"place {absorbed} merged into {place(delta.survivor)}"
                     f" by {visible(bridge.run_id)}:{bridge.keyframe_id}"
                 )
-            case MergeRefused():
+            case d.MergeRefused():
                 yield f"places {place(delta.a)} and {place(delta.b)} kept apart by a command"
-            case PlaceNamed():
+            case d.PlaceNamed():
                 named = "has no name" if delta.name is None else f"is called {visible(delta.name)}"
                 yield f"place {place(delta.place)} {named}"
-            case ObjectFound():
+            case d.ObjectFound():
                 yield f"object {thing(delta.object)} found"
-            case ObjectsMerged():
+            case d.ObjectsMerged():
                 yield f"object {thing(delta.absorbed)} merged into {thing(delta.survivor)}"
-            case ObjectMissing(missing=True):
+            case d.ObjectMissing(missing=True):
                 yield f"object {thing(delta.object)} missing after {delta.misses} misses"
-            case ObjectRelocated():
+            case d.ObjectRelocated():
                 x, y = delta.to_x_um / UM_PER_M, delta.to_y_um / UM_PER_M
                 yield f"object {thing(delta.object)} relocated to ({x:.2f}, {y:.2f})"
-            case MapGiven():
+            case d.MapGiven():
                 yield f"occupancy map of {delta.map.width} × {delta.map.height} cells given"
             case _:
                 pass

@@ -13,16 +13,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
-from projections.fold.deltas import (
-    KeyframeOrdinal,
-    ObjectOrdinal,
-    ObjectSeen,
-    ObjectsMerged,
-    ObservationOrdinal,
-    PlaceOrdinal,
-    Pose,
-    RunOrdinal,
-)
+from projections.fold import deltas
 from projections.fold.exact import UM_PER_M, UnitVector, mean_m
 from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.place_types import ONCE
@@ -34,7 +25,7 @@ _UM2_PER_M2 = UM_PER_M * UM_PER_M
 class RunRecord:
     """One run. ``started_at`` is the earliest keyframe timestamp of it so far."""
 
-    ordinal: RunOrdinal
+    ordinal: deltas.RunOrdinal
     run_id: RunId
     started_at: float
     keyframe_count: int = 0
@@ -48,19 +39,19 @@ class PlaceRecord:
     `MapView.places` lists those that were not absorbed.
     """
 
-    ordinal: PlaceOrdinal
+    ordinal: deltas.PlaceOrdinal
     place_id: str
-    founder: KeyframeOrdinal
+    founder: deltas.KeyframeOrdinal
     founded_offset: Offset
     keyframe_count: int = 0
     sum_x_um: int = 0
     sum_y_um: int = 0
     name: str | None = None
     name_offset: Offset | None = None
-    unordered_members: list[KeyframeOrdinal] = field(default_factory=list)
+    unordered_members: list[deltas.KeyframeOrdinal] = field(default_factory=list)
 
     @property
-    def members(self) -> list[KeyframeOrdinal]:
+    def members(self) -> list[deltas.KeyframeOrdinal]:
         """Ordinals of its keyframes, ascending; a new list each time."""
         return sorted(self.unordered_members)
 
@@ -83,21 +74,21 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     log states them.
     """
 
-    ordinal: KeyframeOrdinal
+    ordinal: deltas.KeyframeOrdinal
     offset: Offset
-    run: RunOrdinal
+    run: deltas.RunOrdinal
     run_id: RunId
     keyframe_id: KeyframeId
     timestamp: float
-    pose: Pose | None
+    pose: deltas.Pose | None
     survivors: PlaceSurvivors
-    observations: list[ObservationOrdinal] | tuple[()] = ()
-    joined: PlaceOrdinal | None = None
+    observations: list[deltas.ObservationOrdinal] | tuple[()] = ()
+    joined: deltas.PlaceOrdinal | None = None
     floor: str | None = None
     camera: StatedCamera | None = None
 
     @property
-    def place(self) -> PlaceOrdinal | None:
+    def place(self) -> deltas.PlaceOrdinal | None:
         """The place it belongs to now; None for noise or without a pose."""
         return None if self.joined is None else self.survivors.find(self.joined)
 
@@ -111,8 +102,8 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     whether it has a depth or a position.
     """
 
-    ordinal: ObservationOrdinal
-    keyframe: KeyframeOrdinal
+    ordinal: deltas.ObservationOrdinal
+    keyframe: deltas.KeyframeOrdinal
     det_id: DetId
     class_name: str
     confidence: float
@@ -121,7 +112,7 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     embedding: UnitVector | None
     embedding_crc: int | None
     foreign_space: bool
-    object: ObjectOrdinal | None = None
+    object: deltas.ObjectOrdinal | None = None
     similarity_q40: int | None = None
     measured: bool = False
 
@@ -170,7 +161,7 @@ class Relocation:
     """An Object was found at another position by ``observation``, of the event at ``offset``."""
 
     offset: Offset
-    observation: ObservationOrdinal
+    observation: deltas.ObservationOrdinal
     from_x_um: int
     from_y_um: int
     to_x_um: int
@@ -187,7 +178,7 @@ class ObjectRecord:
     `projections.map.confirmed`, ``counted_as`` how `PlaceContents` counts it.
     """
 
-    ordinal: ObjectOrdinal
+    ordinal: deltas.ObjectOrdinal
     object_id: str
     class_name: str
     obs_count: int = 0
@@ -195,16 +186,16 @@ class ObjectRecord:
     sum_y_um: int = 0
     first_seen: float = 0.0
     last_seen: float = 0.0
-    place: PlaceOrdinal | None = None
-    observations: list[ObservationOrdinal] = field(default_factory=list)
+    place: deltas.PlaceOrdinal | None = None
+    observations: list[deltas.ObservationOrdinal] = field(default_factory=list)
     estimate: EstimatedPosition | None = None
     misses: int = 0
-    missing_in: RunOrdinal | None = None
+    missing_in: deltas.RunOrdinal | None = None
     relocations: list[Relocation] = field(default_factory=list)
     confirmed: bool = False
-    counted_as: tuple[PlaceOrdinal, str, bool] | None = None
+    counted_as: tuple[deltas.PlaceOrdinal, str, bool] | None = None
 
-    def recount(self, delta: ObjectSeen | ObjectsMerged) -> None:
+    def recount(self, delta: deltas.ObjectSeen | deltas.ObjectsMerged) -> None:
         """Take over the count, sums and times of a delta."""
         self.obs_count = delta.obs_count
         self.sum_x_um, self.sum_y_um = delta.sum_x_um, delta.sum_y_um
@@ -234,8 +225,8 @@ class PlaceContents:
 
     def __init__(self) -> None:
         # place → class → Objects observed once, and more often
-        self._counts: dict[PlaceOrdinal, dict[str, list[int]]] = {}
-        self.touched: set[PlaceOrdinal] = set()
+        self._counts: dict[deltas.PlaceOrdinal, dict[str, list[int]]] = {}
+        self.touched: set[deltas.PlaceOrdinal] = set()
 
     def update(self, found: ObjectRecord) -> None:
         """Replace the Object's earlier count by its current one."""
@@ -251,7 +242,7 @@ class PlaceContents:
                 in_place.setdefault(key[1], [0, 0])[key[2]] += change
                 self.touched.add(key[0])
 
-    def of(self, place: PlaceOrdinal) -> Mapping[str, float]:
+    def of(self, place: deltas.PlaceOrdinal) -> Mapping[str, float]:
         """The weight of each class in a place."""
         counts = self._counts.get(place, {})
         return {name: often + ONCE * once for name, (once, often) in counts.items()}

@@ -24,17 +24,8 @@ from projections.fold.pair_groups import ObjectSurvivors, PlaceSurvivors
 from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
 
+from . import records
 from .confirmed import confirm
-from .records import (
-    EstimatedPosition,
-    KeyframeRecord,
-    ObjectRecord,
-    ObservationRecord,
-    PlaceContents,
-    PlaceRecord,
-    Relocation,
-    RunRecord,
-)
 
 _BY_CORRECTION: tuple[SkipKind, ...] = ("forgotten", "dropped")
 
@@ -63,18 +54,18 @@ class MapView:
         self.corrections = corrections
         self.keep_embeddings = keep_embeddings
         self.next_offset = FIRST_OFFSET
-        self.runs: list[RunRecord] = []
-        self.keyframes: list[KeyframeRecord] = []
-        self.observations: list[ObservationRecord] = []
-        self.all_objects: list[ObjectRecord] = []
-        self.objects: dict[ObjectOrdinal, ObjectRecord] = {}
+        self.runs: list[records.RunRecord] = []
+        self.keyframes: list[records.KeyframeRecord] = []
+        self.observations: list[records.ObservationRecord] = []
+        self.all_objects: list[records.ObjectRecord] = []
+        self.objects: dict[ObjectOrdinal, records.ObjectRecord] = {}
         self.object_survivors = ObjectSurvivors()
-        self.all_places: list[PlaceRecord] = []
-        self.places: dict[PlaceOrdinal, PlaceRecord] = {}
+        self.all_places: list[records.PlaceRecord] = []
+        self.places: dict[PlaceOrdinal, records.PlaceRecord] = {}
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
-        self.contents = PlaceContents()
+        self.contents = records.PlaceContents()
         self.maps: dict[str | None, deltas.MapGiven] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
 
@@ -137,12 +128,12 @@ class MapView:
         """The det_id of each observation."""
         return [each.det_id for each in self.observations]
 
-    def class_counts(self, found: ObjectRecord) -> dict[str, int]:
+    def class_counts(self, found: records.ObjectRecord) -> dict[str, int]:
         """The number of an Object's observations by class, most first; ties by name."""
         names = (self.observations[number].class_name for number in found.observations)
         return dict(sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
-    def sightings(self, found: ObjectRecord) -> list[KeyframeRecord]:
+    def sightings(self, found: records.ObjectRecord) -> list[records.KeyframeRecord]:
         """The keyframes that saw an Object, one for each observation, in their order."""
         return [self.keyframes[self.observations[o].keyframe] for o in found.observations]
 
@@ -152,7 +143,7 @@ class MapView:
 
     def _run_seen(self, delta: deltas.RunSeen) -> None:
         if delta.run == len(self.runs):
-            self.runs.append(RunRecord(delta.run, delta.run_id, delta.started_at))
+            self.runs.append(records.RunRecord(delta.run, delta.run_id, delta.started_at))
         else:
             self.runs[delta.run].started_at = delta.started_at
 
@@ -161,7 +152,7 @@ class MapView:
             return
         self.runs[delta.run].keyframe_count += 1
         self.keyframes.append(
-            KeyframeRecord(
+            records.KeyframeRecord(
                 delta.keyframe,
                 delta.offset,
                 delta.run,
@@ -186,7 +177,7 @@ class MapView:
         keyframe.observations.append(delta.observation)
         vector = delta.embedding
         self.observations.append(
-            ObservationRecord(
+            records.ObservationRecord(
                 delta.observation,
                 delta.keyframe,
                 delta.det_id,
@@ -208,7 +199,7 @@ class MapView:
     def _place_formed(self, delta: deltas.PlaceFormed) -> None:
         if delta.place < len(self.all_places):
             return
-        place = PlaceRecord(delta.place, delta.place_id, delta.founder, delta.offset)
+        place = records.PlaceRecord(delta.place, delta.place_id, delta.founder, delta.offset)
         self.all_places.append(place)
         self.places[delta.place] = place
 
@@ -243,7 +234,7 @@ class MapView:
 
     def _object_found(self, delta: deltas.ObjectFound) -> None:
         if delta.object == len(self.all_objects):
-            found = ObjectRecord(delta.object, delta.object_id, delta.class_name)
+            found = records.ObjectRecord(delta.object, delta.object_id, delta.class_name)
             self.all_objects.append(found)
             self.objects[delta.object] = found
 
@@ -283,7 +274,7 @@ class MapView:
 
     def _object_estimated(self, delta: deltas.ObjectEstimated) -> None:
         variances = delta.var_xx_um2, delta.var_xy_um2, delta.var_yy_um2
-        at = EstimatedPosition(delta.x_um, delta.y_um, *variances, delta.spots)
+        at = records.EstimatedPosition(delta.x_um, delta.y_um, *variances, delta.spots)
         self.all_objects[delta.object].estimate = at
 
     def _object_classified(self, delta: deltas.ObjectClassified) -> None:
@@ -300,7 +291,7 @@ class MapView:
         found = self.all_objects[delta.object]
         found.misses, found.missing_in = 0, None
         at = (delta.from_x_um, delta.from_y_um, delta.to_x_um, delta.to_y_um)
-        moved = Relocation(delta.offset, delta.observation, *at)
+        moved = records.Relocation(delta.offset, delta.observation, *at)
         if moved not in found.relocations:
             found.relocations.append(moved)
 

@@ -28,12 +28,7 @@ from typing import Final
 
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from projections.fold.map_errors import (
-    CheckpointMoved,
-    DatabaseError,
-    DatabaseUnavailable,
-    EmbeddedServerError,
-)
+from projections.fold import map_errors
 from projections.fold.settings import Settings
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
@@ -148,7 +143,7 @@ def serving_tail_metrics(
         yield port
 
 
-AWAY: Final = (DatabaseUnavailable, EmbeddedServerError)
+AWAY: Final = (map_errors.DatabaseUnavailable, map_errors.EmbeddedServerError)
 """Errors after which another attempt may succeed. EmbeddedServerError is raised for a server killed
 during its start."""
 FIRST_PAUSE_S: Final = 0.1
@@ -168,12 +163,12 @@ class Backoff:
     def wait(self) -> None:
         """Wait before the next attempt. Raises DatabaseUnavailable when stopped meanwhile."""
         if self.plan.stop.wait(self.pause_s):
-            raise DatabaseUnavailable(
+            raise map_errors.DatabaseUnavailable(
                 f"{self.place}: stopped while the database was away; what was not written yet is in"
                 " the log and comes with the next start"
             )
 
-    def failed(self, error: DatabaseError) -> None:
+    def failed(self, error: map_errors.DatabaseError) -> None:
         """Report a failed attempt and double the next pause. Raises it after ``patience_s``."""
         self.waited_s += self.pause_s
         patience_s = self.plan.patience_s
@@ -249,7 +244,7 @@ class Writer:
                 with database_errors(self.store.url):
                     transaction()
                     return
-            except DatabaseUnavailable as error:
+            except map_errors.DatabaseUnavailable as error:
                 self.plan.on_trouble(str(error))
             if self._was_committed(self._reconnect(), ends):
                 return
@@ -313,7 +308,7 @@ class Writer:
             if now is None or now.next_offset < before.next_offset:
                 raise LostCommits
             if now.next_offset != ends.get(sink, before.next_offset):
-                raise CheckpointMoved(
+                raise map_errors.CheckpointMoved(
                     f"{self.store.place}: after the connection was lost the checkpoint of the"
                     f" {sink} is at {now.next_offset:,}, which this tail never wrote: something"
                     " else writes there; stop it, then start again"

@@ -31,16 +31,8 @@ from projections.fold.deltas import (
 from projections.fold.settings import Settings
 from projections.map.records import ObjectRecord
 
+from . import history_records
 from .columns import Array
-from .history_records import (
-    Cause,
-    Merge,
-    ObjectHistory,
-    ObjectMerge,
-    PlaceHistory,
-    RefusedMerge,
-    last_before,
-)
 from .lazy_rows import Chunks, Items, OrdinalsByName
 from .neighbours import Neighbours, posed
 from .object_states import ObjectStates
@@ -138,12 +130,12 @@ class History:
         return cast("Sequence[PlaceOrdinal]", as_ints(placed_columns(self.tables)[1]))
 
     @cached_property
-    def places(self) -> Sequence[PlaceHistory]:
+    def places(self) -> Sequence[history_records.PlaceHistory]:
         """What happened to each place."""
         tables = self.tables
         places = []
         for formed, cause in self._with_causes("formed"):
-            place = PlaceHistory(formed, cause)
+            place = history_records.PlaceHistory(formed, cause)
             place.joined = _items_of(tables, "placed", "place", formed.place)
             place.changes = _items_of(tables, "changed", "place", formed.place)
             place.names = _items_of(tables, "named", "place", formed.place)
@@ -155,11 +147,11 @@ class History:
         return places
 
     @cached_property
-    def objects(self) -> Sequence[ObjectHistory]:
+    def objects(self) -> Sequence[history_records.ObjectHistory]:
         """What happened to each object."""
         objects = []
         for found, cause in self._with_causes("found"):
-            record = ObjectHistory(found, cause)
+            record = history_records.ObjectHistory(found, cause)
             for name, table in _OBJECT_LISTS.items():
                 setattr(record, name, _items_of(self.tables, table, "object", found.object))
             objects.append(record)
@@ -217,24 +209,26 @@ class History:
         return OrdinalsByName(tables.count("keyframe"), find, names)
 
     @cached_property
-    def merges(self) -> Sequence[Merge]:
+    def merges(self) -> Sequence[history_records.Merge]:
         """The merges of places."""
         texts = self.tables.texts("merge", "document", 0, self.tables.count("merge"))
-        decode = msgspec.json.Decoder(Merge).decode
+        decode = msgspec.json.Decoder(history_records.Merge).decode
         return [decode(text or "") for text in texts]
 
     @cached_property
-    def refusals(self) -> Sequence[RefusedMerge]:
+    def refusals(self) -> Sequence[history_records.RefusedMerge]:
         """The merges that commands refused."""
         return [
-            RefusedMerge(cause, each.a, each.b, each.bridge, each.link, each.apart)
+            history_records.RefusedMerge(cause, each.a, each.b, each.bridge, each.link, each.apart)
             for each, cause in self._with_causes("refused")
         ]
 
     @cached_property
-    def object_merges(self) -> Sequence[ObjectMerge]:
+    def object_merges(self) -> Sequence[history_records.ObjectMerge]:
         """The merges of objects."""
-        return [ObjectMerge(cause, fused) for fused, cause in self._with_causes("fused")]
+        return [
+            history_records.ObjectMerge(cause, fused) for fused, cause in self._with_causes("fused")
+        ]
 
     @cached_property
     def place_ordinals(self) -> Mapping[str, PlaceOrdinal]:
@@ -269,17 +263,17 @@ class History:
         found = {seen[0].run_id: by_run[number] for number, seen in enumerate(self.runs)}
         return {run_id: as_ints(of) for run_id, of in found.items() if len(of)}
 
-    def _with_causes(self, table: str) -> Iterator[tuple[Any, Cause]]:
+    def _with_causes(self, table: str) -> Iterator[tuple[Any, history_records.Cause]]:
         """The deltas of a table, each with its event."""
         found = self.tables.deltas(table)
         return zip(found, self.causes_at([each.offset for each in found]), strict=True)
 
-    def cause_at(self, offset: Offset) -> Cause:
+    def cause_at(self, offset: Offset) -> history_records.Cause:
         """The event at ``offset`` as a cause."""
         (cause,) = self.causes_at([offset])
         return cause
 
-    def causes_at(self, offsets: Sequence[Offset]) -> list[Cause]:
+    def causes_at(self, offsets: Sequence[Offset]) -> list[history_records.Cause]:
         """`cause_at` for many offsets."""
         tables, keyframes = self.tables, np.asarray(self.keyframe_offsets)
         asked = np.array(offsets, np.int64)
@@ -297,9 +291,11 @@ class History:
             if is_keyframe:
                 time_s, run, keyframe_id = next(values)
                 run_id = self.runs[run][0].run_id
-                causes.append(Cause(offset, "keyframe", time_s, run_id, keyframe_id))
+                causes.append(
+                    history_records.Cause(offset, "keyframe", time_s, run_id, keyframe_id)
+                )
             else:
-                causes.append(Cause(offset, "command"))
+                causes.append(history_records.Cause(offset, "command"))
         return causes
 
     @cached_property
@@ -347,7 +343,7 @@ class History:
     def transitions(self, a: PlaceOrdinal, b: PlaceOrdinal, end: Offset) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))
-        linked = last_before(self.edges.get(pair, ()), end)
+        linked = history_records.last_before(self.edges.get(pair, ()), end)
         return 0 if linked is None else linked.shared_transitions
 
 

@@ -15,27 +15,7 @@ from operator import attrgetter
 from typing import Any, Literal, Protocol, TypeVar
 
 from eventsrc.envelope.model import Offset, RunId
-from projections.fold.deltas import (
-    Delta,
-    KeyframeAdded,
-    KeyframeOrdinal,
-    KeyframePlaced,
-    MeanDrive,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectMoved,
-    ObjectOrdinal,
-    ObjectRelocated,
-    ObjectSeen,
-    ObjectsMerged,
-    PlaceChanged,
-    PlaceFormed,
-    PlaceLink,
-    PlaceNamed,
-    PlaceOrdinal,
-)
+from projections.fold import deltas as d
 from projections.map.phrases import iso_time
 
 from .lazy_rows import Items
@@ -91,10 +71,10 @@ class Cause:
         }
 
 
-def cause_of(offset: Offset, deltas: Iterable[Delta]) -> Cause:
+def cause_of(offset: Offset, deltas: Iterable[d.Delta]) -> Cause:
     """The cause of the deltas of one event: the keyframe it added, if it added one."""
     for delta in deltas:
-        if isinstance(delta, KeyframeAdded):
+        if isinstance(delta, d.KeyframeAdded):
             return Cause(offset, "keyframe", delta.timestamp, delta.run_id, delta.keyframe_id)
     return Cause(offset, "command")
 
@@ -103,8 +83,8 @@ def cause_of(offset: Offset, deltas: Iterable[Delta]) -> Cause:
 class EdgeChange:
     """Shared transitions of two places before and after an event; 0 is no edge."""
 
-    a: PlaceOrdinal
-    b: PlaceOrdinal
+    a: d.PlaceOrdinal
+    b: d.PlaceOrdinal
     before: int
     after: int
 
@@ -122,19 +102,19 @@ class Merge:
 
     number: int
     cause: Cause
-    bridge: KeyframeOrdinal
-    survivor: PlaceOrdinal
+    bridge: d.KeyframeOrdinal
+    survivor: d.PlaceOrdinal
     survivor_size: int
-    absorbed: tuple[PlaceOrdinal, ...]
+    absorbed: tuple[d.PlaceOrdinal, ...]
     absorbed_sizes: tuple[int, ...]
-    links: tuple[PlaceLink, ...]
-    objects: tuple[ObjectOrdinal, ...]
+    links: tuple[d.PlaceLink, ...]
+    objects: tuple[d.ObjectOrdinal, ...]
     edges: tuple[EdgeChange, ...]
-    joined: tuple[PlaceOrdinal, ...] = ()
-    drives: tuple[MeanDrive, ...] = ()
+    joined: tuple[d.PlaceOrdinal, ...] = ()
+    drives: tuple[d.MeanDrive, ...] = ()
 
     @property
-    def places(self) -> tuple[PlaceOrdinal, ...]:
+    def places(self) -> tuple[d.PlaceOrdinal, ...]:
         """The survivor first, then the absorbed places."""
         return (self.survivor, *self.absorbed)
 
@@ -148,11 +128,11 @@ class RefusedMerge:
     """
 
     cause: Cause
-    a: PlaceOrdinal
-    b: PlaceOrdinal
-    bridge: KeyframeOrdinal
-    link: PlaceLink
-    apart: tuple[KeyframeOrdinal, KeyframeOrdinal]
+    a: d.PlaceOrdinal
+    b: d.PlaceOrdinal
+    bridge: d.KeyframeOrdinal
+    link: d.PlaceLink
+    apart: tuple[d.KeyframeOrdinal, d.KeyframeOrdinal]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,18 +140,18 @@ class ObjectMerge:
     """Two objects became one, by a command or by evidence. ``values`` are the survivor's since."""
 
     cause: Cause
-    values: ObjectsMerged
+    values: d.ObjectsMerged
 
     @property
     def offset(self) -> Offset:
         return self.cause.offset
 
     @property
-    def survivor(self) -> ObjectOrdinal:
+    def survivor(self) -> d.ObjectOrdinal:
         return self.values.survivor
 
     @property
-    def absorbed(self) -> ObjectOrdinal:
+    def absorbed(self) -> d.ObjectOrdinal:
         return self.values.absorbed
 
 
@@ -179,12 +159,12 @@ class ObjectMerge:
 class PlaceHistory:
     """The history of a place, from its founding on. The lists are in order of offset."""
 
-    formed: PlaceFormed
+    formed: d.PlaceFormed
     cause: Cause
-    joined: list[KeyframePlaced] = field(default_factory=list)
+    joined: list[d.KeyframePlaced] = field(default_factory=list)
     """Keyframes that joined it, without those of absorbed places."""
-    changes: list[PlaceChanged] = field(default_factory=list)
-    names: list[PlaceNamed] = field(default_factory=list)
+    changes: list[d.PlaceChanged] = field(default_factory=list)
+    names: list[d.PlaceNamed] = field(default_factory=list)
     merges: list[Merge] = field(default_factory=list)
     """Merges it survived."""
     absorbed_by: Merge | None = None
@@ -200,7 +180,7 @@ class PlaceHistory:
             self.absorbed_by is None or self.absorbed_by.cause.offset >= end
         )
 
-    def change(self, end: Offset) -> PlaceChanged | None:
+    def change(self, end: Offset) -> d.PlaceChanged | None:
         """The place's size and sums after the events below ``end``."""
         return last_before(self.changes, end)
 
@@ -214,18 +194,18 @@ class PlaceHistory:
 class ObjectHistory:
     """The history of an object, from its first sighting on. The lists are in order of offset."""
 
-    found: ObjectFound
+    found: d.ObjectFound
     cause: Cause
-    sightings: list[ObjectSeen] = field(default_factory=list)
-    moves: list[ObjectMoved] = field(default_factory=list)
+    sightings: list[d.ObjectSeen] = field(default_factory=list)
+    moves: list[d.ObjectMoved] = field(default_factory=list)
     merges: list[ObjectMerge] = field(default_factory=list)
     """Merges it survived."""
     absorbed_by: ObjectMerge | None = None
     """The merge that ended it."""
-    estimates: list[ObjectEstimated] = field(default_factory=list)
-    classes: list[ObjectClassified] = field(default_factory=list)
-    misses: list[ObjectMissing] = field(default_factory=list)
-    relocations: list[ObjectRelocated] = field(default_factory=list)
+    estimates: list[d.ObjectEstimated] = field(default_factory=list)
+    classes: list[d.ObjectClassified] = field(default_factory=list)
+    misses: list[d.ObjectMissing] = field(default_factory=list)
+    relocations: list[d.ObjectRelocated] = field(default_factory=list)
 
     @property
     def object_id(self) -> str:

@@ -22,14 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
-from projections.fold.deltas import (
-    Delta,
-    ObjectMoved,
-    ObjectOrdinal,
-    PlaceOrdinal,
-    PlacesLinked,
-    PlacesMerged,
-)
+from projections.fold import deltas as d
 
 from .columns import NONE, ROWS, STRIPE_EVENTS, TABLES, Array, Row, Stripe, deltas_of, stripe_of
 from .history_records import EdgeChange, Merge, cause_of
@@ -37,7 +30,7 @@ from .history_records import EdgeChange, Merge, cause_of
 Rows = NDArray[np.int64]
 SHORT_STRIPE_EVENTS: Final = 4_096
 """Events of a stripe that is joined with others before it is written."""
-_COMPARED: Final = frozenset({ObjectMoved, PlacesLinked, PlacesMerged})
+_COMPARED: Final = frozenset({d.ObjectMoved, d.PlacesLinked, d.PlacesMerged})
 """The deltas of which a merge of places says what was before."""
 _T = TypeVar("_T")
 _MANY: Final = 4_000
@@ -291,17 +284,17 @@ class TableWriter:
         self._stripes: list[Stripe] = []
         moved = tables.column("moved", "object")
         last = last_rows(moved, tables.count("found"))
-        moves: list[ObjectMoved] = tables.deltas_at("moved", last[last >= 0])
+        moves: list[d.ObjectMoved] = tables.deltas_at("moved", last[last >= 0])
         self._located = {each.object: each.place for each in moves}
-        links: list[PlacesLinked] = tables.deltas("linked")
+        links: list[d.PlacesLinked] = tables.deltas("linked")
         self._links = {(each.a, each.b): each.shared_transitions for each in links}
         self._merges = tables.count("merge")
         self._rows: defaultdict[str, list[Row]] = defaultdict(list)
 
-    def add(self, offset: Offset, deltas: Sequence[Delta]) -> None:
+    def add(self, offset: Offset, deltas: Sequence[d.Delta]) -> None:
         """Add the deltas of the event at ``offset``."""
-        merges: list[PlacesMerged] = []
-        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]] = []
+        merges: list[d.PlacesMerged] = []
+        moves: list[tuple[d.ObjectOrdinal, d.PlaceOrdinal | None]] = []
         links: list[EdgeChange] = []
         for delta in deltas:
             kind = type(delta)
@@ -310,14 +303,14 @@ class TableWriter:
                 self._rows[table].append(row_of(delta))
             if kind not in _COMPARED:
                 continue
-            if isinstance(delta, ObjectMoved):
+            if isinstance(delta, d.ObjectMoved):
                 moves.append((delta.object, self._located.get(delta.object)))
                 self._located[delta.object] = delta.place
-            elif isinstance(delta, PlacesLinked):
+            elif isinstance(delta, d.PlacesLinked):
                 pair, after = (delta.a, delta.b), delta.shared_transitions
                 links.append(EdgeChange(*pair, self._links.get(pair, 0), after))
                 self._links[pair] = after
-            elif isinstance(delta, PlacesMerged):
+            elif isinstance(delta, d.PlacesMerged):
                 merges.append(delta)
         for merge in merges:
             self._places_merged(offset, deltas, merge, moves, links)
@@ -340,9 +333,9 @@ class TableWriter:
     def _places_merged(
         self,
         offset: Offset,
-        deltas: Sequence[Delta],
-        delta: PlacesMerged,
-        moves: list[tuple[ObjectOrdinal, PlaceOrdinal | None]],
+        deltas: Sequence[d.Delta],
+        delta: d.PlacesMerged,
+        moves: list[tuple[d.ObjectOrdinal, d.PlaceOrdinal | None]],
         links: list[EdgeChange],
     ) -> None:
         places = {delta.survivor, *delta.absorbed}

@@ -34,16 +34,7 @@ from eventsrc.envelope.cdr import CdrFault, CdrFields, is_cdr
 from eventsrc.envelope.model import MAX_TIMESTAMP_S
 from eventsrc.record.transport.session import Received, Session, SizeLimit
 
-from .picture import (
-    JPEG_START,
-    MAX_PICTURE_BYTES,
-    MAX_PICTURE_PIXELS,
-    PNG_START,
-    Picture,
-    PictureError,
-    Pixels,
-    split_stream,
-)
+from . import picture
 from .poses import LivePoses, MessageError, header_stamp
 from .vision import Video, colour_order, decode
 
@@ -69,7 +60,7 @@ class Timing(NamedTuple):
         return None if rate is None else self.start_s + index / rate
 
 
-def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[Picture]:
+def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[picture.Picture]:
     """The pictures of ``--images``. Raises MisuseError before the first, and where a picture has no
     time."""
     if text == "-":
@@ -88,7 +79,7 @@ def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[Picture]:
         return _from_paths([path], timing)
     try:
         video = Video(path)
-    except PictureError as error:
+    except picture.PictureError as error:
         raise MisuseError(
             f"--images {text}: {error}; give a folder of pictures, a video, or -"
         ) from None
@@ -103,12 +94,12 @@ def _in_order(path: Path) -> list[tuple[int, int, str]]:
     ]
 
 
-def _from_paths(paths: Iterable[Path], timing: Timing) -> Iterator[Picture]:
+def _from_paths(paths: Iterable[Path], timing: Timing) -> Iterator[picture.Picture]:
     for index, path in enumerate(paths):
         stamp_s = timing.stamp_s(index)
         if stamp_s is None:
             stamp_s = _stamp_in(path)
-        yield Picture(visible(str(path)), stamp_s, _reader(path))
+        yield picture.Picture(visible(str(path)), stamp_s, _reader(path))
 
 
 def _stamp_in(path: Path) -> float:
@@ -125,28 +116,30 @@ def _stamp_in(path: Path) -> float:
     )
 
 
-def _reader(path: Path) -> Callable[[], Pixels]:
-    def pixels() -> Pixels:
+def _reader(path: Path) -> Callable[[], picture.Pixels]:
+    def pixels() -> picture.Pixels:
         try:
             with open_file(path) as file:
-                data = file.read(MAX_PICTURE_BYTES + 1)
+                data = file.read(picture.MAX_PICTURE_BYTES + 1)
         except FileFault as fault:
-            raise PictureError(str(fault)) from None
+            raise picture.PictureError(str(fault)) from None
         except OSError as error:
-            raise PictureError(error.strerror or str(error)) from None
+            raise picture.PictureError(error.strerror or str(error)) from None
         return decode(data)
 
     return pixels
 
 
-def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[Picture]:
+def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[picture.Picture]:
     try:
         if timing.per_s is None and video.frames_per_s is None:
             raise MisuseError(f"--images {path}: this video does not state its rate; give --fps")
         index = 0
         while video.next():
             stamp_s = timing.stamp_s(index, video.frames_per_s)
-            yield Picture(f"{visible(str(path))}, frame {index}", stamp_s or 0.0, video.pixels)
+            yield picture.Picture(
+                f"{visible(str(path))}, frame {index}", stamp_s or 0.0, video.pixels
+            )
             index += 1
         if index == 0:
             raise MisuseError(f"--images {path}: no frame in this video can be read")
@@ -154,32 +147,32 @@ def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[Picture]:
         video.close()
 
 
-def _from_stdin(read: Read, timing: Timing) -> Iterator[Picture]:
+def _from_stdin(read: Read, timing: Timing) -> Iterator[picture.Picture]:
     """The pictures of a stream if it begins like a picture, else those of a path a line."""
     start = b""
-    while len(start) < len(PNG_START) and b"\n" not in start:
-        piece = read(len(PNG_START) - len(start))
+    while len(start) < len(picture.PNG_START) and b"\n" not in start:
+        piece = read(len(picture.PNG_START) - len(start))
         if not piece:
             break
         start += piece
-    if start.startswith((JPEG_START, PNG_START)):
+    if start.startswith((picture.JPEG_START, picture.PNG_START)):
         yield from _from_stream(start, read, timing)
     elif start.strip():
         yield from _from_paths(_paths(start, read), timing)
 
 
-def _from_stream(start: bytes, read: Read, timing: Timing) -> Iterator[Picture]:
+def _from_stream(start: bytes, read: Read, timing: Timing) -> Iterator[picture.Picture]:
     pending = [start]
-    parts = split_stream(lambda size: pending.pop() if pending else read(size))
+    parts = picture.split_stream(lambda size: pending.pop() if pending else read(size))
     for index, part in enumerate(parts):
         stamp_s = timing.stamp_s(index)
         stamp_s = system_clock() / 1e9 if stamp_s is None else stamp_s
-        yield Picture(f"stdin, picture {index}", stamp_s, _decoder(part))
+        yield picture.Picture(f"stdin, picture {index}", stamp_s, _decoder(part))
 
 
-def _decoder(part: bytes | PictureError) -> Callable[[], Pixels]:
-    def pixels() -> Pixels:
-        if isinstance(part, PictureError):
+def _decoder(part: bytes | picture.PictureError) -> Callable[[], picture.Pixels]:
+    def pixels() -> picture.Pixels:
+        if isinstance(part, picture.PictureError):
             raise part
         return decode(part)
 
@@ -278,12 +271,12 @@ class LivePictures:
             session.subscribe(
                 image_key,
                 lambda message: self.queue.put(message, self._now_s()),
-                SizeLimit(MAX_PICTURE_BYTES, self.queue.refuse),
+                SizeLimit(picture.MAX_PICTURE_BYTES, self.queue.refuse),
                 in_order=True,  # behind its pose
             )
         session.confirm()
 
-    def __iter__(self) -> Iterator[Picture]:
+    def __iter__(self) -> Iterator[picture.Picture]:
         number = 0
         while not self._stop.is_set():
             found = self.queue.get(_POLL_S)
@@ -295,7 +288,7 @@ class LivePictures:
             try:
                 yield picture_of(message.payload, name, received_s)
             except MessageError as error:
-                yield Picture(name, received_s, _decoder(PictureError(str(error))))
+                yield picture.Picture(name, received_s, _decoder(picture.PictureError(str(error))))
         with suppress(TransportError):
             self._session.confirm()  # what the router has by now is here, and counted
         self.queue.close()
@@ -307,10 +300,10 @@ class LivePictures:
 _CHANNELS: Final[Mapping[str, int]] = {"bgr8": 3, "rgb8": 3, "8UC3": 3, "mono8": 1, "8UC1": 1}
 
 
-def picture_of(payload: bytes, name: str, received_s: float) -> Picture:
+def picture_of(payload: bytes, name: str, received_s: float) -> picture.Picture:
     """The picture of a message, not decoded. Raises MessageError if its header cannot be read."""
     if not is_cdr(payload):
-        return Picture(name, received_s, lambda: decode(payload))
+        return picture.Picture(name, received_s, lambda: decode(payload))
     try:
         return _compressed(payload, name, received_s)
     except CdrFault as first:
@@ -322,16 +315,16 @@ def picture_of(payload: bytes, name: str, received_s: float) -> Picture:
             ) from None
 
 
-def _compressed(payload: bytes, name: str, received_s: float) -> Picture:
+def _compressed(payload: bytes, name: str, received_s: float) -> picture.Picture:
     fields = CdrFields(payload)
     stamp_s = header_stamp(fields, received_s)
     fields.text("format")
     (length,) = fields.numbers("I", "the length of data")
     data = bytes(fields.last(length, "data"))
-    return Picture(name, stamp_s, lambda: decode(data))
+    return picture.Picture(name, stamp_s, lambda: decode(data))
 
 
-def _raw(payload: bytes, name: str, received_s: float) -> Picture:
+def _raw(payload: bytes, name: str, received_s: float) -> picture.Picture:
     fields = CdrFields(payload)
     stamp_s = header_stamp(fields, received_s)
     height, width = fields.numbers("II", "height and width")
@@ -344,16 +337,16 @@ def _raw(payload: bytes, name: str, received_s: float) -> Picture:
             f"sensor_msgs/Image of encoding {encoding[:40]!r}; {', '.join(_CHANNELS)} can be read"
         )
     channels = _CHANNELS[encoding]
-    if not 0 < width * height <= MAX_PICTURE_PIXELS or step < width * channels:
+    if not 0 < width * height <= picture.MAX_PICTURE_PIXELS or step < width * channels:
         raise MessageError(f"sensor_msgs/Image of {width:,} × {height:,} pixels, step {step:,}")
     if length != step * height:
         raise MessageError(f"sensor_msgs/Image of {length:,} bytes instead of {step * height:,}")
 
-    def pixels() -> Pixels:
+    def pixels() -> picture.Pixels:
         rows = np.frombuffer(data, np.uint8).reshape(height, step)[:, : width * channels]
         shaped = np.ascontiguousarray(rows).reshape(height, width, channels)
         if channels == 1:
             return colour_order(shaped, "mono")
         return colour_order(shaped, "rgb") if encoding == "rgb8" else shaped
 
-    return Picture(name, stamp_s, pixels)
+    return picture.Picture(name, stamp_s, pixels)

@@ -19,14 +19,7 @@ from typing import Final, NamedTuple
 
 from eventsrc.base.errors import LogDamaged, MapfoldError
 from eventsrc.base.text import command_line
-from eventsrc.envelope.commands import (
-    Command,
-    InvalidCommand,
-    Relabel,
-    Undo,
-    UseSettings,
-    parse_command,
-)
+from eventsrc.envelope import commands
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import CheckedEnvelope
 from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
@@ -47,10 +40,10 @@ class LogCommands(NamedTuple):
     those of a source, why they are not the same; empty if they are. It raises MapfoldError for
     settings that no fold can use."""
 
-    begins: UseSettings | None = None
+    begins: commands.UseSettings | None = None
     settings: Mapping[str, object] | None = None
     labels: Mapping[str, str] = {}
-    all: Sequence[Command] = ()
+    all: Sequence[commands.Command] = ()
     differs: Callable[[Mapping[str, object] | None, Mapping[str, object]], str] = (
         lambda here, there: "" if here == there else "the settings are others"
     )
@@ -73,17 +66,17 @@ class SourceCommands:
         """Decide on the command in ``payload``: the reason to pass over it, empty to append it.
         ``is_first`` in a log without events. Raises NotTakenOver."""
         try:
-            command = parse_command(payload)
-        except InvalidCommand as error:
+            command = commands.parse_command(payload)
+        except commands.InvalidCommand as error:
             raise NotTakenOver(f"no command: {error}") from None
-        if isinstance(command, UseSettings):
+        if isinstance(command, commands.UseSettings):
             return self._take_settings(command, is_first=is_first)
         if command.command_id in self._ids:
             return IS_KNOWN
-        if isinstance(command, Relabel):
+        if isinstance(command, commands.Relabel):
             self._check_labels(command)
             self.names_labels = True
-        elif not (isinstance(command, Undo) and command.undone in self._ids):
+        elif not (isinstance(command, commands.Undo) and command.undone in self._ids):
             edit = command_line("edit", self._log, command.kind)
             raise NotTakenOver(
                 f"{command.kind} is about things of its own log; `{edit}` gives it here"
@@ -91,7 +84,7 @@ class SourceCommands:
         self._ids.add(command.command_id)
         return ""
 
-    def _take_settings(self, command: UseSettings, *, is_first: bool) -> str:
+    def _take_settings(self, command: commands.UseSettings, *, is_first: bool) -> str:
         try:
             differs = self._known.differs(self._settings, command.settings)
         except MapfoldError as error:
@@ -107,7 +100,7 @@ class SourceCommands:
             return SETTINGS_CHOSEN
         raise NotTakenOver(differs)
 
-    def _check_labels(self, command: Relabel) -> None:
+    def _check_labels(self, command: commands.Relabel) -> None:
         for label, name in command.labels:
             here = self._known.labels.get(label, name)
             if here != name:

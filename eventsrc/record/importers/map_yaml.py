@@ -19,29 +19,13 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from eventsrc.base import user_files
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
-from eventsrc.base.user_files import (
-    MAX_DEPTH,
-    MAX_DIGITS,
-    FileFault,
-    checked_int,
-    read_file,
-    too_deep,
-)
+from eventsrc.envelope import occupancy_map
 from eventsrc.envelope.grey_images import BadImage, decode_rgba
 from eventsrc.envelope.ingest import abbreviate
 from eventsrc.envelope.model import Position, describe_error
-from eventsrc.envelope.occupancy_map import (
-    MAX_MAP_CELLS,
-    MAX_MAP_SIDE,
-    OCCUPIED,
-    UNKNOWN,
-    InvalidMap,
-    MapYaw,
-    OccupancyMap,
-    Resolution,
-)
 
 MAX_YAML_BYTES = 64 * 1024
 MAX_IMAGE_BYTES = 128 * 1024 * 1024
@@ -54,28 +38,32 @@ class _MapFile(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     image: Annotated[str, Field(min_length=1)]
-    resolution: Resolution
-    origin: tuple[Position, Position, MapYaw]
+    resolution: occupancy_map.Resolution
+    origin: tuple[Position, Position, occupancy_map.MapYaw]
     negate: Annotated[int, Field(ge=0, le=1)]
     occupied_thresh: _Share
     free_thresh: _Share
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
 
-def read_map_yaml(path: Path, floor: str | None = None) -> OccupancyMap:
+def read_map_yaml(path: Path, floor: str | None = None) -> occupancy_map.OccupancyMap:
     """The map of a map.yaml, for the floor ``floor``. The image's path is relative to the file.
     Raises MisuseError."""
     described = _described(path)
     image = path.parent / described.image
     try:
-        pixels = decode_rgba(_content(image, MAX_IMAGE_BYTES), MAX_MAP_SIDE, MAX_MAP_CELLS)
+        pixels = decode_rgba(
+            _content(image, MAX_IMAGE_BYTES),
+            occupancy_map.MAX_MAP_SIDE,
+            occupancy_map.MAX_MAP_CELLS,
+        )
         cells = _cells(pixels, described)[::-1]
         about = path.stem, described.resolution, described.origin, path.name
-        map_ = OccupancyMap(*about, cells, floor)
+        map_ = occupancy_map.OccupancyMap(*about, cells, floor)
         map_.encode()
     except BadImage as error:
         raise MisuseError(f"{image}: {error}; give a PGM or PNG image") from None
-    except InvalidMap as error:
+    except occupancy_map.InvalidMap as error:
         raise MisuseError(f"{path}: {error}") from None
     return map_
 
@@ -84,7 +72,7 @@ def _described(path: Path) -> _MapFile:
     text = _content(path, MAX_YAML_BYTES)
     try:
         document = parse_yaml(text)
-    except FileFault as fault:
+    except user_files.FileFault as fault:
         raise MisuseError(f"{path}: no YAML: {fault}; give a map server's map.yaml") from None
     if not isinstance(document, dict):
         raise MisuseError(
@@ -134,8 +122,8 @@ _ADVICE: Final = {
 
 def _content(path: Path, limit: int) -> bytes:
     try:
-        return read_file(path, limit)
-    except FileFault as fault:
+        return user_files.read_file(path, limit)
+    except user_files.FileFault as fault:
         raise MisuseError(f"{visible(str(path))}: {fault}; check the path") from None
 
 
@@ -144,15 +132,15 @@ def parse_yaml(text: bytes) -> Any:
     with them can be a document without end. Raises FileFault."""
     try:
         return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
-    except FileFault:
+    except user_files.FileFault:
         raise
     except yaml.YAMLError as error:
-        raise FileFault(visible(" ".join(str(error).split()))) from None
+        raise user_files.FileFault(visible(" ".join(str(error).split()))) from None
     except RecursionError:
-        raise too_deep() from None
+        raise user_files.too_deep() from None
     except (ValueError, ArithmeticError, LookupError, AttributeError, TypeError) as error:
         # of PyYAML, for values that are not of the type of their tag
-        raise FileFault(f"a value that is not of its type ({error})") from None
+        raise user_files.FileFault(f"a value that is not of its type ({error})") from None
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
@@ -163,28 +151,28 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             alias = self.peek_event()
-            raise FileFault(
+            raise user_files.FileFault(
                 f"line {alias.start_mark.line + 1}: an alias, *{visible(alias.anchor)[:40]}; "
                 "write the value there instead"
             )
         self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise too_deep()
+        if self._depth > user_files.MAX_DEPTH:
+            raise user_files.too_deep()
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
 
     def construct_yaml_int(self, node: Any) -> int:
-        return checked_int(super().construct_yaml_int(_short(node)), node.value)
+        return user_files.checked_int(super().construct_yaml_int(_short(node)), node.value)
 
     def construct_yaml_float(self, node: Any) -> float:
         return float(super().construct_yaml_float(_short(node)))
 
 
 def _short(node: Any) -> Any:
-    if isinstance(node.value, str) and len(node.value) > MAX_DIGITS:
+    if isinstance(node.value, str) and len(node.value) > user_files.MAX_DIGITS:
         line = node.start_mark.line + 1
-        raise FileFault(
+        raise user_files.FileFault(
             f"line {line}: a number of {len(node.value):,} characters, {visible(node.value[:20])}…"
         )
     return node
@@ -200,14 +188,14 @@ def _cells(pixels: NDArray[np.uint8], described: _MapFile) -> NDArray[np.uint8]:
     table = _raw_values() if described.mode == "raw" else _threshold_values(described)
     cells: NDArray[np.uint8] = table[total]
     if described.mode != "raw":
-        cells[pixels[..., 3] != _OPAQUE] = UNKNOWN
+        cells[pixels[..., 3] != _OPAQUE] = occupancy_map.UNKNOWN
     return cells
 
 
 def _raw_values() -> NDArray[np.uint8]:
     """The cell of each sum of red, green and blue, 0 to 765."""
     level = np.rint(np.arange(_WHITE + 1) / 3)
-    return np.where(level <= OCCUPIED, level, UNKNOWN).astype(np.uint8)
+    return np.where(level <= occupancy_map.OCCUPIED, level, occupancy_map.UNKNOWN).astype(np.uint8)
 
 
 def _threshold_values(described: _MapFile) -> NDArray[np.uint8]:
@@ -215,8 +203,10 @@ def _threshold_values(described: _MapFile) -> NDArray[np.uint8]:
     shade = np.arange(_WHITE + 1) / _WHITE
     occupied = shade if described.negate else 1.0 - shade
     low, high = described.free_thresh, described.occupied_thresh
-    between = np.full(_WHITE + 1, float(UNKNOWN))
+    between = np.full(_WHITE + 1, float(occupancy_map.UNKNOWN))
     if described.mode == "scale" and high > low:
         between = np.rint((occupied - low) / (high - low) * 98.0 + 1.0).clip(1.0, 99.0)
-    values = np.where(occupied > high, float(OCCUPIED), np.where(occupied < low, 0.0, between))
+    values = np.where(
+        occupied > high, float(occupancy_map.OCCUPIED), np.where(occupied < low, 0.0, between)
+    )
     return values.astype(np.uint8)

@@ -23,13 +23,7 @@ from typing import Final, NamedTuple
 from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError, TransportError
-from eventsrc.envelope.commands import (
-    MAX_COMMAND_BYTES,
-    Command,
-    InvalidCommand,
-    encode_command,
-    parse_command,
-)
+from eventsrc.envelope import commands
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
@@ -78,14 +72,14 @@ class NoAnswer(TransportError):
 
 
 def send_command(
-    session: Session, log_id: str, command: Command, known_at: Offset, *, timeout_s: float
+    session: Session, log_id: str, command: commands.Command, known_at: Offset, *, timeout_s: float
 ) -> Recorded:
     """Send ``command`` to the recorder of a log; return its reply when the event is durable.
 
     Raises CommandRefused, NewerCommand, or NoAnswer, after which the command may still be recorded.
     """
     selector = f"{edit_key(log_id)}?{KNOWN_AT}={known_at}"
-    replies = session.get_replies(selector, encode_command(command), timeout_s=timeout_s)
+    replies = session.get_replies(selector, commands.encode_command(command), timeout_s=timeout_s)
     for good, payload in replies:
         try:
             if good:
@@ -103,7 +97,7 @@ MAX_SELECTOR: Final = 4_096
 MAX_EDITS_WAITING: Final = 64
 """Commands in the queue; more are refused at once."""
 
-CheckCommand = Callable[[Command], None]
+CheckCommand = Callable[[commands.Command], None]
 """Raises MapfoldError for a command that no fold could use."""
 
 
@@ -114,10 +108,10 @@ class EditRequest:
     def __init__(self, query: Query) -> None:
         self._query = query
         self.fault: str | None = None
-        if query.size > MAX_COMMAND_BYTES or query.selector_size > MAX_SELECTOR:
+        if query.size > commands.MAX_COMMAND_BYTES or query.selector_size > MAX_SELECTOR:
             self.fault = (
                 f"a command of {query.size:,} bytes behind a selector of {query.selector_size:,}; "
-                f"at most {MAX_COMMAND_BYTES:,} and {MAX_SELECTOR:,} are taken"
+                f"at most {commands.MAX_COMMAND_BYTES:,} and {MAX_SELECTOR:,} are taken"
             )
         self.payload = query.payload if self.fault is None else b""
         known_at = query.parameters.get(KNOWN_AT, "") if self.fault is None else ""
@@ -153,35 +147,35 @@ class KnownCommands:
         known = cls()
         for event in reader.read(keys={COMMAND_KEY}):
             try:
-                command = parse_command(event.payload)
-            except InvalidCommand as error:
+                command = commands.parse_command(event.payload)
+            except commands.InvalidCommand as error:
                 raise LogDamaged(
                     f"{reader.path}: the event at offset {event.offset} is no command: {error}"
                 ) from None
             known.add(command, Offset(event.offset))
         return known
 
-    def add(self, command: Command, offset: Offset) -> None:
+    def add(self, command: commands.Command, offset: Offset) -> None:
         """Add a command that was appended."""
         self._by_id.setdefault(command.command_id, KnownCommand(offset, _sha256(command)))
         self.end = Offset(offset + 1)
 
-    def find(self, command: Command) -> Offset | None:
+    def find(self, command: commands.Command) -> Offset | None:
         """The offset at which this command is recorded; None if its id is new. Raises
         InvalidCommand if the id is that of another command."""
         known = self._by_id.get(command.command_id)
         if known is None:
             return None
         if known.sha256 != _sha256(command):
-            raise InvalidCommand(
+            raise commands.InvalidCommand(
                 f"command_id: {command.command_id!r} is that of another command, at offset "
                 f"{known.offset}"
             )
         return known.offset
 
 
-def _sha256(command: Command) -> str:
-    return hashlib.sha256(encode_command(command)).hexdigest()
+def _sha256(command: commands.Command) -> str:
+    return hashlib.sha256(commands.encode_command(command)).hexdigest()
 
 
 class _Waiting(NamedTuple):
@@ -214,10 +208,10 @@ class Edits:
             request.refuse(self._known)
             return
         try:
-            command = parse_command(request.payload)
+            command = commands.parse_command(request.payload)
             self._check(command)
             before = self._known.find(command)
-        except (InvalidCommand, MapfoldError) as error:
+        except (commands.InvalidCommand, MapfoldError) as error:
             request.refuse(str(error))
             return
         known_at = request.known_at
@@ -231,7 +225,7 @@ class Edits:
         )
         self._waiting.append(_Waiting(offset, request, recorded))
         if before is None:
-            self._writer.append(COMMAND_KEY, encode_command(command))
+            self._writer.append(COMMAND_KEY, commands.encode_command(command))
             self._known.add(command, offset)
 
     def reply_to_durable(self, durable: Offset) -> None:

@@ -36,15 +36,7 @@ from eventsrc.envelope.system_events import LOSS_KEY, ROS_KEY, Loss
 from eventsrc.log import LogWriter
 from eventsrc.record.append import CROP_FORMAT
 from eventsrc.record.gap_history import delete_ledger, save_ledger
-from eventsrc.record.robot.acks import (
-    MAX_PER_ACK,
-    Ack,
-    Refusal,
-    Refusals,
-    Sent,
-    ack_key,
-    refusal_key,
-)
+from eventsrc.record.robot import acks
 from eventsrc.record.transport.session import Received
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.stream import Counts
@@ -60,7 +52,7 @@ class Replies:
 
     def __init__(self) -> None:
         self._synced: defaultdict[tuple[RunId, str], list[str]] = defaultdict(list)
-        self._refusals: defaultdict[str, list[Refusal]] = defaultdict(list)
+        self._refusals: defaultdict[str, list[acks.Refusal]] = defaultdict(list)
 
     def add(self, event: CheckedMessage) -> None:
         """Add a message whose event is synced."""
@@ -72,12 +64,15 @@ class Replies:
     def messages(self, log_id: str) -> Iterator[tuple[str, bytes]]:
         """Key and payload of each reply."""
         for (run_id, key), digests in self._synced.items():
-            for start in range(0, len(digests), MAX_PER_ACK):
-                some = tuple(digests[start : start + MAX_PER_ACK])
-                ack = Ack(run_id=run_id, key=key, log_id=log_id, sha256=some)
-                yield ack_key(run_id), ack.encode()
+            for start in range(0, len(digests), acks.MAX_PER_ACK):
+                some = tuple(digests[start : start + acks.MAX_PER_ACK])
+                ack = acks.Ack(run_id=run_id, key=key, log_id=log_id, sha256=some)
+                yield acks.ack_key(run_id), ack.encode()
         for key, refused in self._refusals.items():
-            yield refusal_key(key), Refusals(log_id=log_id, refused=tuple(refused)).encode()
+            yield (
+                acks.refusal_key(key),
+                acks.Refusals(log_id=log_id, refused=tuple(refused)).encode(),
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +151,7 @@ class _Announcement(NamedTuple):
     """A robot's last keyframe, announced when the log's next offset was ``offset``."""
 
     offset: Offset
-    sent: Sent
+    sent: acks.Sent
 
 
 class WriterThread:
@@ -313,7 +308,7 @@ class WriterThread:
         """Keep announcements until everything appended so far is synced."""
         for message in announcements:
             try:
-                sent = Sent.decode(message.payload)
+                sent = acks.Sent.decode(message.payload)
             except ValidationError:
                 continue  # no announcement that this version understands
             self._announcements.append(_Announcement(self._writer.next_offset, sent))

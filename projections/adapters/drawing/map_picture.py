@@ -10,38 +10,14 @@ from typing import Final, overload
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.grey_images import with_few_colours
-from projections.adapters import palette
-from projections.adapters.scene import (
-    HousePlan,
-    LostRobot,
-    MergeMark,
-    objects_shown,
-    place_names,
-    spot_of,
-)
+from projections.adapters import palette, scene
 from projections.fold.deltas import PlacesMerged
 from projections.map.confirmed import objects_text
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 from projections.store.history_records import Merge
 
-from .base_layers import (
-    draw_drives,
-    draw_floor,
-    draw_map_walls,
-    draw_regions,
-    draw_walls,
-    wall_spots,
-)
-from .overlays import (
-    DOT_M,
-    draw_adjacency,
-    draw_lost,
-    draw_merge_marks,
-    draw_objects,
-    draw_place_names,
-    draw_room_names,
-)
+from . import base_layers, overlays
 from .sheet import Extent, Sheet, check_suffix, new_sheet
 
 LEGEND = (
@@ -60,9 +36,9 @@ def draw_map(
     out: Path,
     *,
     title: str,
-    plan: HousePlan | None = None,
-    lost: LostRobot | None = None,
-    marks: Sequence[MergeMark] = (),
+    plan: scene.HousePlan | None = None,
+    lost: scene.LostRobot | None = None,
+    marks: Sequence[scene.MergeMark] = (),
     everything: bool = False,
     min_observations: int = 1,
 ) -> None:
@@ -72,8 +48,8 @@ def draw_map(
     are not confirmed. Raises MisuseError when ``out`` cannot be written or has another suffix.
     """
     check_suffix(out)
-    shown = objects_shown(view, everything=everything, min_observations=min_observations)
-    compose(view, title, plan or HousePlan(), lost, marks, shown).save(out)
+    shown = scene.objects_shown(view, everything=everything, min_observations=min_observations)
+    compose(view, title, plan or scene.HousePlan(), lost, marks, shown).save(out)
 
 
 _SMALLER: Final = ((90, 64), (65, 64), (45, 64), (30, 64), (20, 16))
@@ -87,7 +63,7 @@ def map_png(view: MapView, title: str, most_bytes: int) -> bytes | None: ...
 def map_png(view: MapView, title: str, most_bytes: int | None = None) -> bytes | None:
     """``view`` drawn as a PNG; with ``most_bytes`` in few colours and as sharp as it can be, None
     if none is so small."""
-    sheet = compose(view, title, HousePlan())
+    sheet = compose(view, title, scene.HousePlan())
     if most_bytes is None:
         return sheet.png()
     pictures = (with_few_colours(sheet.png(dpi), colours) for dpi, colours in _SMALLER)
@@ -97,30 +73,32 @@ def map_png(view: MapView, title: str, most_bytes: int | None = None) -> bytes |
 def compose(
     view: MapView,
     title: str,
-    plan: HousePlan,
-    lost: LostRobot | None = None,
-    marks: Sequence[MergeMark] = (),
+    plan: scene.HousePlan,
+    lost: scene.LostRobot | None = None,
+    marks: Sequence[scene.MergeMark] = (),
     objects: Sequence[ObjectRecord] | None = None,
 ) -> Sheet:
     """The finished sheet, not yet written to a file; ``objects`` are those to draw, by default the
     confirmed ones."""
     by_evidence = view.settings.fusion == "evidence"
-    shown = objects_shown(view) if objects is None else objects
+    shown = scene.objects_shown(view) if objects is None else objects
     standing = [found.spot for found in shown] if by_evidence else []
-    sheet = new_sheet(view, plan, [*standing, *wall_spots(view)])
-    draw_floor(sheet, plan)
-    draw_map_walls(sheet, view)
-    draw_regions(sheet, view)
-    draw_drives(sheet, view)
-    draw_walls(sheet, plan)
-    draw_adjacency(sheet, view)
-    draw_place_names(sheet, view)
+    sheet = new_sheet(view, plan, [*standing, *base_layers.wall_spots(view)])
+    base_layers.draw_floor(sheet, plan)
+    base_layers.draw_map_walls(sheet, view)
+    base_layers.draw_regions(sheet, view)
+    base_layers.draw_drives(sheet, view)
+    base_layers.draw_walls(sheet, plan)
+    overlays.draw_adjacency(sheet, view)
+    overlays.draw_place_names(sheet, view)
     if lost is not None:
-        draw_lost(sheet, lost)
-    sheet.occupied += (Extent(x, y, DOT_M, DOT_M) for x, y in standing)  # rooms' corners
-    draw_room_names(sheet, plan)
-    draw_merge_marks(sheet, marks)
-    left_out = draw_objects(sheet, shown)
+        overlays.draw_lost(sheet, lost)
+    sheet.occupied += (
+        Extent(x, y, overlays.DOT_M, overlays.DOT_M) for x, y in standing
+    )  # rooms' corners
+    overlays.draw_room_names(sheet, plan)
+    overlays.draw_merge_marks(sheet, marks)
+    left_out = overlays.draw_objects(sheet, shown)
     sheet.header(0, title, 14, palette.INK, "bold")
     sheet.header(1, _numbers(view, len(shown)), 9.5, palette.SMALL_PRINT)
     legend = legend_lines(lost, marks, left_out, by_evidence=by_evidence)
@@ -141,8 +119,8 @@ def _numbers(view: MapView, shown: int) -> str:
 
 
 def legend_lines(
-    lost: LostRobot | None,
-    marks: Sequence[MergeMark],
+    lost: scene.LostRobot | None,
+    marks: Sequence[scene.MergeMark],
     left_out: int,
     *,
     by_evidence: bool = False,
@@ -158,15 +136,15 @@ def legend_lines(
     return [EVIDENCE_LEGEND if by_evidence else LEGEND, "    ".join(parts)]
 
 
-def merge_marks(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[MergeMark]:
+def merge_marks(view: MapView, merges: Iterable[Merge | PlacesMerged]) -> list[scene.MergeMark]:
     """One mark for each merge, at the position of its bridging keyframe."""
-    names = place_names(view)
-    marks: list[MergeMark] = []
+    names = scene.place_names(view)
+    marks: list[scene.MergeMark] = []
     for merge in merges:
         keyframe = view.keyframes[merge.bridge]
-        spot = spot_of(keyframe)
+        spot = scene.spot_of(keyframe)
         if spot is not None:
             absorbed = " and ".join(names[place] for place in merge.absorbed)
             text = f"{absorbed} into {names[merge.survivor]}, keyframe {keyframe.keyframe_id}"
-            marks.append(MergeMark(*spot, text))
+            marks.append(scene.MergeMark(*spot, text))
     return marks

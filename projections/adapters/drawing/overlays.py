@@ -9,16 +9,7 @@ from collections.abc import Iterable, Sequence
 
 from matplotlib.patches import Circle, Ellipse
 
-from projections.adapters import palette
-from projections.adapters.scene import (
-    HousePlan,
-    LostRobot,
-    MergeMark,
-    Spot,
-    object_groups,
-    place_badges,
-    two_sigma,
-)
+from projections.adapters import palette, scene
 from projections.map.records import ObjectRecord
 from projections.map.view import MapView
 
@@ -49,14 +40,14 @@ def draw_adjacency(sheet: Sheet, view: MapView) -> None:
 
 def draw_place_names(sheet: Sheet, view: MapView) -> None:
     """Each place's name on its centroid, in its colour, with its likely type."""
-    names = place_badges(view)
+    names = scene.place_badges(view)
     for ordinal, place in view.places.items():
         centroid = place.centroid_x, place.centroid_y
         colours = palette.place_colour(ordinal), "white", "white"
         _draw_badge(sheet, centroid, names[ordinal], 10, colours, "round,pad=0.3,rounding_size=0.9")
 
 
-def draw_room_names(sheet: Sheet, plan: HousePlan) -> None:
+def draw_room_names(sheet: Sheet, plan: scene.HousePlan) -> None:
     """Each room's name, in the first of its corners that is free."""
     height = 12 * sheet.unit
     for name, (x0, y0, x1, y1) in plan.rooms:
@@ -70,7 +61,7 @@ def draw_room_names(sheet: Sheet, plan: HousePlan) -> None:
 
 def draw_objects(sheet: Sheet, objects: Iterable[ObjectRecord]) -> int:
     """A dot for each object, a label for each group; returns how many labels did not fit."""
-    groups = object_groups(objects)
+    groups = scene.object_groups(objects)
     for group in groups:
         colour = palette.INK if group.place is None else palette.place_colour(group.place)
         xs, ys = zip(*(member.spot for member in group.members), strict=True)
@@ -94,7 +85,7 @@ def draw_objects(sheet: Sheet, objects: Iterable[ObjectRecord]) -> int:
 def _draw_evidence(sheet: Sheet, found: ObjectRecord, colour: str) -> None:
     """An estimate's ellipse, and an arrow from where the object stood before it was moved."""
     if found.estimate is not None:
-        width, height, angle = two_sigma(found.estimate)
+        width, height, angle = scene.two_sigma(found.estimate)
         ellipse = Ellipse(
             found.spot, width, height, angle=angle, fill=False, edgecolor=colour,
             lw=0.7, alpha=0.75 if width < _WIDE_M else 0.35, zorder=8,
@@ -108,7 +99,7 @@ def _draw_evidence(sheet: Sheet, found: ObjectRecord, colour: str) -> None:
         sheet.axes.annotate("", found.spot, start, zorder=9, arrowprops=arrow)
 
 
-def draw_merge_marks(sheet: Sheet, marks: Sequence[MergeMark]) -> None:
+def draw_merge_marks(sheet: Sheet, marks: Sequence[scene.MergeMark]) -> None:
     """A ring around each keyframe that merged places, with its text."""
     for mark in marks:
         sheet.axes.scatter(
@@ -124,7 +115,7 @@ def draw_merge_marks(sheet: Sheet, marks: Sequence[MergeMark]) -> None:
             _draw_text(sheet, box, mark.text, _LABEL_PT, palette.BRIDGE, weight="bold")
 
 
-def draw_lost(sheet: Sheet, lost: LostRobot) -> None:
+def draw_lost(sheet: Sheet, lost: scene.LostRobot) -> None:
     """The lost robot's true position, the estimate with its spread, and a line between them."""
     truth, estimate = lost.truth, lost.estimate
     if estimate is not None:
@@ -140,7 +131,7 @@ def draw_lost(sheet: Sheet, lost: LostRobot) -> None:
     _draw_robot(sheet, truth, palette.TRUTH, "X")
 
 
-def _draw_robot(sheet: Sheet, spot: Spot, colour: str, marker: str) -> None:
+def _draw_robot(sheet: Sheet, spot: scene.Spot, colour: str, marker: str) -> None:
     sheet.axes.scatter(
         [spot.x], [spot.y], s=120, marker=marker, facecolor=colour, edgecolor="white", lw=1.2,
         zorder=16,

@@ -20,18 +20,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from projections.adapters import palette
-from projections.adapters.scene import (
-    Point,
-    ShownObject,
-    ShownPlace,
-    Way,
-    objects_of,
-    places_of,
-    robot_of,
-    thinned,
-    ways_of,
-)
+from projections.adapters import palette, scene
 from projections.fold.deltas import PlaceOrdinal
 from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
@@ -50,7 +39,7 @@ _GOLDEN_ANGLE: Final = math.pi * (3.0 - math.sqrt(5.0))
 class Dots:
     """Spots in metres, with a colour each, #rrggbb, and a label each or none."""
 
-    spots: tuple[Point, ...]
+    spots: tuple[scene.Point, ...]
     colours: tuple[str, ...]
     labels: tuple[str, ...] | None
     radius_m: float
@@ -60,7 +49,7 @@ class Dots:
 class Lines:
     """Strips of spots in metres, each with a colour and half its width."""
 
-    strips: tuple[tuple[Point, ...], ...]
+    strips: tuple[tuple[scene.Point, ...], ...]
     colours: tuple[str, ...]
     radii_m: tuple[float, ...]
 
@@ -69,8 +58,8 @@ class Lines:
 class Arrow:
     """From a spot in metres by a vector."""
 
-    spot: Point
-    vector: Point
+    spot: scene.Point
+    vector: scene.Point
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +67,7 @@ class Graph:
     """Nodes by id, with spots in pixels of the screen, y downwards; edges by ids."""
 
     ids: tuple[str, ...]
-    spots: tuple[Point, ...]
+    spots: tuple[scene.Point, ...]
     colours: tuple[str, ...]
     labels: tuple[str, ...]
     edges: tuple[tuple[str, str], ...]
@@ -90,8 +79,8 @@ Part = Dots | Lines | Arrow | Graph
 def map_parts(view: MapView, *, everything: bool) -> dict[Path, Part]:
     """The whole map but for the robot, and without ``everything`` for Objects that are not
     confirmed."""
-    places, objects = places_of(view), objects_of(view, everything=everything)
-    ways = ways_of(view, places)
+    places, objects = scene.places_of(view), scene.objects_of(view, everything=everything)
+    ways = scene.ways_of(view, places)
     parts: dict[Path, Part] = {("graph",): _graph(view, places, objects, ways)}
     for floor, given in view.maps_in_force().items():
         ends = wall_segments(given.map)
@@ -106,7 +95,7 @@ def map_parts(view: MapView, *, everything: bool) -> dict[Path, Part]:
 
 def robot_parts(view: MapView) -> dict[Path, Part]:
     """The robot's position and heading at the latest keyframe with a pose."""
-    latest = robot_of(view)
+    latest = scene.robot_of(view)
     if latest is None or latest.pose is None:
         return {}
     yaw = latest.pose.yaw_rad
@@ -121,9 +110,9 @@ def _root(floor: str | None) -> Path:
 def _floor(
     view: MapView,
     floor: str | None,
-    all_places: Sequence[ShownPlace],
-    all_objects: Sequence[ShownObject],
-    all_ways: Sequence[Way],
+    all_places: Sequence[scene.ShownPlace],
+    all_objects: Sequence[scene.ShownObject],
+    all_ways: Sequence[scene.Way],
 ) -> Iterator[tuple[Path, Part]]:
     places = [p for p in all_places if p.floor == floor]
     regions = [(p.colour, outline) for p in places for outline in p.outlines]
@@ -164,7 +153,7 @@ def _floor(
         ),
     )
     posed = [k for k in view.keyframes if k.floor == floor and k.pose is not None]
-    shown = thinned(posed)
+    shown = scene.thinned(posed)
     yield (
         ("keyframes",),
         Dots(
@@ -181,19 +170,19 @@ def _floor(
         runs[k.run_id].append(k)
     for run_id, path in runs.items():
         if len(path) > 1:
-            strips = (tuple(_spots(thinned(path))),)
+            strips = (tuple(_spots(scene.thinned(path))),)
             yield ("path", run_id), _lines(strips, palette.FAINT, 0.015)
 
 
-def _spots(keyframes: Iterable[KeyframeRecord]) -> list[Point]:
+def _spots(keyframes: Iterable[KeyframeRecord]) -> list[scene.Point]:
     return [(k.pose.x_m, k.pose.y_m) for k in keyframes if k.pose is not None]
 
 
-def _lines(strips: tuple[tuple[Point, ...], ...], colour: str, radius_m: float) -> Lines:
+def _lines(strips: tuple[tuple[scene.Point, ...], ...], colour: str, radius_m: float) -> Lines:
     return Lines(strips, (colour,) * len(strips), (radius_m,) * len(strips))
 
 
-def _object_colour(found: ShownObject) -> str:
+def _object_colour(found: scene.ShownObject) -> str:
     place = found.record.place
     if found.missing:
         return _MISSING
@@ -202,9 +191,9 @@ def _object_colour(found: ShownObject) -> str:
 
 def _graph(
     view: MapView,
-    places: Sequence[ShownPlace],
-    objects: Sequence[ShownObject],
-    ways: Sequence[Way],
+    places: Sequence[scene.ShownPlace],
+    objects: Sequence[scene.ShownObject],
+    ways: Sequence[scene.Way],
 ) -> Graph:
     spots = {_place_node(view, p.record.ordinal): _in_pixels(p.centroid) for p in places}
     edges = [
@@ -230,10 +219,10 @@ def _place_node(view: MapView, place: PlaceOrdinal) -> str:
     return f"place/{view.all_places[place].place_id}"
 
 
-def _in_pixels(spot: Point) -> Point:
+def _in_pixels(spot: scene.Point) -> scene.Point:
     return spot[0] * _GRAPH_PX_PER_M, -spot[1] * _GRAPH_PX_PER_M
 
 
-def _on_spiral(middle: Point, n: int) -> Point:
+def _on_spiral(middle: scene.Point, n: int) -> scene.Point:
     away, angle = _RING_PX * math.sqrt(n), _GOLDEN_ANGLE * n
     return middle[0] + away * math.cos(angle), middle[1] + away * math.sin(angle)

@@ -13,26 +13,11 @@ from psycopg import sql
 
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import KeyframeId, Offset, RunId, StatedCamera
-from projections.fold.deltas import (
-    KeyframeOrdinal,
-    MapGiven,
-    ObjectOrdinal,
-    ObservationOrdinal,
-    PlaceOrdinal,
-    Pose,
-    RunOrdinal,
-)
+from projections.fold import deltas
 from projections.fold.exact import UM_PER_M, metres_to_um
 from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
-from projections.map.records import (
-    EstimatedPosition,
-    KeyframeRecord,
-    ObjectRecord,
-    PlaceRecord,
-    Relocation,
-    RunRecord,
-)
+from projections.map import records
 from projections.map.view import MapView
 from projections.postgres import checkpoints, map_table
 from projections.postgres.connection import Connection, describe_connection, statements, tables
@@ -49,9 +34,9 @@ class LiveView(MapView):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings, keep_embeddings=False)
         self.log_id: str | None = None
-        self.seen_in: dict[int, list[KeyframeRecord]] = {}
+        self.seen_in: dict[int, list[records.KeyframeRecord]] = {}
 
-    def sightings(self, found: ObjectRecord) -> list[KeyframeRecord]:
+    def sightings(self, found: records.ObjectRecord) -> list[records.KeyframeRecord]:
         """The keyframes that saw an Object, one for each observation, in their order."""
         return self.seen_in.get(found.ordinal, [])
 
@@ -73,7 +58,7 @@ def read_view(connection: Connection) -> LiveView:
         settings = Settings() if kept is None else Settings.model_validate_json(kept.settings)
         view = LiveView(settings)
         for floor, given in map_table.read_with_key(connection)[1].items():
-            view.maps[floor] = MapGiven(Offset(0), given)
+            view.maps[floor] = deltas.MapGiven(Offset(0), given)
     if kept is not None:
         view.log_id = kept.log_id
         view.advance(kept.next_offset)
@@ -91,21 +76,23 @@ def _fill(view: LiveView, rows: dict[str, list[Any]]) -> None:
     runs = _numbers(row[0] for row in rows["runs"])
     for ordinal, (_, properties) in enumerate(rows["runs"]):
         run = json.loads(properties)
-        view.runs.append(RunRecord(RunOrdinal(ordinal), RunId(run["run_id"]), run["started_at"]))
+        view.runs.append(
+            records.RunRecord(deltas.RunOrdinal(ordinal), RunId(run["run_id"]), run["started_at"])
+        )
     places = _numbers(row[0] for row in rows["places"])
     for ordinal, (_, properties) in enumerate(rows["places"]):
-        place = _place(PlaceOrdinal(ordinal), json.loads(properties))
+        place = _place(deltas.PlaceOrdinal(ordinal), json.loads(properties))
         view.all_places.append(place)
         view.places[place.ordinal] = place
     for a, b, properties in rows["edges"]:
-        pair = PlaceOrdinal(places[a]), PlaceOrdinal(places[b])
+        pair = deltas.PlaceOrdinal(places[a]), deltas.PlaceOrdinal(places[b])
         view.adjacency[pair] = json.loads(properties)["shared_transitions"]
     _fill_keyframes(view, rows["keyframes"], runs, places)
     run_of = {run.run_id: run.ordinal for run in view.runs}
     objects = _numbers(row[0] for row in rows["objects"])
     for ordinal, (_, properties, place_id) in enumerate(rows["objects"]):
-        found = _object(ObjectOrdinal(ordinal), json.loads(properties), run_of)
-        found.place = None if place_id is None else PlaceOrdinal(places[place_id])
+        found = _object(deltas.ObjectOrdinal(ordinal), json.loads(properties), run_of)
+        found.place = None if place_id is None else deltas.PlaceOrdinal(places[place_id])
         view.all_objects.append(found)
         view.objects[found.ordinal] = found
         view.contents.update(found)
@@ -128,18 +115,18 @@ def _fill_keyframes(
         pose, floor = None, None
         if posed is not None:
             at = json.loads(posed)
-            pose = Pose(metres_to_um(at["map_x"]), metres_to_um(at["map_y"]), at["map_yaw"])
+            pose = deltas.Pose(metres_to_um(at["map_x"]), metres_to_um(at["map_y"]), at["map_yaw"])
             floor = at.get("floor")
-        keyframe = KeyframeRecord(
-            KeyframeOrdinal(ordinal),
+        keyframe = records.KeyframeRecord(
+            deltas.KeyframeOrdinal(ordinal),
             Offset(known["offset"]),
-            RunOrdinal(runs[run]),
+            deltas.RunOrdinal(runs[run]),
             RunId(known["run_id"]),
             KeyframeId(known["keyframe_id"]),
             known["timestamp"],
             pose,
             view.survivors,
-            joined=None if place_id is None else PlaceOrdinal(places[place_id]),
+            joined=None if place_id is None else deltas.PlaceOrdinal(places[place_id]),
             floor=floor,
             camera=StatedCamera(**known["camera"]) if "camera" in known else None,
         )
@@ -154,12 +141,12 @@ def _fill_keyframes(
             place.unordered_members.append(keyframe.ordinal)
 
 
-def _place(ordinal: PlaceOrdinal, known: dict[str, Any]) -> PlaceRecord:
+def _place(ordinal: deltas.PlaceOrdinal, known: dict[str, Any]) -> records.PlaceRecord:
     count = known["keyframe_count"]
-    return PlaceRecord(
+    return records.PlaceRecord(
         ordinal,
         known["place_id"],
-        KeyframeOrdinal(0),
+        deltas.KeyframeOrdinal(0),
         Offset(0),
         count,
         round(known["centroid_x"] * count * UM_PER_M),
@@ -169,10 +156,10 @@ def _place(ordinal: PlaceOrdinal, known: dict[str, Any]) -> PlaceRecord:
 
 
 def _object(
-    ordinal: ObjectOrdinal, known: dict[str, Any], run_of: dict[RunId, RunOrdinal]
-) -> ObjectRecord:
+    ordinal: deltas.ObjectOrdinal, known: dict[str, Any], run_of: dict[RunId, deltas.RunOrdinal]
+) -> records.ObjectRecord:
     count = known["obs_count"]
-    found = ObjectRecord(
+    found = records.ObjectRecord(
         ordinal,
         known["object_id"],
         known["class_name"],
@@ -186,12 +173,14 @@ def _object(
     if "est_x" in known:
         xx, xy, yy = (round(known[f"est_{each}"] * _UM2_PER_M2) for each in ("xx", "xy", "yy"))
         at = metres_to_um(known["est_x"]), metres_to_um(known["est_y"])
-        found.estimate = EstimatedPosition(*at, xx, xy, yy, known["est_spots"])
+        found.estimate = records.EstimatedPosition(*at, xx, xy, yy, known["est_spots"])
     if known.get("missing"):
         found.missing_in = run_of[known["missing_in"]]
     if "moved_at" in known:
         before = metres_to_um(known["moved_from_x"]), metres_to_um(known["moved_from_y"])
         now = metres_to_um(found.spot[0]), metres_to_um(found.spot[1])
-        moved = Relocation(Offset(known["moved_at"]), ObservationOrdinal(0), *before, *now)
+        moved = records.Relocation(
+            Offset(known["moved_at"]), deltas.ObservationOrdinal(0), *before, *now
+        )
         found.relocations.append(moved)
     return found

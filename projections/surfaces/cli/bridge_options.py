@@ -29,17 +29,7 @@ from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.wire import MAX_DOMAIN, BridgeWire, RmwWire, Wire, topic_of
 
-from .bag_text import (
-    check_run_id,
-    crop_cutter,
-    heights_option,
-    keep_crops_option,
-    labels_option,
-    max_gap_ns,
-    max_gap_option,
-    model_option,
-    ros_option,
-)
+from . import bag_text
 from .terminal import say
 
 TF_POSE: Final = "tf"
@@ -52,7 +42,7 @@ _QUIET_S: Final = 5.0
 _PANEL: Final = "Messages of ROS 2, with --ros2 or --ros2dds"
 
 
-_option = functools.partial(ros_option, _PANEL)
+_option = functools.partial(bag_text.ros_option, _PANEL)
 
 Ros2Option = Annotated[
     bool,
@@ -162,15 +152,15 @@ class BridgeChoice:
             "--run-id", "ID", "The run of the keyframes. [default: namespace and time of the start]"
         ),
     ] = None
-    labels: Annotated[Path | None, labels_option(_PANEL)] = None
-    embedding_model: Annotated[str | None, model_option(_PANEL)] = None
-    heights: Annotated[bool, heights_option(_PANEL)] = False
-    keep_crops: Annotated[bool, keep_crops_option(_PANEL)] = False
+    labels: Annotated[Path | None, bag_text.labels_option(_PANEL)] = None
+    embedding_model: Annotated[str | None, bag_text.model_option(_PANEL)] = None
+    heights: Annotated[bool, bag_text.heights_option(_PANEL)] = False
+    keep_crops: Annotated[bool, bag_text.keep_crops_option(_PANEL)] = False
     images: Annotated[
         str | None,
         _option("--images", "TOPIC", "Topic of the pictures for --keep-crops, which needs it."),
     ] = None
-    max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
+    max_gap: Annotated[float, bag_text.max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
     topic: Annotated[
         list[str] | None,
         _option("--topic", "TOPIC", "Another topic to keep, of any type; may be repeated."),
@@ -268,13 +258,13 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
         grid=full(choice.grid, "--grid"),
         map_frame=choice.map_frame,
         base_frame=choice.base_frame,
-        run_id=check_run_id(choice.run_id),
+        run_id=bag_text.check_run_id(choice.run_id),
         embedding_model=choice.embedding_model,
         labels={} if choice.labels is None else read_labels(choice.labels),
         heights=choice.heights,
-        max_gap_ns=max_gap_ns(choice.max_gap),
+        max_gap_ns=bag_text.max_gap_ns(choice.max_gap),
         images=full(choice.images, "--images"),
-        cut=crop_cutter(choice.keep_crops, choice.images),
+        cut=bag_text.crop_cutter(choice.keep_crops, choice.images),
     )
 
 
@@ -315,10 +305,10 @@ def recording_of(
     detections = list(
         dict.fromkeys(full(t, "--detections") for t in choice.detections or [_DETECTIONS])
     )
-    run = check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
+    run = bag_text.check_run_id(choice.run_id) or _run_id(choice.namespace, now_ns)
     pose = choice.pose or TF_POSE
     labels = {} if choice.labels is None else read_labels(choice.labels)
-    gap_ns = max_gap_ns(choice.max_gap)
+    gap_ns = bag_text.max_gap_ns(choice.max_gap)
     streams = []
     for topic in detections:
         run_id = RunId(run if len(detections) == 1 else f"{run}:{_camera(topic)}")

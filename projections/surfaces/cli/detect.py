@@ -8,6 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
+from eventsrc.adapters.detector import service, vision_models
 from eventsrc.adapters.detector.heads import HEADS
 from eventsrc.adapters.detector.keyframes import (
     AFTER_S,
@@ -20,25 +21,7 @@ from eventsrc.adapters.detector.onnx_model import OnnxModel
 from eventsrc.adapters.detector.picture import Picture
 from eventsrc.adapters.detector.picture_sources import QUEUE, LivePictures, open_images
 from eventsrc.adapters.detector.poses import Poses, PoseTrack, poses_of_file
-from eventsrc.adapters.detector.service import (
-    CropSender,
-    DetectionRun,
-    FileOutput,
-    Output,
-    ZenohOutput,
-)
 from eventsrc.adapters.detector.vision import check_installed
-from eventsrc.adapters.detector.vision_models import (
-    CONFIDENCE,
-    MOST,
-    OVERLAP,
-    SIZE,
-    Encoder,
-    Finder,
-    FinderOptions,
-    read_labels,
-    read_preparation,
-)
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.envelope.crops import CROPS_TOPIC
@@ -46,15 +29,7 @@ from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.config import check_key, parse_address
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 
-from .detect_checks import (
-    check_sources,
-    device_of,
-    limits_of,
-    run_id_of,
-    spool_path,
-    stdin_until,
-    timing_of,
-)
+from . import detect_checks
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
 from .new_log import NewLogOptions
 from .options import JsonOption, PublishKeyOption, ZenohPeer
@@ -167,7 +142,7 @@ def detect(
             help="Side of the detector's input, if the model does not fix it.",
             rich_help_panel=_MODELS,
         ),
-    ] = SIZE,
+    ] = vision_models.SIZE,
     device: Annotated[
         str,
         typer.Option(metavar="cpu|cuda", help="What the models run on.", rich_help_panel=_MODELS),
@@ -191,7 +166,7 @@ def detect(
             help="Least confidence of a detection.",
             rich_help_panel=_MODELS,
         ),
-    ] = CONFIDENCE,
+    ] = vision_models.CONFIDENCE,
     overlap: Annotated[
         float,
         typer.Option(
@@ -201,7 +176,7 @@ def detect(
             help="Two boxes of a class that overlap by more (intersection over union) are one.",
             rich_help_panel=_MODELS,
         ),
-    ] = OVERLAP,
+    ] = vision_models.OVERLAP,
     max_detections: Annotated[
         int,
         typer.Option(
@@ -211,7 +186,7 @@ def detect(
             help="Most detections in a picture.",
             rich_help_panel=_MODELS,
         ),
-    ] = MOST,
+    ] = vision_models.MOST,
     moved: Annotated[
         float,
         typer.Option(
@@ -308,24 +283,26 @@ def detect(
         models = (("--detector", detector), ("--encoder", encoder))
         missing = [name for name, path in models if path is None]
         raise MisuseError(f"no {' and no '.join(missing)} given")
-    check_sources(images, zenoh_image, poses, zenoh_pose)
-    timing = timing_of(start, fps)
+    detect_checks.check_sources(images, zenoh_image, poses, zenoh_pose)
+    timing = detect_checks.timing_of(start, fps)
     if out is not None and keep_crops:
         raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
     check_key(key, "--key")
     settings = new_log.for_file(out)
     address = None if metrics is None else parse_address(metrics, "--metrics")
-    name = run_id_of(run_id)
+    name = detect_checks.run_id_of(run_id)
     check_installed()
-    wanted = device_of(device)
+    wanted = detect_checks.device_of(device)
     given_poses: Poses = PoseTrack() if poses is None else poses_of_file(poses)
-    options = FinderOptions(head, confidence, overlap, max_detections, size)
-    finder = Finder(
+    options = vision_models.FinderOptions(head, confidence, overlap, max_detections, size)
+    finder = vision_models.Finder(
         OnnxModel(detector, wanted, threads),
-        None if labels is None else read_labels(labels),
+        None if labels is None else vision_models.read_labels(labels),
         options,
     )
-    opened = Encoder(OnnxModel(encoder, wanted, threads), read_preparation(encoder))
+    opened = vision_models.Encoder(
+        OnnxModel(encoder, wanted, threads), vision_models.read_preparation(encoder)
+    )
     zenoh = peer.zenoh
     with stop_on_signals() as stop, ExitStack() as stack:
         session = None
@@ -337,12 +314,14 @@ def detect(
         pictures: Iterable[Picture] = (
             live
             if images is None and live
-            else open_images(images or "", stdin_until(stop), timing)
+            else open_images(images or "", detect_checks.stdin_until(stop), timing)
         )
         keyframes = Keyframes(
             finder,
             opened,
-            KeyframeGate(limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))),
+            KeyframeGate(
+                detect_checks.limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
+            ),
             live.poses if live is not None and live.poses is not None else given_poses,
             name,
             hfov_deg=hfov,
@@ -351,15 +330,15 @@ def detect(
         )
         output = _output(
             stack,
-            None if out is None else FileOutput(out, settings),
+            None if out is None else service.FileOutput(out, settings),
             zenoh,
-            spool or spool_path(),
+            spool or detect_checks.spool_path(),
             key,
             session if keep_crops else None,
             stop,
             patient=images is not None,
         )
-        detection = DetectionRun(keyframes, output, live, stop)
+        detection = service.DetectionRun(keyframes, output, live, stop)
         if address is not None:
             stack.enter_context(metrics_of(address, detection))
         where = str(out) if out is not None else key
@@ -370,7 +349,9 @@ def detect(
         detection.close(wait)
     report = detection.report()
     say(summary(name, report, where))
-    for line in advice(report, live, posed=bool(poses or zenoh_pose), spool=spool or spool_path()):
+    for line in advice(
+        report, live, posed=bool(poses or zenoh_pose), spool=spool or detect_checks.spool_path()
+    ):
         say(line)
     if json_:
         emit({"run_id": name, "space": opened.name, **as_document(report)})
@@ -379,7 +360,7 @@ def detect(
 
 def _output(
     stack: ExitStack,
-    file: FileOutput | None,
+    file: service.FileOutput | None,
     options: ZenohOptions,
     spool: Path,
     key: str,
@@ -387,13 +368,13 @@ def _output(
     stop: threading.Event,
     *,
     patient: bool,
-) -> Output:
+) -> service.Output:
     if file is not None:
         stack.callback(file.close, 0.0)
         return file
     publisher = stack.enter_context(EnvelopePublisher(options, spool, key))
-    sender = None if crops is None else CropSender(crops, CROPS_TOPIC, _note)
-    return ZenohOutput(publisher, sender, stop, patient=patient, note=_note)
+    sender = None if crops is None else service.CropSender(crops, CROPS_TOPIC, _note)
+    return service.ZenohOutput(publisher, sender, stop, patient=patient, note=_note)
 
 
 def _note(line: str) -> None:

@@ -17,17 +17,8 @@ from projections.adapters.fleet.engines import Ended
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
 
+from . import fleet_options
 from .event_text import iso_time
-from .fleet_options import (
-    EngineOption,
-    FleetDatabases,
-    JobsOption,
-    QuestionJobsOption,
-    SitesArgument,
-    TemplateOption,
-    ended_sites,
-    sites_of,
-)
 from .folded_log import FoldSettings, settings_from
 from .options import CameraOptions, JsonOption, QuestionArgument, question_from
 from .replay_and_tail import LoaderOption, Loaders, loader_of
@@ -72,16 +63,16 @@ def _check_reach(engine: str, db: str | None) -> None:
 @fleet.command()
 def replay(
     *,
-    place: SitesArgument,
-    engine: EngineOption = "local",
-    jobs: JobsOption = None,
+    place: fleet_options.SitesArgument,
+    engine: fleet_options.EngineOption = "local",
+    jobs: fleet_options.JobsOption = None,
     again: Annotated[
         bool, typer.Option("--again", help="Rebuild also what is up to date.")
     ] = False,
     replace: Annotated[
         bool, typer.Option("--replace", help="Rebuild also over the map of another log.")
     ] = False,
-    stores: FleetDatabases,
+    stores: fleet_options.FleetDatabases,
     settings: FoldSettings,
     loader: LoaderOption = Loaders.copy,
     no_hnsw: Annotated[
@@ -97,7 +88,7 @@ def replay(
     from projections.adapters.fleet.site_tasks import ReplayRequest, SiteReplay, replay_site
 
     chosen = _chosen(settings)
-    sites = sites_of(place)
+    sites = fleet_options.sites_of(place)
     _check_reach(engine, stores.db)
     entries: dict[int, dict[str, Any]] = {}
     with stores.opened(sites) as databases:
@@ -116,7 +107,7 @@ def replay(
         if engine == "local":  # else each site would wait for it
             for server in databases[sites[0].name].urls:
                 check_server(server)
-        with ended_sites(replay_site, requests, sites, engine, jobs) as results:
+        with fleet_options.ended_sites(replay_site, requests, sites, engine, jobs) as results:
             for ended in results:
                 site = sites[ended.index]
                 done = ended.result or SiteReplay("failed", error=ended.error)
@@ -169,9 +160,9 @@ def _say_failed(failed: list[tuple[str, str]]) -> None:
 @fleet.command()
 def status(
     *,
-    place: SitesArgument,
-    jobs: JobsOption = None,
-    stores: FleetDatabases,
+    place: fleet_options.SitesArgument,
+    jobs: fleet_options.JobsOption = None,
+    stores: fleet_options.FleetDatabases,
     settings: FoldSettings,
     as_json: JsonOption = False,
 ) -> None:
@@ -185,11 +176,11 @@ def status(
     from .log import info_document
 
     chosen = _chosen(settings)
-    sites = sites_of(place)
+    sites = fleet_options.sites_of(place)
     found: list[SiteStatus] = [SiteStatus()] * len(sites)
     with stores.opened(sites) as databases:
         requests = [StatusRequest(site, databases[site.name], chosen) for site in sites]
-        with ended_sites(look_at_site, requests, sites, "local", jobs) as results:
+        with fleet_options.ended_sites(look_at_site, requests, sites, "local", jobs) as results:
             for ended in results:
                 found[ended.index] = ended.result or SiteStatus(error=ended.error)
     if as_json:
@@ -211,9 +202,9 @@ def status(
 @fleet.command()
 def verify(
     *,
-    place: SitesArgument,
-    engine: EngineOption = "local",
-    jobs: JobsOption = None,
+    place: fleet_options.SitesArgument,
+    engine: fleet_options.EngineOption = "local",
+    jobs: fleet_options.JobsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Read every byte of all logs, as `log verify` does of one; exit 3 if anything is wrong."""
@@ -221,9 +212,9 @@ def verify(
 
     from .log import finding_text, verification_document
 
-    sites = sites_of(place)
+    sites = fleet_options.sites_of(place)
     found = [SiteVerification()] * len(sites)
-    with ended_sites(verify_site, sites, sites, engine, jobs) as results:
+    with fleet_options.ended_sites(verify_site, sites, sites, engine, jobs) as results:
         for ended in results:
             found[ended.index] = ended.result or SiteVerification(error=ended.error)
     pairs = list(zip(sites, found, strict=True))
@@ -252,14 +243,14 @@ def verify(
 @fleet.command()
 def relocalize(
     *,
-    place: SitesArgument,
+    place: fleet_options.SitesArgument,
     query: QuestionArgument,
     top: Annotated[
         int, typer.Option("--top", metavar="N", min=1, max=100, help="Places of each site.")
     ] = 3,
     camera: CameraOptions,
-    jobs: QuestionJobsOption = None,
-    stores: FleetDatabases,
+    jobs: fleet_options.QuestionJobsOption = None,
+    stores: fleet_options.FleetDatabases,
     as_json: JsonOption = False,
 ) -> None:
     """Find the site a robot is at, from a few object crops: the probability of each, and of none.
@@ -270,7 +261,7 @@ def relocalize(
     from projections.adapters.fleet.which_site import ask_sites
 
     question, asked_by = question_from(query), camera.camera
-    sites = sites_of(place)
+    sites = fleet_options.sites_of(place)
     with stores.opened(sites) as databases:
         answer = ask_sites(
             sites,
@@ -300,20 +291,20 @@ def relocalize(
 @fleet.command()
 def url(
     *,
-    place: SitesArgument,
+    place: fleet_options.SitesArgument,
     site: Annotated[str, typer.Argument(metavar="SITE", help="The site's name.")],
-    db: TemplateOption = None,
+    db: fleet_options.TemplateOption = None,
 ) -> None:
     """Print the URL of one site's database, for --db of the commands of one map.
 
     A URL of the embedded server works while that server runs: see `db start`.
     """
-    sites = sites_of(place)
+    sites = fleet_options.sites_of(place)
     if site not in {each.name for each in sites}:
         names = ", ".join(visible(each.name) for each in sites[:_LISTED])
         more = f" and {len(sites) - _LISTED:,} more" if len(sites) > _LISTED else ""
         raise MisuseError(f"{place}: no site {site!r}; there are {names}{more}")
-    with FleetDatabases(db=db).opened(sites) as databases:
+    with fleet_options.FleetDatabases(db=db).opened(sites) as databases:
         display(databases[site].graph_url)
 
 

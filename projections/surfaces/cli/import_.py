@@ -13,16 +13,10 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import fold_and_save_ledger
+from eventsrc.record.importers import run
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.map_yaml import read_map_yaml
 from eventsrc.record.importers.opening import check_sources, is_ros
-from eventsrc.record.importers.run import (
-    DEFAULT_KEY,
-    IMPORT_FSYNC,
-    ImportInterrupted,
-    ImportReport,
-    import_files,
-)
 from eventsrc.record.importers.sources import NOT_CHOSEN, Source, TopicChoice
 from eventsrc.record.transport.config import check_key
 
@@ -53,7 +47,7 @@ def import_(
     ] = None,
     key: Annotated[
         str, typer.Option(metavar="KEY", help="Key for messages without one.")
-    ] = DEFAULT_KEY,
+    ] = run.DEFAULT_KEY,
     map_: Annotated[
         Path | None,
         typer.Option(
@@ -108,12 +102,12 @@ def import_(
     has_ros = any(map(is_ros, names))
     rejects = _RejectPrinter()
     try:
-        with LogWriter(log, fsync=IMPORT_FSYNC, imported=True) as writer:
+        with LogWriter(log, fsync=run.IMPORT_FSYNC, imported=True) as writer:
             say_restart(log, writer)
             start = LogStart.of(log, writer, new_log, is_ros=has_ros)
             ledger = _known_keyframes(log)
             with FileBars() as bars, ctrl_c_between_steps() as step, start.said_on_error(writer):
-                report = import_files(
+                report = run.import_files(
                     writer,
                     names,
                     key=key,
@@ -126,7 +120,7 @@ def import_(
                     bags=bags,
                     ledger=ledger,
                 )
-    except ImportInterrupted as interrupted:
+    except run.ImportInterrupted as interrupted:
         rejects.say_rest()
         say(_kept(log, interrupted))
         start.say_recorded(writer, as_source=interrupted.report.began_as_source)
@@ -162,7 +156,7 @@ def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
         return None
 
 
-def _as_json(report: ImportReport) -> dict[str, Any]:
+def _as_json(report: run.ImportReport) -> dict[str, Any]:
     """The report as JSON; ``bags`` and such only where there is something to say."""
     document = asdict(report)
     for name in ("bags", "began_as_source", "numbered_classes"):
@@ -187,7 +181,7 @@ class _RejectPrinter:
             say(f"… and {self._count - _MOST_REJECTS:,} more rejected")
 
 
-def _kept(log: Path, interrupted: ImportInterrupted) -> str:
+def _kept(log: Path, interrupted: run.ImportInterrupted) -> str:
     report = interrupted.report
     if interrupted.place is None:
         return f"{log}: nothing was imported"
@@ -198,7 +192,7 @@ def _kept(log: Path, interrupted: ImportInterrupted) -> str:
     )
 
 
-def _summary(log: Path, report: ImportReport) -> str:
+def _summary(log: Path, report: run.ImportReport) -> str:
     parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
     if report.repeated:
         new = report.accepted - report.repeated
@@ -222,7 +216,7 @@ def _summary(log: Path, report: ImportReport) -> str:
     return ", ".join(parts) + hint
 
 
-def _passed_over(log: Path, report: ImportReport) -> Iterator[str]:
+def _passed_over(log: Path, report: run.ImportReport) -> Iterator[str]:
     for each in report.passed_over[:_MOST_TOPICS]:
         yield visible(f"passed over: {each.topic}: {counted(each.count, 'message')}, {each.what}")
     if len(report.passed_over) > _MOST_TOPICS:

@@ -24,23 +24,8 @@ from eventsrc.record.transport.session import Router, check_keys, open_session
 from eventsrc.ros.library import MessageTypes
 from projections.fold.corrections import check_settings
 
+from . import bridge_options
 from .bag_text import crop_cutter, stream_lines
-from .bridge_options import (
-    BridgeChoice,
-    DomainOption,
-    Ros2ddsOption,
-    Ros2Option,
-    as_of_a_bag,
-    check_unused,
-    domain_of,
-    find_topics_of_nodes,
-    finish_last_recording,
-    recording_of,
-    say_topics,
-    topics_of_bridge,
-    topics_of_nodes,
-    warn_of_silence,
-)
 from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions, say_camera
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
@@ -114,10 +99,10 @@ def record(
         ),
     ] = False,
     new_log: NewLogOptions,
-    ros2: Ros2Option = False,
-    domain: DomainOption = None,
-    ros2dds: Ros2ddsOption = False,
-    choice: BridgeChoice,
+    ros2: bridge_options.Ros2Option = False,
+    domain: bridge_options.DomainOption = None,
+    ros2dds: bridge_options.Ros2ddsOption = False,
+    choice: bridge_options.BridgeChoice,
     json: JsonOption = False,
 ) -> None:
     """Record what robots publish over Zenoh, until Ctrl-C.
@@ -127,7 +112,7 @@ def record(
 
     Exit 3 when anything was rejected or lost, is missing, or could not be read.
     """
-    check_unused(choice, domain, ros2=ros2, ros2dds=ros2dds)
+    bridge_options.check_unused(choice, domain, ros2=ros2, ros2dds=ros2dds)
     is_ros = ros2 or ros2dds
     new_log.check()
     policy = parse_fsync(fsync)
@@ -139,11 +124,11 @@ def record(
     check_keys(keys)
     crop_keys = _crop_keys(crops)
     types = MessageTypes() if is_ros else None
-    number = domain_of(domain) if ros2 else 0
+    number = bridge_options.domain_of(domain) if ros2 else 0
     if ros2dds:
-        recording_of(choice, 0, None)
+        bridge_options.recording_of(choice, 0, None)
     if is_ros:
-        as_of_a_bag(choice)
+        bridge_options.as_of_a_bag(choice)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     with (
         RecorderSummary(log, json=json) as summary,
@@ -153,7 +138,7 @@ def record(
     ):
         made = None
         if ros2 and types is not None:
-            made = find_topics_of_nodes(choice, session, number, types, stop)
+            made = bridge_options.find_topics_of_nodes(choice, session, number, types, stop)
             if made is None:
                 return
         writer = opened.enter_context(LogWriter(log, fsync=policy, sealing_process=True))
@@ -161,14 +146,14 @@ def record(
         start = writer.next_offset
         LogStart.of(log, writer, new_log, is_ros=is_ros).record(writer)
         if types is not None:
-            finish_last_recording(writer, types)
+            bridge_options.finish_last_recording(writer, types)
         ledger = _gap_history(log)
         bridge = None
         if types is not None:
             found = (
-                topics_of_bridge(choice, writer.now_ns(), ledger)
+                bridge_options.topics_of_bridge(choice, writer.now_ns(), ledger)
                 if made is None
-                else topics_of_nodes(choice, made, number, ledger)
+                else bridge_options.topics_of_nodes(choice, made, number, ledger)
             )
             cut = crop_cutter(choice.keep_crops, choice.images)
             bridge = Bridge(found.recording, found.topics, types, found.wire, cut)
@@ -188,8 +173,8 @@ def record(
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:
             if bridge is not None and ros2dds:
-                say_topics(log, bridge)
-                watch = warn_of_silence(bridge, watch, EVERY_S)
+                bridge_options.say_topics(log, bridge)
+                watch = bridge_options.warn_of_silence(bridge, watch, EVERY_S)
             named = ", ".join(keys or (bridge.keys if bridge is not None else ()))
             say(f"recording {named} to {log} from offset {writer.next_offset}; Ctrl-C ends it")
             if accept_edits:

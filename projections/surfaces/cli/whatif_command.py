@@ -24,24 +24,16 @@ from projections.history.whatif_rendering import whatif_text
 from projections.localize.evaluate.truth import read_truth
 from projections.map.own_events import read_commands
 
-from .folded_log import (
-    FoldSettings,
-    KnownAtOption,
-    LogArgument,
-    NamedSettings,
-    SettingsOption,
-    known_point,
-    point,
-)
+from . import folded_log
 from .options import JsonOption, check_picture
 from .terminal import Bar, display, emit, say
 from .time_travel import MOST_LINES, AllOption, AtOption
 
 
 def whatif(
-    log: LogArgument,
+    log: folded_log.LogArgument,
     *,
-    named: NamedSettings,
+    named: folded_log.NamedSettings,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,7 +74,7 @@ def whatif(
         ),
     ] = None,
     at: AtOption = "end",
-    known_at: KnownAtOption = None,
+    known_at: folded_log.KnownAtOption = None,
     truth: Annotated[
         list[Path] | None,
         typer.Option(
@@ -103,7 +95,7 @@ def whatif(
             metavar="N", min=1, help="Fold in this many processes [default: the number of cores]."
         ),
     ] = None,
-    settings_file: SettingsOption = None,
+    settings_file: folded_log.SettingsOption = None,
 ) -> None:
     """Show the map under other settings, or without one of its commands.
 
@@ -113,7 +105,7 @@ def whatif(
     --truth, V is the V-measure against rooms and instances: 1 is perfect.
     """
 
-    logged = FoldSettings(settings_file=settings_file).checked()
+    logged = folded_log.FoldSettings(settings_file=settings_file).checked()
 
     def settings(corrections: Corrections) -> Settings:
         return assigned(logged(corrections), base, "--base")
@@ -130,8 +122,8 @@ def whatif(
         )
     scored = read_truth(truth) if truth else None
     with LogReader(log) as reader:
-        end = point(reader, at)
-        commands = read_commands(reader, known_point(reader, known_at, end))
+        end = folded_log.point(reader, at)
+        commands = read_commands(reader, folded_log.known_point(reader, known_at, end))
     corrections = compile_corrections(commands)
     common = Rules(settings(corrections), corrections)
     trials = setting_trials(common, others(common.settings))

@@ -25,13 +25,8 @@ from projections.postgres.connection import (
     describe_target,
 )
 from projections.postgres.labels import SinkName
+from projections.postgres.queries import candidate_search
 from projections.postgres.queries.candidate_rows import ConstantsMemory
-from projections.postgres.queries.candidate_search import (
-    CandidateReader,
-    CandidateSearch,
-    prepare_graph,
-    prepare_vectors,
-)
 from projections.postgres.queries.live_view import LiveView, read_view
 
 from .asked import MapMemory
@@ -100,15 +95,15 @@ class Pools:
         self._targets, self._size, self._outage = targets, size, Outage(note)
         self._memory, self._map = ConstantsMemory(), MapMemory()
         self._require_maps()  # a clear error at once; a pool would retry without one
-        CandidateReader(targets).close()
+        candidate_search.CandidateReader(targets).close()
         self._vectors = _pool(targets.vector_url, size, self._prepare_vectors)
         self._graph = self._vectors
         if not targets.one_database:
-            self._graph = _pool(targets.graph_url, size, prepare_graph)
+            self._graph = _pool(targets.graph_url, size, candidate_search.prepare_graph)
 
     def _prepare_vectors(self, connection: Connection) -> None:
-        prepare_vectors(connection)
-        prepare_graph(connection)
+        candidate_search.prepare_vectors(connection)
+        candidate_search.prepare_graph(connection)
 
     def check(self) -> None:
         """Restart the embedded server if it died. Raises DatabaseError unless there is a map that
@@ -117,7 +112,7 @@ class Pools:
         Uses new connections, so that it sees the present state.
         """
         self._require_maps()
-        with CandidateReader(self._targets, self._memory) as reader:
+        with candidate_search.CandidateReader(self._targets, self._memory) as reader:
             reader.try_question()
 
     def _require_maps(self) -> None:
@@ -151,8 +146,8 @@ class Pools:
             with self._borrow(self._graph, self._targets.graph_url, wait_s) as graph:
                 return self._search(vectors, graph).candidates(crops)
 
-    def _search(self, vectors: Connection, graph: Connection) -> CandidateSearch:
-        return CandidateSearch(self._targets, vectors, graph, self._memory)
+    def _search(self, vectors: Connection, graph: Connection) -> candidate_search.CandidateSearch:
+        return candidate_search.CandidateSearch(self._targets, vectors, graph, self._memory)
 
     def _ask(self, ask: Callable[[float], Result]) -> Result:
         if self._outage.is_on:

@@ -14,13 +14,7 @@ from typing import Any, Final, Literal, NamedTuple
 from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import describe_value
 from projections.postgres.connection import Connection
-from projections.postgres.queries.graph_reads import (
-    Page,
-    objects_after,
-    objects_near,
-    places_after,
-    places_near,
-)
+from projections.postgres.queries import graph_reads
 
 State = Literal["places", "objects"]
 
@@ -36,12 +30,12 @@ _NAMES: Final = ("x", "y", "radius", "limit", "cursor")
 
 class _Reads(NamedTuple):
     near: Callable[[Connection, float, float, float], list[dict[str, Any]]]
-    after: Callable[[Connection, int, int], Page]
+    after: Callable[[Connection, int, int], graph_reads.Page]
 
 
 _STATES: Final = {
-    "places": _Reads(places_near, places_after),
-    "objects": _Reads(objects_near, objects_after),
+    "places": _Reads(graph_reads.places_near, graph_reads.places_after),
+    "objects": _Reads(graph_reads.objects_near, graph_reads.objects_after),
 }
 
 
