@@ -41,6 +41,12 @@ VISION_MSGS: Final[Mapping[str, str]] = {
     "vision_msgs/msg/VisionInfo": (
         f"{_HEADER}string method\nstring database_location\nint32 database_version\n"
     ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection3D": (
+        f"{_HEADER}vision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection3DArray": f"{_HEADER}vision_msgs/Detection3D[] detections\n",
 }
 """The definitions of vision_msgs 4, which ROS does not ship with its own messages. Those of version
 3 differ in the name of a nested type only: in CDR both are the same bytes."""
@@ -161,6 +167,10 @@ class MessageTypes:
                 f"is {type_hash:.80}, not {known}"
             )
         return text
+
+    def hash_of(self, type_name: str) -> str:
+        """The hash that ROS gives a type, ``RIHS01_…``."""
+        return self._store.hash_rihs01(type_name)
 
     def knows(self, type_name: str) -> bool:
         """Whether the type has a definition."""

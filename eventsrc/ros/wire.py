@@ -24,6 +24,8 @@ with the four bytes of encapsulation before it, in both ways:
 
   Caches are ``<key>/@adv/pub/**``, of older versions ``<zenoh id>/<key>``. Each message has an
   attachment: its number, the time, and the publisher's id, which is new when its node starts again.
+  A service is a queryable of such a key; a request has an attachment of its client's, the reply the
+  same with its own time.
 """
 
 import re
@@ -195,6 +197,60 @@ def _labelled_parts(attachment: bytes) -> bytes:
         parts += rest[:size]
         rest = rest[size:] if size else b""
     return parts
+
+
+class RmwNode(NamedTuple):
+    """A node of our own over rmw_zenoh, in the Zenoh session ``session_id``: its tokens and keys.
+    ``namespace`` is ``/bot1``, or empty for none."""
+
+    domain: int
+    session_id: str
+    namespace: str
+    name: str
+
+    def token(self) -> str:
+        """The liveliness token of the node."""
+        return self._tokens(0, "NN")
+
+    def end_token(
+        self, kind: str, number: int, topic: str, end: str, *, latched: bool = False
+    ) -> str:
+        """The liveliness token of its publisher (MP), subscription (MS) or service (SS) with a
+        ``number`` of its own. ``end`` is `end_of_key`."""
+        quality = ":1:,1:,:,:,," if latched else "::,10:,:,:,,"
+        return f"{self._tokens(number, kind)}/{topic.replace('/', '%')}/{end}/{quality}"
+
+    def _tokens(self, number: int, kind: str) -> str:
+        namespace = self.namespace.replace("/", "%") or "%"
+        return (
+            f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{kind}/%/{namespace}/{self.name}"
+        )
+
+    def key(self, topic: str, end: str) -> str:
+        """The key of a topic's messages, or of a service's requests."""
+        return f"{self.domain}{topic}/{end}"
+
+    def cache(self, key: str, number: int) -> str:
+        """The key under which late subscribers ask for a publisher's last message, and the token
+        by which subscribers that are there already find it."""
+        return f"{key}/@adv/pub/{self.session_id}/{number}/_"
+
+
+def end_of_key(type_name: str, type_hash: str) -> str:
+    """Type and hash as keys have them, of ``std_msgs/msg/String`` or ``std_srvs/srv/Trigger``."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_/{type_hash}"
+
+
+def attachment(number: int, stamp_ns: int, publisher: bytes) -> bytes:
+    """The attachment of a message: its number, the time, and the publisher's id."""
+    sent = number.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little", signed=True)
+    return sent + bytes([len(publisher)]) + publisher
+
+
+def reply_attachment(request: bytes, stamp_ns: int) -> bytes:
+    """The attachment of the reply to a request with an attachment."""
+    return request[:8] + stamp_ns.to_bytes(8, "little", signed=True) + request[16:]
 
 
 def _from_dds(dds_type: str) -> str | None:

@@ -233,7 +233,7 @@ def test_the_databases_have_one_map(log: Path, one_database: Targets) -> None:
         ):
             refused = called(live, name, arguments)
             assert refused.is_error
-            assert re.search("only by the log; start mcp with LOG", text_of(refused))
+            assert re.search("only by the log; give LOG", text_of(refused))
 
 
 @pytest.mark.parametrize(

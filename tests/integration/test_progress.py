@@ -32,6 +32,7 @@ WITHOUT = {
     "detect": "shows a status line",
     "spool": "reads no log",
     "import": "has a bar for each file",
+    "ros": "follows the log until Ctrl-C",
     "foxglove": "has a bar of its own, then runs until Ctrl-C",
     "reembed": "has a bar of its own",
     "ui": "shows its progress in the page",

@@ -168,9 +168,22 @@ class Query:
         such as the REST plugin of a router, show it by its encoding."""
         self._end(lambda: self._query.reply(key, payload, encoding=_JSON))
 
+    @property
+    def attachment(self) -> bytes:
+        """A copy of the attachment; empty if the query has none."""
+        return b"" if self._query.attachment is None else self._query.attachment.to_bytes()
+
+    def reply_attached(self, key: str, payload: bytes, attachment: bytes) -> None:
+        """Reply under ``key`` with bytes that are no JSON, and an attachment."""
+        self._end(lambda: self._query.reply(key, payload, attachment=attachment))
+
     def reply_error(self, payload: bytes) -> None:
         """Reply with an error, which is JSON."""
         self._end(lambda: self._query.reply_err(payload, encoding=_JSON))
+
+    def close(self) -> None:
+        """End it without a reply."""
+        self._end(lambda: None)
 
     def _end(self, send: Callable[[], None]) -> None:
         with ignore_transport_errors():  # the peer that asked may be gone
@@ -199,10 +212,10 @@ class Publisher:
     def _on_matching(self, status: Any) -> None:
         self.departures += not status.matching
 
-    def put(self, payload: bytes) -> None:
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Send. Returns when Zenoh has accepted the message; it may not have been received yet."""
         with self._not_sent:
-            self._sender.put(payload)
+            self._sender.put(payload, attachment=attachment)
 
     @property
     def has_subscriber(self) -> bool:

@@ -148,6 +148,17 @@ class Session:
                 self.raw.liveliness().declare_subscriber(key_expr, receive, history=True)
             )
 
+    def declare_token(self, key: str) -> Subscription:
+        """Declare a liveliness token, which others see until it or the session is closed."""
+        check_key_length(key)
+        with transport_errors(f"token {key!r} cannot be declared"):
+            return Subscription(self.raw.liveliness().declare_token(key))
+
+    @property
+    def id(self) -> str:
+        """The session's id, new for each session."""
+        return str(self.raw.zid())
+
     def tokens(self, key_expr: str, *, timeout_s: float) -> list[str]:
         """The keys of all liveliness tokens under ``key_expr``."""
         check_key_length(key_expr)

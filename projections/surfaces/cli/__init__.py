@@ -41,6 +41,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "path": "find_command:show_path",
         "export": "export_command:export",
         "foxglove": "export_command:foxglove",
+        "ros": "ros_command:ros",
     },
     "Find a robot": {
         "relocalize": "relocalize:relocalize",

@@ -142,7 +142,7 @@ class LogMaps:
 
     def _refuse_other(self, there: LogReader) -> None:
         if there.log_id != self._timeline.reader.log_id:
-            raise LogError(f"there is another log at {self._log} now; start mapfold mcp again")
+            raise LogError(f"there is another log at {self._log} now; start this command again")
 
     def _moment(self, at: str, known_at: str | None) -> tuple[Offset, Offset]:
         self._refresh()
@@ -190,7 +190,7 @@ class LiveMaps:
             raise MisuseError(f"the map at {at}, known at {known_at or at}, {_ONLY_LOG}")
 
 
-_ONLY_LOG = "is known only by the log; start mcp with LOG instead of --db"
+_ONLY_LOG = "is known only by the log; give LOG instead of --db"
 
 
 def offsets_in(document: object) -> set[int]:

@@ -1,0 +1,158 @@
+"""`mapfold ros`: the node's tokens, and what late and early subscribers get of the map, by Zenoh's
+own advanced subscriber, which is that of rmw_zenoh."""
+
+import queue
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+
+from eventsrc.record.ros_node import TRIGGER, TRIGGER_HASH, TRIGGERED, RosNode
+from eventsrc.record.transport.session import Session
+from eventsrc.ros.wire import RmwWire, end_of_key
+from projections.adapters.ros.messages import DETECTIONS, GRID, MARKERS, MapMessages
+from projections.adapters.ros.shown_map import ShownMap
+from projections.surfaces.python.map import fold
+from tests.support import rmw
+from tests.support.commands import Commands
+from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.ros_messages import TYPES
+
+Sessions = Callable[[], Session]
+SAMPLE = "logs/sample"
+KINDS = {"markers": MARKERS, "objects": DETECTIONS, "walls": GRID}
+
+
+def key_of(topic: str) -> str:
+    kind = KINDS[topic]
+    return f"3/bot1/mapfold/{topic}/{rmw.dds_type(kind)}/{rmw.type_hash(kind)}"
+
+
+@contextmanager
+def subscribed(session: Session, topic: str) -> Iterator["queue.Queue[tuple[Any, bytes]]"]:
+    """The messages of a topic as a transient-local subscriber gets them, with attachments."""
+    got: queue.Queue[tuple[Any, bytes]] = queue.Queue()
+
+    def receive(sample: zenoh.Sample) -> None:
+        attached = sample.attachment
+        assert attached is not None
+        got.put((TYPES.decode(sample.payload.to_bytes(), KINDS[topic]), attached.to_bytes()))
+
+    subscriber = declare_advanced_subscriber(
+        session.raw,
+        key_of(topic),
+        receive,
+        history=HistoryConfig(detect_late_publishers=True, max_samples=5),
+        recovery=RecoveryConfig(heartbeat=True),
+    )
+    yield got
+    subscriber.undeclare()
+
+
+def keys_of(message: Any) -> set[tuple[str, int]]:
+    return {(each.ns, each.id) for each in message.markers}
+
+
+def test_the_graph_has_its_tokens(connected: Sessions) -> None:
+    asking = connected()
+    with RosNode(connected(), TYPES, 3, "/bot1", "mapfold") as node:
+        shown = ShownMap(node)
+        node.session.confirm()
+        zid, wire = node.session.id, RmwWire(3)
+        tokens = asking.tokens("@ros2_lv/3/**", timeout_s=DEADLINE_S)
+        assert f"@ros2_lv/3/{zid}/0/0/NN/%/%bot1/mapfold" in tokens
+        found = [each for t in tokens if (each := wire.read_token(t)) is not None]
+        assert sorted(each.topic for each in found) == sorted(shown.topics)
+        assert all(each.is_latched for each in found)
+    assert asking.tokens("@ros2_lv/3/**", timeout_s=DEADLINE_S) == []
+
+
+def test_early_subscribers_get_the_changes_and_late_ones_everything(connected: Sessions) -> None:
+    before, after = fold(SAMPLE, at=300).view, fold(SAMPLE, preset="rooms").view
+    messages = MapMessages(TYPES)
+    first, second = messages.markers(before), messages.markers(after)
+    changed = messages.changed(first, second)
+    deleted = {(each.ns, each.id) for each in changed if each.action == 2}
+    assert deleted == first.keys() - second.keys() != set()
+    assert len(changed) - len(deleted) > 0
+    assert messages.changed(second, messages.markers(after)) == []
+    with (
+        subscribed(connected(), "markers") as early,
+        RosNode(connected(), TYPES, 3, "/bot1", "mapfold") as node,
+    ):
+        shown = ShownMap(node)
+        assert shown.show(before) == len(first)
+        whole, attached = early.get(timeout=DEADLINE_S)
+        assert keys_of(whole) == first.keys()
+        assert RmwWire(3).read_attachment(attached) is not None
+        assert shown.show(after) == len(changed)
+        told = early.get(timeout=DEADLINE_S)[0]
+        while keys_of(told) == first.keys():  # the first again, as the publisher was detected
+            told = early.get(timeout=DEADLINE_S)[0]
+        assert keys_of(told) == {(each.ns, each.id) for each in changed}
+        assert shown.show(after) == 0
+        with subscribed(connected(), "markers") as late, subscribed(connected(), "objects") as seen:
+            assert keys_of(late.get(timeout=DEADLINE_S)[0]) == second.keys()
+            detections = seen.get(timeout=DEADLINE_S)[0].detections
+    confirmed = [each for each in after.objects.values() if each.confirmed]
+    shown_ids = [each.object_id for each in confirmed if each.missing_in is None]
+    assert [each.id for each in detections] == shown_ids
+    at = detections[0].bbox.center.position
+    assert (at.x, at.y) == confirmed[0].spot
+
+
+def test_a_trigger_is_answered(connected: Sessions) -> None:
+    answers = iter([(True, "found"), (False, "not yet")])
+    with RosNode(connected(), TYPES, 3, "", "mapfold") as node:
+        node.trigger("~/localize", lambda: next(answers))
+        asking = connected()
+        node.session.confirm()
+        key = f"3/mapfold/localize/{end_of_key(TRIGGER, TRIGGER_HASH)}"
+        request = rmw.attachment(5, bytes(range(16)))
+        for expected in ((True, "found"), (False, "not yet")):
+            (reply,) = asking.raw.get(key, payload=b"\0\1\0\0\0", attachment=request)
+            assert reply.ok is not None
+            assert reply.ok.attachment is not None
+            assert RmwWire().read_attachment(reply.ok.attachment.to_bytes()) == (
+                bytes(range(16)).hex(),
+                5,
+            )
+            made = TYPES.decode(reply.ok.payload.to_bytes(), TRIGGERED)
+            assert (made.success, made.message) == expected
+        (reply,) = asking.raw.get(key)
+        assert reply.err is not None
+
+
+@pytest.mark.seconds
+def test_the_command_shows_the_map_and_its_walls(
+    endpoint: str, connected: Sessions, start_code: Callable[..., Program]
+) -> None:
+    program = start_code(
+        MAPFOLD, "ros", str(Path(SAMPLE).resolve()), "--connect", endpoint, "--domain", "3",
+        "--namespace", "/bot1", "--no-cache",
+    )  # fmt: skip
+    program.wait_for("node /bot1/mapfold in domain 3")
+    assert "marker" in program.wait_for("map of 447 events")
+    view = fold(SAMPLE).view
+    with subscribed(connected(), "walls") as walls:
+        grid = walls.get(timeout=DEADLINE_S)[0]
+    assert view.map is not None
+    assert (grid.info.width, grid.info.height) == (view.map.map.width, view.map.map.height)
+    assert set(grid.data.tolist()) <= {-1, *range(101)}
+    assert program.end(signal.SIGINT) == 0
+
+
+def test_options_of_the_command(tmp_path: Path) -> None:
+    run = Commands.in_folder(tmp_path)
+    for wrong, said in (
+        ([], "give a LOG, or --db"),
+        (["L", "--name", "a b"], "is no name of a ROS 2 node"),
+        (["L", "--namespace", "/a b"], "is no ROS 2 namespace"),
+        (["L", "--vector-db", "x"], "--vector-db is for --db"),
+    ):
+        assert said in run("ros", *wrong, code=2).err
