@@ -18,6 +18,9 @@ from .labels import SINKS, SinkName
 from .sink import Checkpoint
 
 _COMMENT_PREFIX: Final = "mapfold"
+FOLLOWING: Final = "mapfold tail"
+REFOLDING: Final = "mapfold tail, refolding"
+"""The names of a tail's sessions."""
 LOCK_GRACE_S: Final = 1.0
 """Wait for the writer's lock: a server takes a moment to notice that the last writer's connection
 has ended."""
@@ -171,18 +174,9 @@ def write_heartbeat(connection: Connection, sink: SinkName) -> None:
     connection.execute(statements("checkpoint")["write_heartbeat"], {"sink": sink})
 
 
-def write_refold(
-    connection: Connection, sink: SinkName, done: int | None, total: int | None
-) -> None:
-    """Record that the sink's tail is alive, and how far its refold is; None for no refold."""
-    values = {"sink": sink, "done": done, "total": total}
-    connection.execute(statements("checkpoint")["write_refold"], values)
-
-
-def refold(connection: Connection, sink: SinkName) -> tuple[int, int] | None:
-    """The number of events that a tail has refolded, and of all; None when it is not refolding."""
-    row = connection.execute(statements("checkpoint")["refold"], {"sink": sink}).fetchone()
-    return None if row is None or row[0] is None or row[1] is None else (row[0], row[1])
+def name_session(connection: Connection, name: str) -> None:
+    """Change what `writer` returns for the sinks that this session holds."""
+    connection.execute(statements("checkpoint")["name_session"], {"name": name})
 
 
 def ages(connection: Connection, sink: SinkName) -> tuple[float, float | None]:

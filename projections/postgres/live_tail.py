@@ -125,7 +125,7 @@ def _run_pass(
             inputs = LogInputs.read(reader, plan.settings)
             settings = inputs.latest.settings
             with open_stores(
-                plan.targets, settings, only=only, application="mapfold tail", loader=loader
+                plan.targets, settings, only=only, application=checkpoints.FOLLOWING, loader=loader
             ) as stores:
                 run = TailPass(plan, stores, report, inputs, inputs.latest)
                 run.run(reader)
@@ -337,7 +337,8 @@ class TailPass:
         if made and found.next_offset:
             raise rows_dropped(found, sink.name, store.place, self.plan.log, latest)
         # Now, as `status` reports a sink as followed while its lock is held.
-        checkpoints.write_refold(connection, sink.name, None, None)
+        checkpoints.write_heartbeat(connection, sink.name)
+        checkpoints.name_session(connection, checkpoints.FOLLOWING)
         self.checkpoints[sink.name] = found
         self.parked |= {x.offset: x for x in checkpoints.parked(connection, sink.name)}
         return has_fault

@@ -11,18 +11,16 @@ correction changes are kept (`KeptVectors`).
 The transaction of the swap records in the checkpoint which commands the new map includes. However a
 refold ends, a command that the map does not include makes the next tail refold.
 
-Its progress is in the checkpoints, for other processes to read. The refold's own connections are in
-the transaction of the swap, whose writes are not visible before it ends, so a thread writes the
-progress over connections of its own.
+That there is one shows in the name of the tail's sessions (`checkpoints.name_session`), which other
+processes see at once, also while the refold is in the transaction of its swap.
 """
 
-import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import TracebackType
-from typing import Final, Self
+from functools import partial
+from typing import Final
 
 from eventsrc.base.machine import gc_paused
 from eventsrc.base.text import advised
@@ -42,68 +40,6 @@ from .shadows import FoldedLog, ShadowOf, ShadowWriter, drop_replaced, stream, s
 from .sink import Checkpoint, Shadow
 from .stores import DatabaseSink, Store
 from .vector_sink import READERS, count_vectors, has_hnsw
-
-BEAT_S: Final = 1.0
-
-
-class RefoldProgress:
-    """A context manager around a refold of ``stores``. ``update`` raises what the thread raised."""
-
-    def __init__(self, stores: Sequence[Store]) -> None:
-        self._stores = stores
-        self._at: tuple[int, int] | tuple[None, None] = (0, 0)
-        self._held = threading.Lock()
-        self._ended = threading.Event()
-        self._failed: BaseException | None = None
-        self._thread = threading.Thread(target=self._work, name="refold-progress", daemon=True)
-        self._stack = contextlib.ExitStack()
-        self._connections: list[tuple[Store, Connection]] = []
-
-    def __enter__(self) -> Self:
-        with contextlib.ExitStack() as stack:
-            for store in self._stores:
-                connection = stack.enter_context(store.throwaway_connection())
-                self._connections.append((store, connection))
-            self._write()
-            self._stack = stack.pop_all()
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        self._thread.join()
-        self._stack.close()
-
-    def update(self, done: int, total: int) -> None:
-        """``done`` of ``total`` events are folded. Raises what the thread raised."""
-        self._at = (done, total)
-        if self._failed is not None:
-            raise self._failed
-
-    @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Pause writing progress during the block, which changes the checkpoints and ends the
-        refold."""
-        with self._held:
-            yield
-            self._at = (None, None)
-
-    def _work(self) -> None:
-        try:
-            while not self._ended.wait(BEAT_S):
-                with self._held:
-                    self._write()
-        except BaseException as error:  # noqa: BLE001 - raised by `update`
-            self._failed = error
-
-    def _write(self) -> None:
-        for store, connection in self._connections:
-            with database_errors(store.url):
-                for sink in store.sinks:
-                    checkpoints.write_refold(connection, sink.name, *self._at)
-
 
 TICK_EVENTS: Final = 256
 LOOK_S: Final = 0.5
@@ -146,23 +82,24 @@ class Refold:
         folded: list[FoldedLog] = []
 
         def fold_into(writers: Sequence[ShadowWriter]) -> FoldedLog:
-            folded.append(self._fold(writers, progress))
+            folded.append(self._fold(writers))
             return folded[0]
 
         indexed = self._swaps_indexed_vectors()
-        with gc_paused(), RefoldProgress(self.stores) as progress:
+        for store in self.stores:
+            store.run(partial(checkpoints.name_session, name=checkpoints.REFOLDING))
+        with gc_paused():
             swap_in_new_map(
                 self.stores,
                 self.reader.log_id,
                 fold_into,
                 lambda _: None,
                 shadow_of=self._shadow_of(),
-                while_swapping=progress.held(),
             )
             drop_replaced(self.stores, lambda _: None, hnsw=indexed)
         return folded[0]
 
-    def _fold(self, writers: Sequence[ShadowWriter], progress: RefoldProgress) -> FoldedLog:
+    def _fold(self, writers: Sequence[ShadowWriter]) -> FoldedLog:
         fold = LiveFold(self.base.settings, corrections=self.base.corrections, reader=self.reader)
         last: Event | None = None
         at, end = FIRST_OFFSET, self.inputs.end
@@ -172,7 +109,6 @@ class Refold:
                     self._feed(fold, batch)
                     last = batch[-1]
                     stream(fold, writers)
-                    progress.update(last.offset + 1, end)
                     self.on_progress(last.offset + 1, end)
                     if time.monotonic() - self._looked_at > LOOK_S:
                         self._look()

@@ -281,13 +281,9 @@ def swap_in_new_map(
     notify: Notify,
     *,
     shadow_of: ShadowOf = lambda sink: sink.shadow(),
-    while_swapping: contextlib.AbstractContextManager[object] | None = None,
 ) -> Swap:
-    """Replace the map that readers see. On any exception the old map stays.
-
-    ``while_swapping`` is entered before the checkpoints are written and left after the commit.
-    """
-    with _transactions(stores) as committing:
+    """Replace the map that readers see. On any exception the old map stays."""
+    with _transactions(stores):
         with short_turns(), _shadow_writers(stores, shadow_of) as writers:
             folded = fold_into(writers)
             notify("writing")
@@ -301,8 +297,6 @@ def swap_in_new_map(
                 writer.thread.flush()
         notify("swapping")
         lock_readers(writers)
-        if while_swapping is not None:
-            committing.enter_context(while_swapping)
         checkpoint = folded.inputs.checkpoint(
             log_id, fold.map.next_offset, event_hash(folded.last), digest, maps_key(fold.view)
         )
@@ -316,16 +310,13 @@ def swap_in_new_map(
 
 
 @contextlib.contextmanager
-def _transactions(stores: Sequence[Store]) -> Iterator[contextlib.ExitStack]:
-    """A transaction in each store, committed in turn; an error inside rolls all of them back.
-
-    Contexts entered in the yielded stack are left after the commits.
-    """
-    with contextlib.ExitStack() as afterwards, contextlib.ExitStack() as transactions:
+def _transactions(stores: Sequence[Store]) -> Iterator[None]:
+    """A transaction in each store, committed in turn; an error inside rolls all of them back."""
+    with contextlib.ExitStack() as transactions:
         for store in stores:
             transactions.enter_context(database_errors(store.url))
             transactions.enter_context(store.connection.transaction())
-        yield afterwards
+        yield
 
 
 def _replace_checkpoints(

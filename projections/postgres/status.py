@@ -55,8 +55,7 @@ class SinkStatus:
     """One sink. Ages are seconds; ``note`` explains ``other`` and ``unreachable``.
 
     ``lag`` is None when it was made from another log, or a longer one. ``unwanted_writers`` are
-    roles without the privilege to write that Apache AGE lets write nevertheless. ``refold_done`` of
-    ``refold_total`` events are refolded.
+    roles without the privilege to write that Apache AGE lets write nevertheless.
     """
 
     sink: SinkName
@@ -72,8 +71,6 @@ class SinkStatus:
     dead_letters: tuple[DeadLetter, ...] = ()
     versions: dict[str, str] | None = None
     unwanted_writers: tuple[str, ...] = ()
-    refold_done: int | None = None
-    refold_total: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,17 +135,13 @@ def _sink_status(
         advice = f"{dropped}; {replay_advice(reader.path, inputs.latest)}"
         return SinkStatus(sink, where, "missing", note=advice, versions=versions)
     moved, heartbeat = checkpoints.ages(connection, sink)
-    refolded = checkpoints.refold(connection, sink)
     is_silent = heartbeat is None or heartbeat > STALLED_S
     condition, note = _condition(found, sink, where, reader, inputs)
     if condition != "other" and writer is not None:
         condition, note = _working(writer), None
-        if writer == "mapfold tail" and is_silent:
+        if condition == "following" and is_silent:
             condition = "stalled"
             note = "a tail holds it but sends no heartbeat; look at that process"
-        elif writer == "mapfold tail" and refolded is not None:
-            condition = "refolding"
-    done, total = refolded if refolded and condition == "refolding" else (None, None)
     is_of_log = found.log_id == reader.log_id and found.next_offset <= end
     return SinkStatus(
         sink,
@@ -164,8 +157,6 @@ def _sink_status(
         tuple(checkpoints.parked(connection, sink)),
         versions,
         tuple(unwanted_writers(connection)) if sink == "graph" else (),
-        done,
-        total,
     )
 
 
@@ -190,8 +181,12 @@ def _condition(
     return "behind", note
 
 
-def _working(writer: str) -> Literal["following", "rebuilding"]:
-    return "following" if writer == "mapfold tail" else "rebuilding"
+def _working(writer: str) -> Condition:
+    of_tail: dict[str, Condition] = {
+        checkpoints.FOLLOWING: "following",
+        checkpoints.REFOLDING: "refolding",
+    }
+    return of_tail.get(writer, "rebuilding")
 
 
 def _versions(connection: Connection) -> dict[str, str]:

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from projections.map.fold import fold_log
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
-from projections.postgres.status import SinkStatus, projection_status
+from projections.postgres.status import Status, projection_status
 from projections.surfaces.cli.db import _sink_line
 from tests.support.commands import Commands
 from tests.support.logs import (
@@ -293,36 +292,26 @@ def test_settings_of_fusion_by_evidence_keep_the_vectors(
     assert all_rows(targets) == all_rows(third_database)
 
 
-@pytest.mark.slow
-def test_status_tells_how_far_a_refold_is(
-    log: Path, targets: Targets, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("projections.postgres.refold.TICK_EVENTS", 10)
-    monkeypatch.setattr("projections.postgres.refold.BEAT_S", 0.01)
+def test_status_tells_of_a_refold(log: Path, targets: Targets) -> None:
     tail(log, targets, SETTINGS, once=True)
     append_command(log, forget_run("run-b"))
-    seen: list[tuple[SinkStatus, ...]] = []
+    seen: list[Status] = []
 
-    def look(done: int, total: int) -> None:
-        if done == 60:
-            shown = threading.Event()
-            while not shown.wait(0.02):
-                status = projection_status(log, targets, SETTINGS)
-                assert status.healthy
-                if all(s.refold_done == 60 for s in status.sinks):
-                    seen.append(status.sinks)
-                    shown.set()
+    def look(_done: int, _total: int) -> None:
+        if not seen:
+            seen.append(projection_status(log, targets, SETTINGS))
 
     before = projection_status(log, targets, SETTINGS)
     assert [s.condition for s in before.sinks] == ["behind", "behind"]
     assert "1 command came since, the last at offset 120" in str(before.sinks[0].note)
     tail(log, targets, SETTINGS, once=True, on_refold=look)
-    ((graph, vectors),) = seen
-    assert (graph.condition, vectors.condition) == ("refolding", "refolding")
-    assert (graph.refold_total, graph.next_offset) == (LOG_LENGTH + 1, LOG_LENGTH)
-    assert _sink_line(graph).startswith("refolding, 49 %, old map at offset 120, 1 behind")
+    (during,) = seen
+    assert during.healthy
+    assert [s.condition for s in during.sinks] == ["refolding", "refolding"]
+    assert during.sinks[0].next_offset == LOG_LENGTH
+    assert _sink_line(during.sinks[0]).startswith("refolding, old map at offset 120, 1 behind")
     after = projection_status(log, targets, SETTINGS)
-    assert [(s.condition, s.refold_done) for s in after.sinks] == [("idle", None)] * 2
+    assert [s.condition for s in after.sinks] == ["idle", "idle"]
 
 
 @pytest.mark.slow
@@ -364,7 +353,7 @@ def test_checkpoints_of_an_older_version_are_used(
     log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
 ) -> None:
     rebuild(log, one_database, SETTINGS)
-    for column in ("known_at", "observed", "refold_done", "refold_total", "maps"):
+    for column in ("known_at", "observed", "maps"):
         pg.execute(f"ALTER TABLE mapfold.checkpoint DROP COLUMN {column}")  # type: ignore[arg-type]
     status = projection_status(log, one_database, SETTINGS)
     assert [s.condition for s in status.sinks] == ["idle", "idle"]

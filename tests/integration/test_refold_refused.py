@@ -89,7 +89,7 @@ def test_a_command_that_no_fold_can_obey_leaves_the_old_map(log: Path, targets: 
         tail(log, targets, SETTINGS, once=True)
     assert all_rows(targets) == before
     status = projection_status(log, targets, SETTINGS)
-    assert [(s.refold_done, s.dead_letters) for s in status.sinks] == [(None, ())] * 2
+    assert [s.dead_letters for s in status.sinks] == [(), ()]
     append_command(log, undo(bad))
     assert tail(log, targets, SETTINGS, once=True).parked == []
     assert all_rows(targets) == before

@@ -20,8 +20,6 @@ CREATE TABLE mapfold.checkpoint (
     heartbeat_at timestamptz,             -- when a tail last said that it lives
     known_at     bigint,                  -- the corrections are those of the commands before it
     observed     text,                    -- fingerprint of what the observations depend on
-    refold_done  bigint,                  -- events that a tail's refold has folded …
-    refold_total bigint,                  -- … of so many; null when there is none
     maps         text                     -- key of the rows of mapfold.occupancy_map, null for none
 );
 CREATE TABLE mapfold.dead_letter (
@@ -42,7 +40,6 @@ WHERE attrelid = 'mapfold.checkpoint'::regclass AND attname = 'maps'
 -- name: add_columns
 ALTER TABLE mapfold.checkpoint
     ADD COLUMN IF NOT EXISTS known_at bigint, ADD COLUMN IF NOT EXISTS observed text,
-    ADD COLUMN IF NOT EXISTS refold_done bigint, ADD COLUMN IF NOT EXISTS refold_total bigint,
     ADD COLUMN IF NOT EXISTS maps text
 
 -- name: load
@@ -82,18 +79,13 @@ ON CONFLICT (sink) DO UPDATE
 SET log_id = EXCLUDED.log_id, fingerprint = EXCLUDED.fingerprint, settings = EXCLUDED.settings,
     next_offset = EXCLUDED.next_offset, last_event = EXCLUDED.last_event,
     digest = EXCLUDED.digest, known_at = EXCLUDED.known_at, observed = EXCLUDED.observed,
-    maps = EXCLUDED.maps, moved_at = now(), heartbeat_at = NULL, refold_done = NULL, refold_total = NULL
+    maps = EXCLUDED.maps, moved_at = now(), heartbeat_at = NULL
 
 -- name: write_heartbeat
 UPDATE mapfold.checkpoint SET heartbeat_at = now() WHERE sink = %(sink)s
 
--- name: write_refold
-UPDATE mapfold.checkpoint
-SET heartbeat_at = now(), refold_done = %(done)s, refold_total = %(total)s WHERE sink = %(sink)s
-
--- name: refold
-SELECT (to_jsonb(c) ->> 'refold_done')::bigint, (to_jsonb(c) ->> 'refold_total')::bigint
-FROM mapfold.checkpoint c WHERE c.sink = %(sink)s
+-- name: name_session
+SELECT set_config('application_name', %(name)s, false)
 
 -- name: ages
 SELECT extract(epoch FROM now() - moved_at)::float8, extract(epoch FROM now() - heartbeat_at)::float8

@@ -230,16 +230,8 @@ def status_document(info: LogInfo, found: Status) -> dict[str, Any]:
             "rejected": info.rejected,
             "lost": info.lost,
         },
-        "sinks": {s.sink: _sink_document(s) for s in found.sinks},
+        "sinks": {s.sink: asdict(s) for s in found.sinks},
     }
-
-
-def _sink_document(sink: SinkStatus) -> dict[str, Any]:
-    """The status as JSON, with a refold's progress only while there is one."""
-    document = asdict(sink)
-    if sink.refold_total is None:
-        del document["refold_done"], document["refold_total"]
-    return document
 
 
 def _print_status(info: LogInfo, found: Status) -> None:
@@ -273,7 +265,5 @@ def _sink_line(sink: SinkStatus) -> str:
     if sink.next_offset is None:
         return f"{sink.condition} · {sink.place}" + (f" · {versions}" if versions else "")
     lag = "" if sink.lag is None else f", {sink.lag:,} behind"
-    condition: str = sink.condition
-    if sink.refold_done is not None and sink.refold_total:
-        condition += f", {100 * sink.refold_done // sink.refold_total} %, old map"
-    return f"{condition} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"
+    old = ", old map" if sink.condition == "refolding" else ""
+    return f"{sink.condition}{old} at offset {sink.next_offset:,}{lag} · {sink.place} · {versions}"
