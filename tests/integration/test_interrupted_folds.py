@@ -3,17 +3,23 @@
 import gc
 import random
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mapfold import Settings, Timeline, fold, open_log
 
-from eventsrc.log import LogReader
+from eventsrc.envelope.system_events import REJECTED_KEY, RejectedPayload
+from eventsrc.log import LogReader, LogWriter
 from projections.fold.map_errors import FoldInterrupted
 from projections.map.digest import map_digest
 from projections.map.own_events import read_corrections
 from projections.postgres.live_fold import LiveFold
+from projections.postgres.queries.live_view import LiveView
+from projections.surfaces.serve.asked import ChangesQuery, FindQuery, ServedLog
+from projections.surfaces.ui.log_map import LogMap, Opened
+from projections.surfaces.ui.map_answers import history_columns
 from tests.property.test_timeline_cache import kept_early
 from tests.support.commands import interrupt, moments_of
 from tests.support.evidence_drives import EVIDENCE
@@ -163,3 +169,62 @@ def test_an_interrupted_live_fold_goes_on_rightly_or_refuses(log: Path, rules: S
         else:
             assert map_digest(live.view) == expected
     assert refused
+
+
+@RULES
+def test_the_map_of_the_page_is_right_after_an_interrupted_refresh(
+    log: Path, rules: Settings
+) -> None:
+    opened = [LogMap(Opened(log, lambda _: rules, cache=False)) for _ in range(rounds(60, 4) + 1)]
+    for each in opened:
+        each.refresh()
+    grow(log)
+    with LogWriter(log) as writer:
+        for _ in range(20):
+            writer.append(REJECTED_KEY, RejectedPayload.encode("k", "no JSON", b"?"))
+
+    def shown(page: LogMap) -> list[Any]:
+        page.refresh()
+        marks = page.log_events
+        columns = repr(history_columns(page.timeline.history, 0, marks))
+        return [page.key, columns, marks.events, marks.rejected, page.problems]
+
+    with LogMap(Opened(log, lambda _: rules, cache=False)) as page:
+        expected = shown(page)
+    moments = in_each_event(lambda: shown(opened.pop()), seed=7)
+    counted = moments_of(lambda: shown(opened[0]), mark="_rejected")
+    moments[-2:] = counted.marks[3], counted.marks[18]
+    for page, moment in zip(opened[1:], moments[::-1], strict=False):
+        with page:
+            interrupt(lambda: shown(page), moment)  # noqa: B023
+            assert shown(page) == expected, moment
+
+
+def test_a_served_log_answers_rightly_after_an_interrupted_question(log: Path) -> None:
+    grow(log)
+    with LogReader(log) as reader:
+        view = LiveView(EVIDENCE)
+        view.log_id = reader.log_id
+        view.advance(reader.next_offset)
+
+    def ask(beside: ServedLog) -> list[Any]:
+        past = beside.find(view, FindQuery(at="30"))
+        now = beside.find(view, FindQuery(all="true", limit=100))
+        return [past, now, beside.changes(view, ChangesQuery(since="20"))]
+
+    with closing(ServedLog(log)) as beside:
+        expected = ask(beside)
+    kept = log.with_name("log.history")
+
+    def anew() -> list[Any]:
+        for path in kept.glob("*"):
+            path.unlink()
+        with closing(ServedLog(log)) as beside:
+            return ask(beside)
+
+    for moment in in_each_event(anew, seed=8):
+        for path in kept.glob("*"):
+            path.unlink()
+        with closing(ServedLog(log)) as beside:
+            interrupt(lambda: ask(beside), moment)
+            assert ask(beside) == expected, moment

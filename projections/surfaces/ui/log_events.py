@@ -67,11 +67,16 @@ class LogEvents:
         return max(0, self._reports - self._most)
 
     def read_on(self, reader: LogReader, end: Offset) -> None:
-        """Read those below ``end``. Raises LogDamaged."""
-        for event in reader.read(self.through, end, keys=tuple(_SYSTEM_KEYS)):
-            self._add(event)
-            self.through = Offset(event.offset + 1)
-        self.through = end
+        """Read those below ``end``. After an exception they are as they were. Raises LogDamaged."""
+        counts = self._reports, self.rejected, self.losses, len(self.events)
+        try:
+            for event in reader.read(self.through, end, keys=tuple(_SYSTEM_KEYS)):
+                self._add(event)
+            self.through = end
+        except BaseException:
+            self._reports, self.rejected, self.losses, kept = counts
+            del self.events[kept:]
+            raise
 
     def _add(self, event: Event) -> None:
         kind = _SYSTEM_KEYS[event.key]
