@@ -257,7 +257,7 @@ BAD_VECTORS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize("which", LEFT_OUT)
+@pytest.mark.parametrize("which", mostly_slow(LEFT_OUT))
 def test_a_bad_vector_among_detections_without_is_kept_as_rejected(
     mapfold: Commands, which: Without
 ) -> None:

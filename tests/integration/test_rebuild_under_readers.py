@@ -169,8 +169,9 @@ def test_interrupted_at_each_stage_one_whole_map_is_served(
 
 
 def test_a_rebuild_refuses_to_run_beside_a_tail_and_the_other_way_round(
-    tmp_path: Path, one_database: Targets
+    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("projections.postgres.checkpoints.LOCK_GRACE_S", 0.0)
     log = write_log(tmp_path / "log", walk(30))
     refused = []
 

@@ -269,7 +269,13 @@ def test_the_command_finds_its_topics_by_itself(
     assert [e.payload for e in envelopes(read_log(log))] == expected_envelopes(sent)
 
 
-@pytest.mark.seconds
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that waits only briefly for messages that nobody sends."""
+    monkeypatch.setattr("eventsrc.record.ros_graph._SAMPLES_S", 0.1)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_of_several_topics_of_transforms_none_is_taken(endpoint: str, connected: Sessions) -> None:
     with rmw.node(endpoint, 3) as node:
         node.advertise("/detections", BOXES)
@@ -289,7 +295,7 @@ def test_of_several_topics_of_transforms_none_is_taken(endpoint: str, connected:
     assert any("/bot1/tf, /bot2/tf" in note for note in found.notes)
 
 
-@pytest.mark.seconds
+@pytest.mark.usefixtures("impatient")
 def test_what_may_come_later_is_recorded_and_other_robots_are_not(
     endpoint: str, connected: Sessions
 ) -> None:

@@ -96,6 +96,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def house(log: Path) -> api.Map:
+    return api.fold(log)
+
+
 @pytest.mark.parametrize(
     ("arguments", "keywords"),
     [
@@ -115,10 +120,14 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_the_command_and_python_give_the_same_answers(
-    log: Path, mapfold: Commands, arguments: list[str], keywords: dict[str, Any]
+    log: Path,
+    house: api.Map,
+    mapfold: Commands,
+    arguments: list[str],
+    keywords: dict[str, Any],
 ) -> None:
     said = mapfold("find", log, *arguments, "--json")
-    found = api.fold(log).find(**keywords)
+    found = house.find(**keywords)
     assert json.loads(said.out) == json.loads(json.dumps(found.document()))
     text = mapfold("find", log, *arguments)
     for answer in found.answers:
@@ -126,8 +135,7 @@ def test_the_command_and_python_give_the_same_answers(
     assert found.answers or "nothing found" in text.out
 
 
-def test_what_has_moved_is_told_with_where_it_was(log: Path) -> None:
-    house = api.fold(log)
+def test_what_has_moved_is_told_with_where_it_was(house: api.Map) -> None:
     moved = house.find(moved=True, every=True, top=100).answers
     assert moved
     for answer in moved:
@@ -160,8 +168,7 @@ def test_what_cannot_be_answered_is_an_error_that_says_why(
     assert len(answer.err) < 2_000
 
 
-def test_a_place_is_no_object_and_the_error_says_how_to_ask(log: Path) -> None:
-    house = api.fold(log)
+def test_a_place_is_no_object_and_the_error_says_how_to_ask(house: api.Map) -> None:
     place_id = house.places[0]["place_id"]
     with pytest.raises(
         MisuseError, match=r"is a place: .*; `mapfold find --in .*` lists what is in it"
@@ -171,8 +178,7 @@ def test_a_place_is_no_object_and_the_error_says_how_to_ask(log: Path) -> None:
         house.find(seen_since="now")
 
 
-def test_an_object_is_found_by_its_id_also_one_seen_once(log: Path) -> None:
-    house = api.fold(log)
+def test_an_object_is_found_by_its_id_also_one_seen_once(house: api.Map) -> None:
     for record in house.objects:
         (answer,) = house.find(record["object_id"]).answers
         assert answer.object_id == record["object_id"]
