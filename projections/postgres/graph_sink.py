@@ -41,7 +41,7 @@ from .labels import (
     Label,
     SinkName,
 )
-from .loader import Load, LoaderName, graph_statement, load_of_graph, unnest_columns
+from .loader import Load, copy_to_graph, graph_statement, insert_into_graph, unnest_columns
 from .map_table import MapRow, map_rows
 from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
 from .sink import PreparedWrite
@@ -59,9 +59,6 @@ class GraphSink:
     """Implements `Sink` for the graph ``semantic_map``."""
 
     name: Final[SinkName] = "graph"
-
-    def __init__(self, loader: LoaderName = "copy") -> None:
-        self._loader: LoaderName = loader
 
     def ensure(self, connection: Connection) -> bool:
         """Create an empty graph if there is none, or one without labels. Raises ProjectionMismatch
@@ -96,15 +93,15 @@ class GraphSink:
         connection: Connection,
     ) -> None:
         copies = not is_small and not policies_apply(connection)
-        loader = self._loader if copies else "insert"
+        load_of = copy_to_graph if copies else insert_into_graph
         for label, inserted in rows.inserted.items():
-            load_of_graph(loader, GRAPH, label, inserted)(connection)
+            load_of(GRAPH, label, inserted)(connection)
         for label, upserted in rows.upserted.items():
             kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
             unnest_columns(kind, GRAPH, label, upserted)(connection)
         for label, replaced in rows.replaced.items():
             _delete(connection, label, [int(row[1]) for row in replaced], "delete_from")
-            load_of_graph("insert", GRAPH, label, replaced)(connection)
+            insert_into_graph(GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
             _delete(connection, label, ids)
         if maps is not None:
@@ -128,7 +125,7 @@ class GraphSink:
 
     def shadow(self) -> "GraphShadow":
         """A shadow, not created yet."""
-        return GraphShadow(self._loader)
+        return GraphShadow()
 
     def drop_replaced(self, connection: Connection) -> None:
         """Drop the replaced graph once its last reader has ended."""
@@ -138,9 +135,6 @@ class GraphSink:
 
 class GraphShadow:
     """Implements `Shadow`: the graph ``semantic_map_next``."""
-
-    def __init__(self, loader: LoaderName) -> None:
-        self._loader = loader
 
     def create(self, connection: Connection) -> None:
         """Create an empty graph and its early indexes."""
@@ -179,9 +173,7 @@ class GraphShadow:
         _swap_in(connection, NEXT_GRAPH)
 
     def _load(self, rows_of: Mapping[Label, list[Row]]) -> Load:
-        loads = [
-            load_of_graph(self._loader, NEXT_GRAPH, label, rows) for label, rows in rows_of.items()
-        ]
+        loads = [copy_to_graph(NEXT_GRAPH, label, rows) for label, rows in rows_of.items()]
 
         def load(connection: Connection) -> None:
             for send in loads:

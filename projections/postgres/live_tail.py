@@ -42,7 +42,6 @@ from .connection import Targets, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf, commands_between
 from .labels import SinkName
 from .live_fold import LiveFold, batches
-from .loader import LoaderName
 from .map_table import maps_key
 from .origin import is_under_other_corrections, replay_advice, rows_dropped
 from .refold import CommandsCame, Refold, RefoldStopped, refuse_if_not_allowed
@@ -62,7 +61,6 @@ def tail(
     *,
     once: bool = False,
     only: Only = None,
-    loader: LoaderName = "copy",
     batch_events: int = BATCH_EVENTS,
     stop: threading.Event | None = None,
     on_fold: Callable[[int], None] = lambda _: None,
@@ -101,7 +99,7 @@ def tail(
     outage: Backoff | None = None
     while True:
         try:
-            if _run_pass(plan, report, only, loader, outage):
+            if _run_pass(plan, report, only, outage):
                 return report
         except LostCommits:
             report.restarts += 1
@@ -109,9 +107,7 @@ def tail(
             outage = Backoff(describe_target(targets.graph_url), plan)
 
 
-def _run_pass(
-    plan: TailPlan, report: TailReport, only: Only, loader: LoaderName, outage: Backoff | None
-) -> bool:
+def _run_pass(plan: TailPlan, report: TailReport, only: Only, outage: Backoff | None) -> bool:
     """Run one pass; False when the database was unreachable at its beginning. Raises LostCommits.
 
     ``outage`` is None for the first pass, which does not wait for an unreachable database.
@@ -125,7 +121,7 @@ def _run_pass(
             inputs = LogInputs.read(reader, plan.settings)
             settings = inputs.latest.settings
             with open_stores(
-                plan.targets, settings, only=only, application=checkpoints.FOLLOWING, loader=loader
+                plan.targets, settings, only=only, application=checkpoints.FOLLOWING
             ) as stores:
                 run = TailPass(plan, stores, report, inputs, inputs.latest)
                 run.run(reader)

@@ -1,8 +1,7 @@
 """Bulk insertion of new rows, in one of two ways that write the same.
 
-``copy`` streams COPY, for rebuilds and large batches. ``insert`` sends ``INSERT … SELECT unnest``
-with the columns as bound arrays, for servers and proxies that do not let COPY through, and for
-batches so small that COPY's own round trips would cost more.
+Rebuilds and large batches are streamed by COPY. ``INSERT … SELECT unnest``, with the columns as
+bound arrays, is for batches so small that COPY's own round trips would cost more.
 
 A `Load` of rows is made when all work of this process is done, and only sending is left. A rebuild
 sends in a thread; if the thread encoded rows too, it and the fold would take the interpreter from
@@ -25,7 +24,7 @@ bytes as the type's ``recv`` function takes them; an int16 -1 ends it. All big-e
 import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from psycopg import sql
@@ -138,12 +137,8 @@ def _name_fields(class_name: str, model: str | None) -> bytes:
     return _text(class_name) + (_NULL if model is None else _text(model))
 
 
-LoaderName: TypeAlias = Literal["copy", "insert"]
 Load: TypeAlias = Callable[[Connection], None]
 """Sends rows that are not in the table yet, inside a transaction."""
-TypeName: TypeAlias = Callable[[], sql.Composable]
-"""Returns pgvector's type. Called when rows are sent: when they are encoded, a rebuild's thread may
-not have read yet in which schema the server has it."""
 INSERT_CHUNK: Final = 5_000
 """Rows of one INSERT: client and server hold all of a statement's parameters in memory."""
 VECTOR_CHUNK: Final = 500
@@ -152,11 +147,9 @@ COPY_CHUNK: Final = 60
 memory is allocated by the system each time."""
 
 
-def load_of_graph(loader: LoaderName, graph: str, label: Label, rows: Sequence[Row]) -> Load:
-    """Adds vertices or edges of one label."""
+def copy_to_graph(graph: str, label: Label, rows: Sequence[Row]) -> Load:
+    """Copies vertices or edges of one label."""
     kind = "edge" if label in EDGE_LABELS else "vertex"
-    if loader == "insert":
-        return unnest_columns(f"insert_{kind}", graph, label, rows)
     # agtype text, which has no binary form, holds no raw tab or line end (they are escaped in
     # strings), so the backslash is the only character that COPY's own format still has to escape.
     line = "%d\t%d\t%d\t%s\n" if kind == "edge" else "%d\t%s\n"
@@ -164,16 +157,16 @@ def load_of_graph(loader: LoaderName, graph: str, label: Label, rows: Sequence[R
     return _copy(graph_statement(f"copy_{kind}", graph, label), [document])
 
 
-def load_of_vectors(
-    loader: LoaderName, schema: str, vector: TypeName, rows: Sequence[VectorRow]
-) -> Load:
-    """Adds rows of ``detection_embeddings``."""
-    where = sql.Identifier(schema)
-    if loader == "insert":
-        insert, fields = statements("vectors")["insert"], [_vector_fields(row) for row in rows]
-        return _unnest(lambda: insert.format(schema=where, vector=vector()), fields, VECTOR_CHUNK)
+def insert_into_graph(graph: str, label: Label, rows: Sequence[Row]) -> Load:
+    """Inserts vertices or edges of one label."""
+    kind = "edge" if label in EDGE_LABELS else "vertex"
+    return unnest_columns(f"insert_{kind}", graph, label, rows)
+
+
+def copy_vectors(schema: str, rows: Sequence[VectorRow]) -> Load:
+    """Copies rows of ``detection_embeddings``."""
     statement = sql.SQL("COPY {}.detection_embeddings ({}) FROM STDIN (FORMAT binary)").format(
-        where, sql.SQL(", ").join(map(sql.Identifier, COPIED))
+        sql.Identifier(schema), sql.SQL(", ").join(map(sql.Identifier, COPIED))
     )
     documents = [
         copy_document(rows[i : i + COPY_CHUNK], i == 0, i + COPY_CHUNK >= len(rows))
@@ -182,13 +175,18 @@ def load_of_vectors(
     return _copy(statement, documents)
 
 
+def insert_vectors(schema: str, vector: sql.Composable, rows: Sequence[VectorRow]) -> Load:
+    """Inserts rows of ``detection_embeddings``; ``vector`` is the name of pgvector's type."""
+    insert = statements("vectors")["insert"].format(schema=sql.Identifier(schema), vector=vector)
+    return _unnest(insert, [_vector_fields(row) for row in rows], VECTOR_CHUNK)
+
+
 def unnest_columns(
     statement: str, graph: str, label: str, rows: Sequence[tuple[object, ...]]
 ) -> Load:
     """Runs one of the unnest statements of ``sql/graph.sql`` with the columns of ``rows``."""
     as_text = [tuple(map(str, row)) for row in rows]
-    query = graph_statement(statement, graph, label)
-    return _unnest(lambda: query, as_text, INSERT_CHUNK)
+    return _unnest(graph_statement(statement, graph, label), as_text, INSERT_CHUNK)
 
 
 def graph_statement(
@@ -209,9 +207,7 @@ def _copy(statement: sql.Composed, documents: list[bytes]) -> Load:
     return load
 
 
-def _unnest(
-    statement: Callable[[], sql.Composed], rows: Sequence[tuple[object, ...]], size: int
-) -> Load:
+def _unnest(statement: sql.Composed, rows: Sequence[tuple[object, ...]], size: int) -> Load:
     """One statement for each ``size`` rows."""
     chunks = [
         [list(column) for column in zip(*rows[start : start + size], strict=True)]
@@ -219,9 +215,8 @@ def _unnest(
     ]
 
     def load(connection: Connection) -> None:
-        query = statement()
         for columns in chunks:
-            connection.execute(query, columns)
+            connection.execute(statement, columns)
 
     return load
 

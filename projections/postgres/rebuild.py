@@ -34,7 +34,6 @@ from .connection import Targets, connect, database_errors, describe_target
 from .inputs import LogInputs, MapInputs, SettingsOf
 from .labels import SINKS, SinkName
 from .live_fold import LiveFold
-from .loader import LoaderName
 from .origin import command_for, refuse_mismatch
 from .shadows import FoldedLog, ShadowWriter, drop_replaced, stream, swap_in_new_map
 from .stores import Only, open_stores
@@ -119,7 +118,6 @@ def rebuild(
     until: Offset | None = None,
     known_at: Offset | None = None,
     only: Only = None,
-    loader: LoaderName = "copy",
     hnsw: bool = True,
     workers: int | None = None,
     progress: OnProgress | None = None,
@@ -159,9 +157,7 @@ def rebuild(
         def notify_stage(stage: str) -> None:
             notify(RebuildProgress(stage, total, total))
 
-        opened = open_stores(
-            targets, inputs.settings, only=only, application="mapfold replay", loader=loader
-        )
+        opened = open_stores(targets, inputs.settings, only=only, application="mapfold replay")
         with opened as stores, ParsedLog(reader, total, workers) as parsed:
             swap = swap_in_new_map(stores, reader.log_id, fold_into, notify_stage)
             index = drop_replaced(stores, notify_stage, hnsw=hnsw)

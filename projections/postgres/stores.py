@@ -21,7 +21,6 @@ from .connection import (
 )
 from .graph_sink import GraphSink
 from .labels import SinkName
-from .loader import LoaderName
 from .vector_sink import VectorSink
 
 Only: TypeAlias = SinkName | None
@@ -78,12 +77,11 @@ def open_stores(
     *,
     only: Only,
     application: str,
-    loader: LoaderName = "copy",
 ) -> Iterator[list[Store]]:
     """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
     stores: list[Store] = []
     try:
-        for url, sinks in _sinks_by_url(targets, settings, only, loader).items():
+        for url, sinks in _sinks_by_url(targets, settings, only).items():
             stores.append(Store(url, application, sinks, _open(url, application, sinks)))
         yield stores
     finally:
@@ -92,10 +90,10 @@ def open_stores(
 
 
 def _sinks_by_url(
-    targets: Targets, settings: Settings, only: Only, loader: LoaderName
+    targets: Targets, settings: Settings, only: Only
 ) -> dict[str, tuple[DatabaseSink, ...]]:
     found: dict[str, tuple[DatabaseSink, ...]] = {}
-    for sink in (GraphSink(loader), VectorSink(loader, dimension=settings.embedding_dim)):
+    for sink in (GraphSink(), VectorSink(dimension=settings.embedding_dim)):
         if only in (None, sink.name):
             url = targets.url_of(sink.name)
             found[url] = (*found.get(url, ()), sink)

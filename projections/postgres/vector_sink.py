@@ -38,7 +38,7 @@ from .connection import (
 )
 from .grants import copy_privileges
 from .labels import TABLE, SinkName
-from .loader import Load, LoaderName, load_of_vectors
+from .loader import Load, copy_vectors, insert_vectors
 from .replaced_tables import try_drop_lock, wait_for_drop
 from .sink import PreparedWrite
 from .vector_rows import VectorRow, new_rows
@@ -72,8 +72,7 @@ class VectorSink:
 
     name: Final[SinkName] = "vectors"
 
-    def __init__(self, loader: LoaderName = "copy", *, dimension: int | None = None) -> None:
-        self._loader: LoaderName = loader
+    def __init__(self, *, dimension: int | None = None) -> None:
         self._dimension = dimension or DEFAULT_DIMENSION
         self._type: sql.Composable = sql.Identifier("vector")
 
@@ -104,8 +103,10 @@ class VectorSink:
             self._refuse_if_not_owner(connection, dimension)
             _redimension(connection, READERS, self._type, dimension)
             self._dimension = dimension
-        loader = "insert" if is_small else self._loader
-        load_of_vectors(loader, READERS, lambda: self._type, rows)(connection)
+        if is_small:
+            insert_vectors(READERS, self._type, rows)(connection)
+        else:
+            copy_vectors(READERS, rows)(connection)
 
     def drop_leftovers(self, connection: Connection) -> None:
         """Drop a replaced table that was left; refuse early if the name in use is not ours."""
@@ -116,7 +117,7 @@ class VectorSink:
 
     def shadow(self) -> "VectorShadow":
         """A shadow, not created yet."""
-        return VectorShadow(self._loader, self._dimension)
+        return VectorShadow(self._dimension)
 
     def drop_replaced(self, connection: Connection) -> None:
         """Have the replaced table dropped."""
@@ -136,8 +137,7 @@ class VectorSink:
 class VectorShadow:
     """Implements `Shadow`: the table ``mapfold.detection_embeddings``."""
 
-    def __init__(self, loader: LoaderName, dimension: int) -> None:
-        self._loader = loader
+    def __init__(self, dimension: int) -> None:
         self._dimension = dimension
         self._type: sql.Composable = sql.Identifier("vector")
 
@@ -152,7 +152,7 @@ class VectorShadow:
         if not rows:
             return lambda _: None
         dimension = len(rows[0].unit)
-        add = load_of_vectors(self._loader, SHADOW, lambda: self._type, rows)
+        add = copy_vectors(SHADOW, rows)
 
         def load(connection: Connection) -> None:
             if dimension != self._dimension:

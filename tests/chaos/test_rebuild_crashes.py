@@ -20,7 +20,7 @@ from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, rebuild
 from projections.postgres.connection import Targets, connect, describe_target
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.loader import Load, LoaderName, TypeName, load_of_vectors
+from projections.postgres.loader import Load, copy_vectors
 from projections.postgres.vector_sink import VectorShadow
 from tests.support import prefork
 from tests.support.logs import bridge, walk, write_log
@@ -130,14 +130,12 @@ def test_rows_that_the_server_refuses_while_the_fold_goes_on(
     old = all_rows(one_database)
     calls: list[int] = []
 
-    def twice_the_second_time(
-        loader: LoaderName, schema: str, vector: TypeName, rows: Sequence[Any]
-    ) -> Load:
+    def twice_the_second_time(schema: str, rows: Sequence[Any]) -> Load:
         calls.append(len(rows))
-        return load_of_vectors(loader, schema, vector, [*rows, *rows] if len(calls) == 2 else rows)
+        return copy_vectors(schema, [*rows, *rows] if len(calls) == 2 else rows)
 
     with monkeypatch.context() as patched:
-        patched.setattr("projections.postgres.vector_sink.load_of_vectors", twice_the_second_time)
+        patched.setattr("projections.postgres.vector_sink.copy_vectors", twice_the_second_time)
         with pytest.raises(DatabaseError, match="duplicate key"):
             rebuild(log, one_database, SETTINGS)
     assert len(calls) >= 2  # made ready ahead of what was refused

@@ -21,7 +21,6 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.graph_rows import expected_rows
 from projections.postgres.labels import LABELS
-from projections.postgres.loader import LoaderName
 from projections.store.history_recorder import map_after
 from tests.integration.test_projections import parsed
 from tests.property.test_timeline_cache import kept_early
@@ -78,20 +77,19 @@ def test_batches_of_any_size_give_the_rows_of_the_fold(log: Path, size: int) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "loader"), [(23, "insert"), (1, "copy"), (256, "copy")])
+@pytest.mark.parametrize("size", [23, 1, 256])
 def test_a_tail_that_goes_on_has_the_rows_of_a_rebuild(
     tmp_path: Path,
     documents: list[dict[str, Any]],
     one_database: Targets,
     third_database: Targets,
     size: int,
-    loader: LoaderName,
 ) -> None:
     log = tmp_path / "log"
     for start in range(0, len(documents), 90):
         write_log(log, documents[start : start + 130])
-        tail(log, one_database, EVIDENCE, once=True, batch_events=size, loader=loader)
-    rebuild(log, third_database, EVIDENCE, loader=loader)
+        tail(log, one_database, EVIDENCE, once=True, batch_events=size)
+    rebuild(log, third_database, EVIDENCE)
     rows = all_rows(one_database)
     assert rows == all_rows(third_database)
     view = view_of(log)

@@ -18,7 +18,6 @@ from projections.map.view import MapView
 from projections.postgres.checkpoints import ensure_schema
 from projections.postgres.connection import Connection, Targets, connect, pin_session_settings
 from projections.postgres.graph_sink import GraphSink
-from projections.postgres.loader import LoaderName
 from projections.postgres.queries.candidate_search import prepare_graph
 from projections.postgres.queries.graph_reads import objects_near
 from projections.postgres.queries.live_view import read_view
@@ -46,12 +45,10 @@ def session(targets: Targets) -> Iterator[Connection]:
         yield connection
 
 
-def follow(
-    connection: Connection, events: list[list[d.Delta]], size: int, loader: LoaderName
-) -> MapView:
+def follow(connection: Connection, events: list[list[d.Delta]], size: int) -> MapView:
     """Both sinks live, in batches of ``size``."""
     tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
-    sinks = GraphSink(loader), VectorSink(loader, dimension=3)
+    sinks = GraphSink(), VectorSink(dimension=3)
     with connection.transaction():
         for sink in sinks:
             sink.ensure(connection)
@@ -70,11 +67,9 @@ def follow(
     return tracker.view
 
 
-def rebuild(
-    connection: Connection, events: list[list[d.Delta]], size: int, loader: LoaderName
-) -> MapView:
+def rebuild(connection: Connection, events: list[list[d.Delta]], size: int) -> MapView:
     tracker = ChangeTracker(MapView(EVIDENCE, keep_embeddings=False))
-    shadows = GraphSink(loader).shadow(), VectorSink(loader, dimension=3).shadow()
+    shadows = GraphSink().shadow(), VectorSink(dimension=3).shadow()
     with connection.transaction():
         for shadow in shadows:
             shadow.create(connection)
@@ -93,18 +88,18 @@ def rebuild(
 
 
 @pytest.mark.parametrize(
-    ("seed", "size", "loader"),
-    mostly_slow([(1, 1, "copy"), (2, 7, "insert"), (3, 7, "copy"), (4, 99, "copy")]),
+    ("seed", "size"),
+    mostly_slow([(1, 1), (2, 7), (3, 7), (4, 99)]),
 )
 def test_live_batches_and_a_rebuild_give_what_the_deltas_say(
-    seed: int, size: int, loader: LoaderName, one_database: Targets
+    seed: int, size: int, one_database: Targets
 ) -> None:
     events = SyntheticDeltas.of(random_steps(seed, 70)).events
     with session(one_database) as connection:
-        view = follow(connection, events, size, loader)
+        view = follow(connection, events, size)
         assert len(view.objects) < len(view.all_objects)
         live = all_rows(one_database)
-        rebuild(connection, events, 13, loader)
+        rebuild(connection, events, 13)
         assert all_rows(one_database) == live
     graph = parsed(dict(live[0]))
     assert graph == expected_graph(view)

@@ -16,7 +16,6 @@ from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
-from projections.postgres.loader import LoaderName
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import WEIRD, append_raw, bridge, walk, write_log
 from tests.support.rows import (
@@ -30,7 +29,6 @@ from tests.support.rows import (
 from tests.support.thorough import mostly_slow
 
 SETTINGS = Settings()
-LOADERS: list[LoaderName] = ["copy", "insert"]
 
 
 def log_in(folder: Path) -> Path:
@@ -67,11 +65,8 @@ def view_of(log: Path, until: int | None = None, settings: Settings = SETTINGS) 
         return fold_log(reader, settings, until)[1]
 
 
-@pytest.mark.parametrize("loader", LOADERS)
-def test_replay_writes_what_the_fold_says(
-    log: Path, one_database: Targets, loader: LoaderName
-) -> None:
-    report = rebuild(log, one_database, SETTINGS, loader=loader)
+def test_replay_writes_what_the_fold_says(log: Path, one_database: Targets) -> None:
+    report = rebuild(log, one_database, SETTINGS)
     view = view_of(log)
     assert view.counts()["places"] >= 1
     assert view.counts()["ADJACENT_TO"] + view.counts()["LOCATED_IN"] > 0
@@ -84,25 +79,15 @@ def test_replay_writes_what_the_fold_says(
     assert report.events == view.next_offset
 
 
-@pytest.mark.parametrize(
-    ("kind", "loader"),
-    mostly_slow(
-        [
-            ("two_databases", "insert"),
-            ("one_database", "insert"),
-            ("two_databases", "copy"),
-            ("one_database", "copy"),
-        ]
-    ),
-)
+@pytest.mark.parametrize("kind", mostly_slow(["two_databases", "one_database"]))
 def test_tail_writes_the_rows_of_replay(
-    log: Path, kind: str, loader: LoaderName, request: pytest.FixtureRequest
+    log: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:
     targets: Targets = request.getfixturevalue(kind)
-    report = tail(log, targets, SETTINGS, once=True, loader=loader)
+    report = tail(log, targets, SETTINGS, once=True)
     assert report.next_offset == view_of(log).next_offset
     tailed = all_rows(targets)
-    rebuild(log, targets, SETTINGS, loader=loader)
+    rebuild(log, targets, SETTINGS)
     assert all_rows(targets) == tailed
     assert parsed(dict(tailed[0])) == expected_graph(view_of(log))
 
@@ -255,10 +240,11 @@ def test_a_box_beyond_float32(tmp_path: Path, one_database: Targets) -> None:
     boxes = ([1e300, -1e300, 1e-60, 0.1], [0.1, 0.2, 0.3, 16777217.0])
     seen = [detection("cup", [1.0, float(i)], bbox=box) for i, box in enumerate(boxes)]
     log = write_log(tmp_path / "log", [envelope(0, detections=seen)])
-    rebuild(log, one_database, SETTINGS, loader="copy")
+    tail(log, one_database, SETTINGS, once=True)
+    inserted = all_rows(one_database)
+    rebuild(log, one_database, SETTINGS)
     copied = all_rows(one_database)
-    rebuild(log, one_database, SETTINGS, loader="insert")
-    assert all_rows(one_database) == copied
+    assert inserted == copied
     assert copied[1][0][6][:3] == [float("inf"), float("-inf"), 0.0]
 
 

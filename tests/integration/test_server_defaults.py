@@ -18,7 +18,6 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, pin_session_settings
 from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.grants import roles_sql
-from projections.postgres.loader import LoaderName
 from projections.postgres.status import projection_status
 from tests.support.logs import walk, write_log
 from tests.support.rows import all_rows, wait_for_drops
@@ -57,16 +56,15 @@ def as_user(url: str, user: str) -> Targets:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loader", mostly_slow(["copy", "insert"]))
 def test_pgvector_in_a_schema_of_its_own(
-    log: Path, bare: psycopg.Connection, bare_pg_url: str, loader: LoaderName
+    log: Path, bare: psycopg.Connection, bare_pg_url: str
 ) -> None:
     """The fold makes rows before the thread that sends them has found the type."""
     bare.execute("CREATE SCHEMA elsewhere")
     bare.execute("CREATE EXTENSION vector WITH SCHEMA elsewhere")
     targets = Targets(bare_pg_url, bare_pg_url)
-    rebuild(log, targets, SETTINGS, until=30, loader=loader)
-    assert tail(log, targets, SETTINGS, once=True, loader=loader).events == 10
+    rebuild(log, targets, SETTINGS, until=30)
+    assert tail(log, targets, SETTINGS, once=True).events == 10
     assert [r.differing for r in check(log, targets, SETTINGS)] == [0, 0]
 
 
@@ -86,7 +84,6 @@ def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Co
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
 
 
-@pytest.mark.parametrize("loader", mostly_slow(["copy", "insert"]))
 @pytest.mark.parametrize(
     "setting",
     mostly_slow(
@@ -103,14 +100,14 @@ def test_short_default_timeouts(log: Path, one_database: Targets, pg: psycopg.Co
     ),
 )
 def test_output_formats_of_the_server_change_no_value(
-    log: Path, one_database: Targets, pg: psycopg.Connection, setting: str, loader: LoaderName
+    log: Path, one_database: Targets, pg: psycopg.Connection, setting: str
 ) -> None:
     rebuild(log, one_database, SETTINGS)
     rows = all_rows(one_database)
     database = sql.Identifier(pg.info.dbname)
     pg.execute(sql.SQL("ALTER DATABASE {} SET ").format(database) + sql.SQL(setting))  # type: ignore[arg-type]
-    rebuild(log, one_database, SETTINGS, until=5, loader=loader)
-    assert tail(log, one_database, SETTINGS, once=True, loader=loader, batch_events=30).events == 35
+    rebuild(log, one_database, SETTINGS, until=5)
+    assert tail(log, one_database, SETTINGS, once=True, batch_events=30).events == 35
     assert [r.differing for r in check(log, one_database, SETTINGS)] == [0, 0]
     assert projection_status(log, one_database, SETTINGS).healthy
     pg.execute(sql.SQL("ALTER DATABASE {} RESET ALL").format(database))

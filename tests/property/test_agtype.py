@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import psycopg
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from projections.postgres import graph_rows as agtype
-from projections.postgres.loader import LoaderName, load_of_graph
+from projections.postgres.loader import copy_to_graph, insert_into_graph
 from tests.support.thorough import examples
 
 ODD = ["\\", "\\\\n", '"', "'", "\t", "\\.", "\\N", "$$", "\u2028", "\x7f", "\x85", "😀"]
@@ -30,12 +31,12 @@ def connection(pg_server: object, _template: str) -> Iterator[psycopg.Connection
         opened.rollback()
 
 
-def trip(connection: psycopg.Connection, loader: LoaderName, texts: list[str]) -> list[str]:
-    """Write properties through a loader, read them back as text, leave nothing."""
+def trip(connection: psycopg.Connection, load_of: Any, texts: list[str]) -> list[str]:
+    """Write properties, read them back as text, leave nothing."""
     with connection.transaction(force_rollback=True):
         base = 3 << 48
         rows = [(base + i, text) for i, text in enumerate(texts, 1)]
-        load_of_graph(loader, "agtype_trip", "Thing", rows)(connection)  # type: ignore[arg-type]
+        load_of("agtype_trip", "Thing", rows)(connection)
         found = connection.execute(
             'SELECT properties FROM agtype_trip."Thing" ORDER BY id'
         ).fetchall()
@@ -48,10 +49,10 @@ def trip(connection: psycopg.Connection, loader: LoaderName, texts: list[str]) -
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(st.lists(st.tuples(names, finite, int64, st.lists(finite)), min_size=1))
-@pytest.mark.parametrize("loader", ["copy", "insert"])
+@pytest.mark.parametrize("load_of", [copy_to_graph, insert_into_graph])
 def test_values_come_back_from_the_server_as_sent(
     connection: psycopg.Connection,
-    loader: LoaderName,
+    load_of: Any,
     values: list[tuple[str, float, int, list[float]]],
 ) -> None:
     texts = [
@@ -59,7 +60,7 @@ def test_values_come_back_from_the_server_as_sent(
         f' "l": [{", ".join(map(repr, many))}]}}'
         for s, f, i, many in values
     ]
-    for text, (s, f, i, many) in zip(trip(connection, loader, texts), values, strict=True):
+    for text, (s, f, i, many) in zip(trip(connection, load_of, texts), values, strict=True):
         back = json.loads(text, strict=False)
         assert back["s"] == s
         assert type(back["i"]) is int

@@ -1,4 +1,4 @@
-"""Memory, both loaders, one database and two databases: after any steps their rows are equal.
+"""Memory, one database and two databases: after any steps their rows are equal.
 
 The machine writes events (walks, merges, duplicates, conflicts, unreadable ones) and commands, also
 some that change the rule by which observations are fused; it tails in batches of any size, crashes
@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import psycopg
 import pytest
@@ -38,7 +38,6 @@ from projections.map.own_events import read_corrections
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold
-from projections.postgres.loader import LoaderName
 from tests.support.envelopes import envelope
 from tests.support.logs import (
     append_command,
@@ -89,7 +88,6 @@ class Bomb:
 
 class SinksAgree(RuleBasedStateMachine):
     targets: dict[str, Targets]
-    loaders: ClassVar[dict[str, LoaderName]] = {"one": "copy", "two": "insert"}
 
     @initialize(fusion=st.sampled_from(["page", "evidence"]))
     def begin(self, fusion: str) -> None:
@@ -184,16 +182,18 @@ class SinksAgree(RuleBasedStateMachine):
     @rule(name=PLACES, size=st.integers(1, 20), only=st.sampled_from(["graph", "vectors"]))
     def one_sink_goes_ahead(self, name: str, size: int, only: Any) -> None:
         tail(
-            self.log, self.targets[name], settings_of, once=True, only=only, batch_events=size,
-            loader=self.loaders[name],
-        )  # fmt: skip
+            self.log,
+            self.targets[name],
+            settings_of,
+            once=True,
+            only=only,
+            batch_events=size,
+        )
 
     @rule(name=PLACES, until=st.none() | st.integers(0, 40))
     def rebuild_to_some_offset(self, name: str, until: int | None) -> None:
         try:
-            rebuild(
-                self.log, self.targets[name], settings_of, until=until, loader=self.loaders[name]
-            )
+            rebuild(self.log, self.targets[name], settings_of, until=until)
         except FoldError:
             assert self.unreadable
 
@@ -202,7 +202,7 @@ class SinksAgree(RuleBasedStateMachine):
         with pytest.MonkeyPatch.context() as patch:
             Bomb(patch, at)
             with contextlib.suppress(Crash, FoldError):
-                rebuild(self.log, self.targets[name], settings_of, loader=self.loaders[name])
+                rebuild(self.log, self.targets[name], settings_of)
 
     @rule(size=st.integers(1, 20))
     def all_agree_once_caught_up(self, size: int) -> None:
@@ -235,9 +235,12 @@ class SinksAgree(RuleBasedStateMachine):
 
     def _tail(self, name: str, size: int) -> None:
         tail(
-            self.log, self.targets[name], settings_of, once=True, batch_events=size,
-            loader=self.loaders[name],
-        )  # fmt: skip
+            self.log,
+            self.targets[name],
+            settings_of,
+            once=True,
+            batch_events=size,
+        )
 
     def _memory_catches_up(self) -> None:
         with LogReader(self.log) as reader:

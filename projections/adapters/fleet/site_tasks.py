@@ -29,7 +29,6 @@ from projections.postgres.connection import (
     url_without_secrets,
 )
 from projections.postgres.labels import SINKS
-from projections.postgres.loader import LoaderName
 from projections.postgres.origin import refuse_other_events
 from projections.postgres.status import SinkStatus, Status, projection_status
 
@@ -102,7 +101,6 @@ class ReplayRequest:
     settings: ChosenSettings = field(default_factory=ChosenSettings)
     again: bool = False
     replace: bool = False
-    loader: LoaderName = "copy"
     hnsw: bool = True
 
 
@@ -141,7 +139,6 @@ def _replay(request: ReplayRequest, progress: Progress) -> SiteReplay:
                 request.site.log,
                 request.databases,
                 request.settings.of,
-                loader=request.loader,
                 hnsw=request.hnsw,
                 workers=0,  # the other sites keep the other processors busy
                 progress=lambda at: progress(at.done),

@@ -21,7 +21,6 @@ from . import fleet_options
 from .event_text import iso_time
 from .folded_log import FoldSettings, settings_from
 from .options import CameraOptions, JsonOption, QuestionArgument, question_from
-from .replay_and_tail import LoaderOption, Loaders, loader_of
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
@@ -74,7 +73,6 @@ def replay(
     ] = False,
     stores: fleet_options.FleetDatabases,
     settings: FoldSettings,
-    loader: LoaderOption = Loaders.copy,
     no_hnsw: Annotated[
         bool, typer.Option("--no-hnsw", help="Do not index large tables for vector search.")
     ] = False,
@@ -99,7 +97,6 @@ def replay(
                 chosen,
                 again,
                 replace,
-                loader_of(loader),
                 not no_hnsw,
             )
             for site in sites

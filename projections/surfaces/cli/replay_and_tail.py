@@ -31,7 +31,6 @@ from projections.postgres import (
 )
 from projections.postgres.batch_writer import serving_tail_metrics
 from projections.postgres.labels import SinkName
-from projections.postgres.loader import LoaderName
 from projections.postgres.origin import command_line
 
 from .folded_log import LogSettings, W
@@ -112,27 +111,10 @@ class Sinks(StrEnum):
     vectors = "vectors"
 
 
-class Loaders(StrEnum):
-    """The values of ``--loader``."""
-
-    copy = "copy"
-    insert = "insert"
-
-
 OnlyOption = Annotated[
     Sinks | None,
     typer.Option("--only", metavar="graph|vectors", help="Only the graph or the vectors."),
 ]
-LoaderOption = Annotated[
-    Loaders,
-    typer.Option(
-        "--loader",
-        metavar="copy|insert",
-        help="How rows are sent; insert where COPY is not allowed.",
-    ),
-]
-
-
 WorkersOption = Annotated[
     int | None,
     typer.Option(
@@ -151,18 +133,12 @@ def only_of(only: Sinks | None) -> SinkName | None:
     return None if only is None else only.value
 
 
-def loader_of(loader: Loaders) -> LoaderName:
-    """The loader's name."""
-    return loader.value
-
-
 def replay(
     *,
     until: Annotated[str, typer.Option("--until", metavar="W", help=f"Fold to here: {W}.")] = "end",
     only: OnlyOption = None,
     databases: Databases,
     source: LogSettings,
-    loader: LoaderOption = Loaders.copy,
     no_hnsw: Annotated[
         bool, typer.Option("--no-hnsw", help="Do not index a large table for vector search.")
     ] = False,
@@ -179,7 +155,6 @@ def replay(
             settings,
             until=end,
             only=only_of(only),
-            loader=loader_of(loader),
             hnsw=not no_hnsw,
             workers=workers,
             progress=lambda at: bar.show(at.stage, at.done, at.total),
@@ -224,7 +199,6 @@ def tail_command(
     only: OnlyOption = None,
     databases: Databases,
     source: LogSettings,
-    loader: LoaderOption = Loaders.copy,
     metrics: Annotated[
         str | None,
         typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
@@ -249,7 +223,6 @@ def tail_command(
             settings,
             once=once,
             only=only_of(only),
-            loader=loader_of(loader),
             stop=stop,
             progress=progress,
             on_fold=_CatchUpBar(log, end, bar, once).show,

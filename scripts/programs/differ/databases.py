@@ -15,13 +15,11 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, ensure_extension
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.loader import LoaderName
 from tests.support.rows import all_rows
 
 from .outcomes import Chosen, Tally, folded, outcome
 
 _TEMPLATE = "differ_template"
-_LOADERS: tuple[LoaderName, ...] = ("copy", "insert")
 _MOST_KILLS = 2
 _PATIENCE_MS = 30_000
 
@@ -34,7 +32,6 @@ class DatabaseWays:
     ) -> None:
         self._log, self._settings, self._rng, self._tally = log, settings, rng, tally
         self._server = server
-        self._loader = rng.choice(_LOADERS)
 
     @contextmanager
     def opened(self) -> Iterator["DatabaseWays"]:
@@ -55,10 +52,7 @@ class DatabaseWays:
 
     def _tail(self) -> None:
         size = self._rng.choice((1, 7, 1000))
-        tail(
-            self._log, self._followed, self._settings, once=True, batch_events=size,
-            loader=self._loader,
-        )  # fmt: skip
+        tail(self._log, self._followed, self._settings, once=True, batch_events=size)
 
     def compare(self, end: int) -> None:
         """The rows of the tail and of a replay are equal, and of the map of a fold."""
@@ -84,10 +78,7 @@ class DatabaseWays:
         self._tally.compare("rows of a check", sound, [(True, 0, ())] * len(sound), end)
 
     def _replay(self) -> str:
-        loader = self._rng.choice(_LOADERS)
-        return rebuild(
-            self._log, self._replayed, self._settings, loader=loader, hnsw=False, workers=0
-        ).digest
+        return rebuild(self._log, self._replayed, self._settings, hnsw=False, workers=0).digest
 
 
 class _KillAt:
