@@ -2,10 +2,6 @@
 
 Other processes read and parse a large log (`projections.map.parsed_log`), this one folds it and
 makes the rows, and a thread for each database sends them.
-
-Retry: a parked event, once folded, changes everything after it, so it cannot be added later. If all
-parked events of a sink can be read now (by a newer mapfold), the sink is rebuilt up to its
-checkpoint. If one still cannot, nothing is changed.
 """
 
 import sys
@@ -18,7 +14,7 @@ from typing import Final, TypeAlias
 
 from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.forms import read_envelope
-from eventsrc.envelope.ingest import Accepted, Rejected
+from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.map_errors import FoldError
@@ -28,13 +24,10 @@ from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
 
-from . import checkpoints
-from .checkpoints import DeadLetter
-from .connection import Targets, connect, database_errors, describe_target
+from .connection import Targets
 from .inputs import LogInputs, MapInputs, SettingsOf
-from .labels import SINKS, SinkName
 from .live_fold import LiveFold
-from .origin import command_for, refuse_mismatch
+from .origin import command_for
 from .shadows import FoldedLog, ShadowWriter, drop_replaced, stream, swap_in_new_map
 from .stores import Only, open_stores
 from .vector_sink import HnswReport
@@ -206,52 +199,3 @@ def _advice(log: Path, inputs: MapInputs, offset: Offset) -> str:
         "the databases stay as they were; to leave it out run:"
         f" {before} && {command_for('tail', log, inputs)}"
     )
-
-
-@dataclass(frozen=True, slots=True)
-class RetryReport:
-    """A sink's parked events: how many, which still fail, whether it was rebuilt."""
-
-    sink: SinkName
-    parked: int
-    still: tuple[DeadLetter, ...]
-    rebuilt: bool
-
-
-def retry(log: Path, targets: Targets, settings: Settings | SettingsOf) -> list[RetryReport]:
-    """Retry the parked events of both sinks. Raises ProjectionMismatch."""
-    return [_retry(log, targets, settings, sink, targets.url_of(sink)) for sink in SINKS]
-
-
-def _retry(
-    log: Path, targets: Targets, settings: Settings | SettingsOf, sink: SinkName, url: str
-) -> RetryReport:
-    opened = connect(url, application="mapfold retry")
-    with LogReader(log) as reader, opened as connection, database_errors(url):
-        letters = checkpoints.parked(connection, sink)
-        checkpoint = checkpoints.load(connection, sink)
-        if checkpoint is None or not letters:
-            return RetryReport(sink, 0, (), rebuilt=False)
-        inputs = LogInputs.read(reader, settings).at(checkpoint.known_to)
-        refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
-        still = tuple(_still_rejected(reader, letters))
-    if not still:
-        rebuild(
-            log,
-            targets,
-            settings,
-            until=checkpoint.next_offset,
-            known_at=checkpoint.known_to,
-            only=sink,
-        )
-    return RetryReport(sink, len(letters), still, rebuilt=not still)
-
-
-def _still_rejected(reader: LogReader, letters: list[DeadLetter]) -> list[DeadLetter]:
-    failing = []
-    for letter in letters:
-        (event,) = reader.read(letter.offset, Offset(letter.offset + 1))
-        parsed = read_envelope(event, max_bytes=sys.maxsize)
-        if isinstance(parsed, Rejected):
-            failing.append(DeadLetter(letter.offset, letter.key, letter.run_id, parsed.reason))
-    return failing

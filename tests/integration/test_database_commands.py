@@ -90,8 +90,6 @@ def test_check_and_repair(own_server: Commands, log: Path) -> None:
     assert "db check --repair" in found.err
     assert "rebuilt" in own_server("db", "check", log, "--repair", code=3).err
     own_server("db", "check", log)
-    none = "graph: no event is parked\nvectors: no event is parked\n"
-    assert own_server("db", "retry", log).out == none
     own_server("db", "stop")
     assert not server(own_server).running
 
@@ -112,7 +110,6 @@ def test_parked_events_are_findings(mapfold: Commands, log: Path) -> None:
     assert "cannot be folded" in mapfold("replay", log, code=1).err
     assert "parked: offset 40" in mapfold("tail", log, "--once", code=3).err
     assert "parked: offset 40" in mapfold("status", log, code=3).out
-    assert "still cannot be folded" in mapfold("db", "retry", log, code=3).out
 
 
 @pytest.mark.slow

@@ -47,7 +47,6 @@ WITHOUT = {
     "fleet relocalize": "asks the databases",
     "fleet url": "reads no log",
     "db check": "tests/integration/test_db_check.py",
-    "db retry": "folds as db check and replay do",
     "db url": "reads no log",
     "db start": "reads no log",
     "db stop": "reads no log",

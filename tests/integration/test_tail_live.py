@@ -1,27 +1,23 @@
 """A tail that follows a growing log: rows, status, metrics, stopping, dead letters."""
 
 import re
-import sys
 import threading
 import urllib.request
 from pathlib import Path
 
 import psycopg
 import pytest
-from msgspec.structs import replace
 
-from eventsrc.envelope.forms import read_envelope
-from eventsrc.log import ALWAYS, Event, LogWriter
+from eventsrc.log import ALWAYS, LogWriter
 from eventsrc.record.append import append_payload
-from projections.fold.map_errors import ProjectionBusy, ProjectionMismatch
+from projections.fold.map_errors import ProjectionBusy
 from projections.fold.settings import Settings
 from projections.postgres import RebuildProgress, TailProgress, TailReport, rebuild, tail
 from projections.postgres.batch_writer import serving_tail_metrics
 from projections.postgres.connection import Targets
-from projections.postgres.rebuild import retry
 from projections.postgres.status import projection_status
-from tests.support.envelopes import envelope, payload
-from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.envelopes import payload
+from tests.support.logs import bridge, walk, write_log
 from tests.support.rows import all_rows
 
 SETTINGS = Settings()
@@ -185,47 +181,3 @@ def test_no_commit_age_before_the_first_commit(tmp_path: Path, one_database: Tar
 
 def test_progress_wait_times_out() -> None:
     assert not TailProgress().wait(1, 0.01)
-
-
-def test_parked_events_are_tried_again(
-    tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = write_log(tmp_path / "log", walk(10))
-    append_raw(log, payload({**envelope(3, run_id="odd"), "keyframe_id": 3, "detections": "none"}))
-    write_log(log, walk(10, first=10))
-    assert [d.run_id for d in tail(log, one_database, SETTINGS, once=True).parked] == ["odd"]
-    before = all_rows(one_database)
-    reports = retry(log, one_database, SETTINGS)
-    assert [(r.parked, len(r.still), r.rebuilt) for r in reports] == [(1, 1, False)] * 2
-    assert "detections" in reports[0].still[0].reason
-    assert all_rows(one_database) == before
-
-    # A newer mapfold, which can read it: here, one whose door mends it.
-    def lenient(event: Event, *, max_bytes: int) -> object:
-        mended = replace(event, payload=event.payload.replace(b'"none"', b"[]"))
-        return read_envelope(mended, max_bytes=max_bytes)
-
-    monkeypatch.setattr(sys.modules["projections.postgres.rebuild"], "read_envelope", lenient)
-    monkeypatch.setattr(
-        "projections.map.parsing.read_envelopes",
-        lambda events, *, max_bytes: [lenient(event, max_bytes=max_bytes) for event in events],
-    )
-    reports = retry(log, one_database, SETTINGS)
-    assert [(r.still, r.rebuilt) for r in reports] == [((), True)] * 2
-    assert projection_status(log, one_database, SETTINGS).healthy
-    rows = all_rows(one_database)
-    assert len(rows[0]["Keyframe"]) == len(before[0]["Keyframe"]) + 1
-
-
-def test_parked_events_of_another_log_or_with_other_settings_are_not_tried(
-    tmp_path: Path, one_database: Targets
-) -> None:
-    """A rebuild would make a map with other settings than the one that is there."""
-    log = write_log(tmp_path / "log", walk(10))
-    append_raw(log, b"not an envelope")
-    tail(log, one_database, SETTINGS, once=True)
-    with pytest.raises(ProjectionMismatch, match=r"eps_m=1.5 there, 1.0 here"):
-        retry(log, one_database, SETTINGS.with_assignments(["eps_m=1.0"]))
-    other = write_log(tmp_path / "other", walk(3))
-    with pytest.raises(ProjectionMismatch, match="made from log"):
-        retry(other, one_database, SETTINGS)

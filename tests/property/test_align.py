@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from eventsrc.base.errors import MisuseError
 from projections.fold.settings import CameraSettings, Settings
-from projections.localize.align import FramedThings, align, decision_text, things_of_map
+from projections.localize.align.alignment import align, decision_text
+from projections.localize.align.framed_things import FramedThings, things_of_map
 from projections.localize.align.matching import Comparison, _best_matching, moved
 from tests.support.folds import Folded
 from tests.support.logs import simulated

@@ -17,7 +17,8 @@ from projections.adapters.scene import HousePlan, drives
 from projections.history.known_history import KnownHistory
 from projections.history.merge_reasons import chains_of, merge_reason
 from projections.history.names import keyframe_name, place_title
-from projections.localize.align import Alignment, moved
+from projections.localize.align.alignment import Alignment
+from projections.localize.align.matching import moved
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_records import Merge

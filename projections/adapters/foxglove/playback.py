@@ -1,21 +1,24 @@
-"""A server whose time is set by Foxglove's timeline: seek, play and pause show the map as it was;
-and a layout for its panels.
+"""How a map came about, for Foxglove: an MCAP file; and a server whose time is set by Foxglove's
+timeline: seek, play and pause show the map as it was. And a layout for its panels.
 
 The SDK calls the ``on_`` methods in its own thread; they only store the request. The thread that
 runs `Playback.run` folds and publishes.
 """
 
+import io
 import logging
 import math
+import os
 import re
 import threading
 import time
 from bisect import bisect_left
 from collections.abc import Callable
 from functools import partial
-from typing import Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
-from foxglove import Capability, Context, layouts, start_server
+from foxglove import Capability, Context, layouts, open_mcap, start_server
 from foxglove.websocket import (
     ChannelView,
     Client,
@@ -27,17 +30,19 @@ from foxglove.websocket import (
     WebSocketServer,
 )
 
+from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.machine import gc_paused
+from eventsrc.base.user_files import OutputFile, written_whole
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
-from projections.fold.deltas import PlacesMerged
+from projections.fold.deltas import KeyframeAdded, MapGiven, PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, new_map
 from projections.map.parsing import READ_AHEAD
 from projections.map.phrases import change_lines
-from projections.map.scenes import Moments
+from projections.map.scenes import Moments, RecordedFold
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_recorder import map_at
@@ -326,3 +331,62 @@ class Playback(ServerListener):
                 self._topics.walls(view, given, now)
         self._topics.robot(view, now)
         self._topics.scene(view, merges, now)
+
+
+def write_recording(fold: RecordedFold, path: Path, *, everything: bool = False) -> int:
+    """Record a fold's events and the maps that they make; returns the number of scenes.
+
+    Scenes have Objects that are not confirmed only with ``everything``. The same log gives the same
+    bytes. Raises FoldError at an event that cannot be folded, and what `written_whole` raises.
+    """
+    context, scenes = Context(), 0
+    with written_whole(path) as file:
+        if not file.seekable():
+            raise MisuseError(f"{path}: an MCAP recording goes to a file, not a pipe; choose one")
+        sink = _Sink(file)
+        with open_mcap(sink, context=context):
+            topics = MapTopics(context, everything=everything)
+            for event, now, deltas, is_scene in fold:
+                topics.event(event, now)
+                topics.changes(change_lines(fold.view, deltas), now)
+                for delta in deltas:
+                    if isinstance(delta, MapGiven):
+                        topics.walls(fold.view, delta, now)
+                if any(isinstance(delta, KeyframeAdded) for delta in deltas):
+                    topics.robot(fold.view, now)
+                if is_scene:
+                    topics.scene(fold.view, fold.merges, now)
+                    scenes += 1
+                sink.check()
+        sink.check()
+    return scenes
+
+
+class _Sink(io.RawIOBase):
+    """What the SDK writes to. It would print a line for each message after a failed write, so the
+    error is kept for `check`, and what comes after it is dropped."""
+
+    def __init__(self, file: OutputFile) -> None:
+        self._file = file
+        self._position = 0
+        self._failed: Exception | None = None
+
+    def write(self, data: Any, /) -> int:
+        try:
+            if self._failed is None:
+                self._file.write(data)
+        except (MapfoldError, OSError) as error:
+            self._failed = error
+        self._position += len(data)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        self._position = offset + (self._position if whence == os.SEEK_CUR else 0)
+        if self._failed is None:
+            self._position = self._file.seek(offset, whence)
+        return self._position
+
+    def check(self) -> None:
+        """Raise the error of the first write that failed, if one did."""
+        if self._failed is not None:
+            raise self._failed

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 SECTIONS: "Mapping[str, Mapping[str, str]]" = {
     "Try it": {
-        "demo": "demo:demo",
+        "demo": "simulate:demo",
         "simulate": "simulate:simulate",
     },
     "Record a log": {
@@ -46,7 +46,7 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
     "Find a robot": {
         "relocalize": "relocalize:relocalize",
         "serve": "serve:serve",
-        "mcp": "mcp_command:mcp",
+        "mcp": "serve:mcp",
     },
     "Travel in time": {
         "merges": "time_travel:merges",

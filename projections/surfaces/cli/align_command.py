@@ -24,7 +24,7 @@ from .options import JsonOption, ZenohClient, check_picture, user_at_host
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
-    from projections.localize.align import Alignment
+    from projections.localize.align.alignment import Alignment
 
 _NAMED = 5
 """Pairs that the reason of a command names."""
@@ -51,7 +51,7 @@ class _Frames(CachedLog):
     def maps(self, opened: OpenLog) -> tuple[MapView, MapView, str, list[RunId]]:
         """The map of the frame, the map to move, what the frame is called, the runs to move.
         Raises MisuseError for a run that the log does not have."""
-        from projections.localize.align import map_of_runs
+        from projections.localize.align.framed_things import map_of_runs
 
         reader, end, _, corrections, settings = opened
         view = map_after(
@@ -130,8 +130,9 @@ def align(
     """
     check_picture(picture)
     try:
-        from projections.localize.align import align as align_things
-        from projections.localize.align import decision_text, things_of_map
+        from projections.localize.align.alignment import align as align_things
+        from projections.localize.align.alignment import decision_text
+        from projections.localize.align.framed_things import things_of_map
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold align needs {error.name}, which is not installed; pip install"

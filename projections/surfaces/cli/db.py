@@ -1,5 +1,5 @@
 """``mapfold status`` and ``mapfold db``: the state of the log and the databases; the
-embedded server, check and repair of the databases, roles, retry."""
+embedded server, check and repair of the databases, roles."""
 
 from dataclasses import asdict
 from typing import Annotated, Any, get_args
@@ -15,7 +15,6 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.grants import roles_sql
 from projections.postgres.labels import SinkName
 from projections.postgres.queries.candidate_search import question_error
-from projections.postgres.rebuild import retry
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .folded_log import LogSettings
@@ -133,28 +132,6 @@ def check(
 def roles(only: OnlyOption = None) -> None:
     """Print SQL for two least-privilege roles: mapfold_reader and mapfold_writer."""
     display(roles_sql(("graph", "vectors") if only is None else (only.value,)))
-
-
-@group.command(name="retry")
-def retry_command(
-    *,
-    databases: Databases,
-    source: LogSettings,
-    as_json: JsonOption = False,
-) -> None:
-    """Try parked events again: rebuild if all of them can be folded now, else say why not."""
-    log, settings = source.log, source.checked()
-    with databases.opened() as targets:
-        reports = retry(log, targets, settings)
-    if as_json:
-        emit({"sinks": [asdict(r) for r in reports]})
-    for report in () if as_json else reports:
-        done = "rebuilt" if report.rebuilt else f"{len(report.still)} still cannot be folded"
-        found = f"{report.parked} parked, {done}" if report.parked else "no event is parked"
-        display(f"{report.sink}: {found}")
-        for letter in report.still:
-            display(f"  offset {letter.offset:,}: {letter.reason}")
-    finish(findings=any(report.still for report in reports))
 
 
 def _check_document(report: CheckReport) -> dict[str, Any]:

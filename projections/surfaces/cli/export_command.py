@@ -169,7 +169,7 @@ def _recorder(
     installed."""
     try:
         if name == "foxglove":
-            from projections.adapters.foxglove.recording import write_recording
+            from projections.adapters.foxglove.playback import write_recording
 
             return partial(write_recording, everything=everything)
         from projections.adapters.rerun import rrd_recording

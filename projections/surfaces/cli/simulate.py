@@ -1,4 +1,4 @@
-"""`mapfold simulate`: a simulated robot and its detector."""
+"""`mapfold simulate`, a simulated robot and its detector; `mapfold demo`, which maps its run."""
 
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -13,7 +13,7 @@ from eventsrc.record.transport.config import check_key
 from eventsrc.record.transport.session import ZenohOptions, open_session
 
 from .new_log import NewLogOptions
-from .options import JsonOption, PublishKeyOption, ZenohPeer
+from .options import Databases, JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -94,3 +94,35 @@ def _summary(document: dict[str, Any]) -> str:
         f"{document['run_id']}: {counted(document['keyframes'], 'keyframe')}, "
         f"{counted(document['detections'], 'detection')} in {document['seconds']} s of driving"
     )
+
+
+def demo(
+    *,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for the log, the databases and map.png.")
+    ] = Path("logs/demo"),
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Which simulated house.", min=0)
+    ] = DEFAULT_SEED,
+    speed: Annotated[
+        float, typer.Option(metavar="X", help="Times real time.", min=1.0, max=1000.0)
+    ] = 30.0,
+    databases: Databases,
+    json_: JsonOption = False,
+) -> None:
+    """Record, replay, map and re-localise a simulated robot on this machine.
+
+    A robot explores a simulated house and is recorded through a Zenoh router; the log is replayed
+    into databases; a second, lost robot asks where it is. The databases are the demo's own, in DIR,
+    and yours are not touched; but in those that --db and --vector-db name, the demo's map replaces
+    the one that is there.
+
+    Exit 3 when log, databases and fold do not agree.
+    """
+    # Here and not above: the demo alone needs nearly everything, and that takes a while to import.
+    from projections.surfaces.demo.play import run_demo
+
+    numbers = run_demo(out, seed, speed, databases.db, databases.vector_db, say)
+    if json_:
+        emit(numbers)
+    finish(findings=not numbers["sound"])

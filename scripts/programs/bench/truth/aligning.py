@@ -12,7 +12,9 @@ import numpy as np
 from eventsrc.base.text import table
 from eventsrc.envelope.ingest import Accepted
 from projections.fold.settings import Settings
-from projections.localize.align import FramedThings, align, moved, things_of_map
+from projections.localize.align.alignment import align
+from projections.localize.align.framed_things import FramedThings, things_of_map
+from projections.localize.align.matching import moved
 from projections.map.view import MapView
 
 from .folding import fold_into
