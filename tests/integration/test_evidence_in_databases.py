@@ -126,7 +126,7 @@ def test_the_example_of_the_page_finds_objects_by_where_they_stand(
 ) -> None:
     (query,) = re.findall(r"    SELECT[^;]*o\.est_sigma_m < 0\.5[^;]*;", PAGE.read_text())
     with session(one_database) as connection:
-        view = follow(connection, SyntheticDeltas.of(random_steps(10, 30)).events, 10, "copy")
+        view = follow(connection, SyntheticDeltas.of(random_steps(10, 30)).events, 10)
     rows = pg.execute(query.encode()).fetchall()
     near = [
         o for o in view.objects.values()
@@ -148,7 +148,7 @@ def test_questions_use_where_objects_stand(one_database: Targets) -> None:
         for deltas in events
     ]
     with session(one_database) as connection:
-        view = follow(connection, events, 10, "copy")
+        view = follow(connection, events, 10)
         prepare_graph(connection)
         live = {each.object_id: each for each in read_view(connection).objects.values()}
         assert [*live] == [each.object_id for each in view.objects.values()]
