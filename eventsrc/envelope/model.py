@@ -74,6 +74,7 @@ ANGLE_RAD = Field(ge=-7.0, le=7.0)
 SIGMA_M = Field(ge=0.001, le=1000.0)
 """Bounds of a standard error, metres."""
 MAX_DEPTH_M = 1000.0
+MAX_SIZE_M = 1000.0
 
 INT64 = Field(ge=-(2**63), lt=2**63)
 Int64 = Annotated[int, INT64]
@@ -172,6 +173,7 @@ def contains_non_finite(value: object) -> bool:
 _KnownText = Annotated[str, Meta(min_length=1, max_length=MAX_ID_LENGTH)]
 _KnownPosition = Annotated[float, Meta(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 _Sigma = Annotated[float, Meta(ge=0.001, le=1000.0)]
+_Size = Annotated[float, Meta(gt=0.0, le=MAX_SIZE_M)]
 _Pixels = Annotated[float, Meta(ge=1.0, le=1e6)]
 _Number = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 if TYPE_CHECKING:
@@ -198,6 +200,8 @@ class Detection(_Known, frozen=True, rename={"class_name": "class"}):
     depth_sigma_m: _Sigma | None = None
     position: tuple[_KnownPosition, _KnownPosition] | None = None
     position_sigma_m: _Sigma | None = None
+    position_z: _KnownPosition | None = None
+    size: tuple[_Size, _Size, _Size] | None = None
 
 
 class StatedCamera(_Known, frozen=True):

@@ -33,6 +33,7 @@ from .model import (
     MAX_DEPTH_M,
     MAX_DETECTIONS,
     MAX_DIMENSION,
+    MAX_SIZE_M,
     MAX_TIMESTAMP_S,
     PIXELS,
     SIGMA_M,
@@ -77,13 +78,17 @@ class _Model(BaseModel):
     )
 
 
+Size = Annotated[float, Field(gt=0.0, le=MAX_SIZE_M)]
+
+
 class DetectionModel(_Model, title="Detection"):
     """One detected object in a keyframe.
 
     ``bbox`` is x_min, y_min, x_max, y_max in pixels. ``embedding`` is base64 of
     ``embedding_dim`` little-endian float32. ``depth_m`` is how far away the thing is along the ray
     through the box's centre, ``position`` its x and y in the map frame, in metres; their standard
-    errors count only beside them.
+    errors count only beside them, and so does ``position_z``, the height of its middle in that
+    frame, beside ``position``. ``size`` is its length, width and height.
     """
 
     det_id: Annotated[DetId, TEXT] | None = None
@@ -97,6 +102,8 @@ class DetectionModel(_Model, title="Detection"):
     depth_sigma_m: Annotated[float, SIGMA_M] | None = None
     position: tuple[Position, Position] | None = None
     position_sigma_m: Annotated[float, SIGMA_M] | None = None
+    position_z: Position | None = None
+    size: tuple[Size, Size, Size] | None = None
 
 
 class EnvelopeCamera(_Model):

@@ -63,9 +63,7 @@ def find_topics(
     if contents is None or not _sample(session, wire, contents, options, stop):
         return None
     contents.first_ns = time.time_ns()
-    given = tuple(options.detections) or tuple(
-        sorted(topic for topic in _of_type(contents, ros.DETECTIONS) if topic.startswith(under))
-    )
+    given = tuple(options.detections) or tuple(contents.detections(under))
     by_transforms = TF_POSE if _of_type(contents, ros.TF) else None
     chosen = replace(
         options,
@@ -115,8 +113,7 @@ def _announced(
     while not stop.is_set():
         _add_announced(session, wire, contents)
         topics = contents.topics
-        there = _of_type(contents, ros.DETECTIONS)
-        wanted = options.detections or [each for each in there if each.startswith(under)]
+        wanted = options.detections or contents.detections(under)
         if wanted and all(topic in topics for topic in wanted):
             return contents
         if not waiting:
@@ -136,7 +133,7 @@ def _add_announced(session: Session, wire: RmwWire, contents: BagContents) -> No
 
 
 def _waiting(wire: RmwWire, options: BagOptions, under: str, topics: dict[str, BagTopic]) -> str:
-    what = " and ".join(map(visible, options.detections)) or ros.DETECTIONS
+    what = " and ".join(map(visible, options.detections)) or " or ".join(ros.DETECTION_TYPES)
     where = f"domain {wire.domain}" + ("" if under == "/" else f", under {visible(under)}")
     seen = counted(len(topics), "topic") if topics else "no topic at all"
     return (

@@ -19,7 +19,7 @@ from eventsrc.envelope.crops import Crop
 
 from .messages import (
     CAMERA_INFO,
-    DETECTIONS,
+    DETECTION_TYPES,
     FLOATS,
     TEXT,
     UNCLASSIFIED,
@@ -35,6 +35,7 @@ from .messages import (
 )
 from .named_classes import ClassNames
 from .pictures import CutCrops, Jpegs, StreamPictures
+from .solids import place_solids
 from .stream import Counts, PicturePose, PoseSource, Stream
 from .transforms import TransformBuffer
 
@@ -237,8 +238,8 @@ class _StreamState:
 
     def picture(self, type_name: str, received_ns: int, content: Any) -> _Picture:
         """The detections of a message, with the next keyframe id. Raises BadMessage."""
-        if type_name != DETECTIONS:
-            raise BadMessage(f"it is {type_name:.80}, not {DETECTIONS}")
+        if type_name not in DETECTION_TYPES:
+            raise BadMessage(f"it is {type_name:.80}, not {' or '.join(DETECTION_TYPES)}")
         detected = read(detections_of, content)
         self._next += 1
         jpegs = None if self._pictures is None else self._pictures.cut(detected)
@@ -277,13 +278,17 @@ class _StreamState:
             counts.without_pose += 1
         else:
             document |= self._pose_fields(pose)
-        if self._lens is None:
+        lens = self._lens
+        if lens is not None and not detected.has_boxes and lens.frame != detected.frame:
+            lens = None  # things in the frame of a lidar, say
+        counts.with_position += place_solids(detected, pose, lens)
+        if lens is None:
             counts.without_camera += 1
         else:
             document["camera"] = {
-                "hfov_deg": self._lens.hfov_deg,
-                "width_px": self._lens.width_px,
-                "height_px": self._lens.height_px,
+                "hfov_deg": lens.hfov_deg,
+                "width_px": lens.width_px,
+                "height_px": lens.height_px,
                 "yaw_rad": 0.0 if pose is None else pose.camera_yaw,
             }
         self._name_classes(detected)
@@ -296,7 +301,7 @@ class _StreamState:
 
     def _pose_fields(self, pose: PicturePose) -> dict[str, Any]:
         counts = self.counts
-        counts.without_camera_frame += not pose.has_camera
+        counts.without_camera_frame += pose.camera is None
         counts.without_base_frame += not pose.has_base
         fields: dict[str, Any] = {"map_x": pose.x, "map_y": pose.y, "map_yaw": pose.yaw}
         if self.stream.heights:

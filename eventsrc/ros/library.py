@@ -34,6 +34,12 @@ VISION_MSGS: Final[Mapping[str, str]] = {
         "vision_msgs/BoundingBox2D bbox\nstring id\n"
     ),
     "vision_msgs/msg/Detection2DArray": f"{_HEADER}vision_msgs/Detection2D[] detections\n",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection3D": (
+        f"{_HEADER}vision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection3DArray": f"{_HEADER}vision_msgs/Detection3D[] detections\n",
     "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name\n",
     "vision_msgs/msg/LabelInfo": (
         f"{_HEADER}vision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
@@ -41,12 +47,6 @@ VISION_MSGS: Final[Mapping[str, str]] = {
     "vision_msgs/msg/VisionInfo": (
         f"{_HEADER}string method\nstring database_location\nint32 database_version\n"
     ),
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "vision_msgs/msg/Detection3D": (
-        f"{_HEADER}vision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id\n"
-    ),
-    "vision_msgs/msg/Detection3DArray": f"{_HEADER}vision_msgs/Detection3D[] detections\n",
 }
 """The definitions of vision_msgs 4, which ROS does not ship with its own messages. Those of version
 3 differ in the name of a nested type only: in CDR both are the same bytes."""

@@ -15,9 +15,11 @@ from pydantic_core import from_json
 
 from eventsrc.envelope.model import covariance_fault
 
-from .transforms import Transform, unit_transform
+from .transforms import BadTransform, Transform, unit_transform
 
 DETECTIONS: Final = "vision_msgs/msg/Detection2DArray"
+DETECTIONS_3D: Final = "vision_msgs/msg/Detection3DArray"
+DETECTION_TYPES: Final = (DETECTIONS, DETECTIONS_3D)
 LABELS: Final = "vision_msgs/msg/LabelInfo"
 VISION_INFO: Final = "vision_msgs/msg/VisionInfo"
 PARAMETERS: Final = "rcl_interfaces/msg/ParameterEvent"
@@ -33,6 +35,7 @@ UNCLASSIFIED: Final = "unclassified"
 """The class of a detection without a hypothesis."""
 _POSE_OF_6D: Final = (0, 1, 5, 6, 7, 11, 30, 31, 35)
 """Indices of x, y and yaw in the covariance of x, y, z, roll, pitch and yaw, row by row."""
+_X_Y_Z_OF_6D: Final = (0, 1, 2, 6, 7, 8, 12, 13, 14)
 _NS: Final = 1_000_000_000
 _NS_DIGITS: Final = 9
 
@@ -87,15 +90,26 @@ class StampedEmbeddings(NamedTuple):
     """By Detection2D.id; None if they are by index."""
 
 
+class Solid(NamedTuple):
+    """Where a detected thing is, in the frame of its message: its middle and its axes, the
+    covariance of x, y and z if it is known, and its lengths along its axes if they are."""
+
+    pose: Transform
+    covariance: tuple[float, ...] | None
+    size: tuple[float, float, float] | None
+
+
 class Detected(NamedTuple):
-    """A Detection2DArray. ``detections`` are as in an envelope, without embeddings, and ``ids``
-    the Detection2D.id of each."""
+    """A Detection2DArray or Detection3DArray. ``detections`` are as in an envelope, without
+    embeddings, and ``ids`` the id of each. Boxes of a Detection3DArray are all zeros."""
 
     stamp_ns: int
     frame: str
     detections: list[dict[str, Any]]
     ids: list[str]
     unclassified: int
+    solids: list[Solid | None]
+    has_boxes: bool = True
 
 
 def stamp_of(stamp: Any) -> int:
@@ -161,18 +175,24 @@ def lens_of(message: Any) -> Lens:
 
 
 def detections_of(message: Any) -> Detected:
-    """The detections of a Detection2DArray of vision_msgs 2, 3 or 4. Of several hypotheses the one
-    with the highest score counts, of equal ones the first; its class is the id as it is."""
+    """The detections of a Detection2DArray of vision_msgs 2, 3 or 4, or of a Detection3DArray. Of
+    several hypotheses the one with the highest score counts, of equal ones the first; its class is
+    the id as it is."""
     made: list[dict[str, Any]] = []
     ids: list[str] = []
-    unclassified = 0
+    solids: list[Solid | None] = []
+    unclassified, has_boxes = 0, True
     for each in message.detections:
-        class_name, score = _best(each.results)
+        class_name, score, given = _best(each.results)
         unclassified += class_name == UNCLASSIFIED
-        made.append({"class": class_name, "confidence": score, "bbox": _box(each.bbox)})
+        has_boxes = not hasattr(each.bbox, "size")
+        bbox = _box(each.bbox) if has_boxes else [0.0] * 4
+        made.append({"class": class_name, "confidence": score, "bbox": bbox})
         ids.append(str(getattr(each, "id", "")))
+        solids.append(_solid(given, None if has_boxes else each.bbox))
     header = message.header
-    return Detected(stamp_of(header.stamp), frame_name(header.frame_id), made, ids, unclassified)
+    of = stamp_of(header.stamp), frame_name(header.frame_id)
+    return Detected(*of, made, ids, unclassified, solids, has_boxes)
 
 
 def embeddings_of_text(message: Any) -> StampedEmbeddings:
@@ -215,20 +235,50 @@ def embeddings_of_floats(message: Any) -> StampedEmbeddings:
     )
 
 
-def _best(results: Sequence[Any]) -> tuple[str, float]:
-    """Class and score of the best hypothesis."""
-    best, class_id = -math.inf, None
+def _best(results: Sequence[Any]) -> tuple[str, float, Any]:
+    """Class, score and PoseWithCovariance of the best hypothesis."""
+    best, class_id, pose = -math.inf, None, None
     for result in results:
         hypothesis = getattr(result, "hypothesis", result)  # vision_msgs 2 has none
         score = float(hypothesis.score)
         if class_id is None or score > best or math.isnan(best):
-            best = score
+            best, pose = score, getattr(result, "pose", None)
             class_id = str(
                 hypothesis.class_id if hasattr(hypothesis, "class_id") else hypothesis.id
             )
     if not class_id:
-        return UNCLASSIFIED, max(best, 0.0)
-    return class_id, best
+        return UNCLASSIFIED, max(best, 0.0), pose
+    return class_id, best, pose
+
+
+def _solid(given: Any, bbox: Any) -> Solid | None:
+    """Where a thing is by the middle of its BoundingBox3D, else by the pose of its hypothesis;
+    None where neither says so: a position of zeros or NaN is unknown."""
+    boxed = None if bbox is None else _pose_of_thing(bbox.center)
+    pose = boxed or (None if given is None else _pose_of_thing(given.pose))
+    if pose is None:
+        return None
+    values = () if given is None else tuple(float(given.covariance[at]) for at in _X_Y_Z_OF_6D)
+    is_known = any(values) and all(map(math.isfinite, values)) and min(values[::4]) >= 0.0
+    size = None
+    if boxed is not None:
+        x, y, z = (float(part) for part in (bbox.size.x, bbox.size.y, bbox.size.z))
+        size = (x, y, z) if min(x, y, z) > 0.0 and math.isfinite(x + y + z) else None
+    return Solid(pose, values if is_known else None, size)
+
+
+def _pose_of_thing(pose: Any) -> Transform | None:
+    at, turn = pose.position, pose.orientation
+    if not (at.x or at.y or at.z):
+        return None
+    try:
+        return _transform(at, turn)
+    except BadTransform:
+        pass
+    try:  # a detector that knows no orientation may leave it all zeros
+        return unit_transform(at.x, at.y, at.z, 0.0, 0.0, 0.0, 1.0)
+    except BadTransform:
+        return None
 
 
 def _box(bbox: Any) -> list[float]:

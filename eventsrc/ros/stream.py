@@ -86,6 +86,8 @@ class Counts:
     """Keyframes that have a pose without a covariance."""
     with_embedding: int = 0
     """Detections that have an embedding."""
+    with_position: int = 0
+    """Detections that have a measured position."""
     unclassified: int = 0
     """Detections without a hypothesis."""
     numbered: int = 0
@@ -117,8 +119,8 @@ _Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
 
 @dataclass(frozen=True, slots=True)
 class PicturePose:
-    """A pose in the map frame, metres and radians; ``z`` is the base's height. ``has_base`` and
-    ``has_camera`` say which of the two frames were known."""
+    """A pose in the map frame, metres and radians; ``z`` is the base's height. ``has_base`` says
+    whether the base's frame was known; ``camera`` is the whole pose of the camera's, if it was."""
 
     x: float
     y: float
@@ -127,7 +129,7 @@ class PicturePose:
     camera_yaw: float
     covariance: Covariance | None
     has_base: bool
-    has_camera: bool
+    camera: Transform | None
 
 
 class PoseSource:
@@ -202,7 +204,7 @@ class PoseSource:
             0.0 if looks is None else round(math.remainder(looks - yaw, math.tau), _RADIANS),
             covariance,
             base is not None,
-            there is not None,
+            there,
         )
 
     def _of_transforms(self, stamp_ns: int, camera: str, *, final: bool) -> _Found:
@@ -237,14 +239,19 @@ def heading(t: Transform) -> float:
     return math.atan2(y, x)
 
 
+def is_optical(t: Transform | None, frame: str) -> bool:
+    """Whether a camera looks along the z axis of its frame, see `heading_of_camera`."""
+    return "optical" in frame or (t is not None and abs(rotate(t, 0.0, 0.0, 1.0)[2]) < _UPRIGHT)
+
+
 def heading_of_camera(t: Transform, frame: str) -> float:
     """The heading of a camera on the ground, radians: along z in an optical frame, along x in a
     frame of the robot's body. A frame without ``optical`` in its name counts as optical if its z
     axis is within 30° of the horizontal."""
-    x, y, z = rotate(t, 0.0, 0.0, 1.0)
-    if "optical" in frame or abs(z) < _UPRIGHT:
-        return math.atan2(y, x)
-    return heading(t)
+    if not is_optical(t, frame):
+        return heading(t)
+    x, y, _ = rotate(t, 0.0, 0.0, 1.0)
+    return math.atan2(y, x)
 
 
 def _between(a: Covariance | None, b: Covariance | None, share: float) -> Covariance | None:

@@ -18,9 +18,8 @@ ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRel
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
 names only things that deltas before it have introduced. MapGiven is the only one of its event.
 
-Deltas are frozen msgspec structs: a fold makes some ten a keyframe, and a struct takes a third of
-the time of a frozen dataclass to make. ``gc=False`` keeps them out of the garbage collector, which
-would traverse a whole history of them; a delta is never part of a reference cycle.
+A fold makes some ten deltas a keyframe: a msgspec struct takes a third of the time of a frozen
+dataclass, and with ``gc=False`` the garbage collector does not traverse a history of them.
 """
 
 from typing import Literal, NewType, TypeAlias
@@ -64,10 +63,7 @@ class Pose(msgspec.Struct, frozen=True, gc=False):
 
 
 class RunSeen(msgspec.Struct, frozen=True, gc=False):
-    """A run is new, or started earlier than known so far.
-
-    ``started_at`` is the earliest keyframe timestamp of the run so far, in seconds.
-    """
+    """A run is new, or started earlier: ``started_at`` is its earliest timestamp so far."""
 
     offset: Offset
     run: RunOrdinal
@@ -90,6 +86,16 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     camera: StatedCamera | None = None
 
 
+class Body(msgspec.Struct, frozen=True, gc=False):
+    """The measured height of a thing's middle in the map frame, and its length, width and height,
+    µm; None for what was not measured."""
+
+    z_um: int | None
+    length_um: int | None = None
+    width_um: int | None = None
+    height_um: int | None = None
+
+
 class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     """A new detection of a keyframe.
 
@@ -110,16 +116,16 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
     embedding: UnitVector | None
     foreign_space: bool
     measured: bool = False
+    body: Body | None = None
 
 
 class EventSkipped(msgspec.Struct, frozen=True, gc=False):
     """An envelope, or a detection of it, that changes nothing.
 
-    ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (same keyframe, other
-    content: the first one stands), ``forgotten`` (a correction leaves the keyframe out),
-    ``det_id_reused`` (an observation of a new keyframe whose det_id an earlier keyframe has) or
-    ``dropped`` (a correction leaves the detection out). The last two are of one detection,
-    ``det_id``; the rest of the keyframe is folded.
+    ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (other content: the first
+    one stands), ``forgotten`` (a correction leaves the keyframe out), ``det_id_reused`` (an earlier
+    keyframe has the det_id) or ``dropped`` (a correction leaves the detection out). The last two
+    are of one detection, ``det_id``; the rest of the keyframe is folded.
     """
 
     offset: Offset
@@ -145,8 +151,7 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
 class PlaceLink(msgspec.Struct, frozen=True, gc=False):
     """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
 
-    Of places by rooms: the founders of the two places' cells that are the shortest drive apart,
-    and the length of that drive.
+    By rooms: the founders of the cells that are the shortest drive apart, and its length.
     """
 
     core: KeyframeOrdinal
@@ -167,11 +172,10 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
     """Places became one. All members of ``absorbed`` belong to ``survivor`` from now on.
 
     No KeyframePlaced is emitted for them: code that keeps members must move them all. ``bridge`` is
-    the keyframe whose arrival did it, ``links`` the pairs of core points that join the parts, one
-    pair for each absorbed place. ``survivor_count`` and ``absorbed_counts`` are members before the
-    merge. ``joined`` are those absorbed by a ``join`` command; their link is of the command's two
-    anchors, at whatever distance. ``drives`` are there for places by rooms, one for each absorbed
-    place but those in ``joined``.
+    the keyframe whose arrival did it, ``links`` the pair of core points that joined each absorbed
+    place. ``survivor_count`` and ``absorbed_counts`` are members before the merge. ``joined`` are
+    absorbed by a ``join`` command; their link is of its two anchors, at whatever distance.
+    ``drives`` are there for places by rooms, one for each absorbed place not in ``joined``.
     """
 
     offset: Offset
@@ -188,9 +192,9 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
 class MergeRefused(msgspec.Struct, frozen=True, gc=False):
     """Two places touched and stay two, because a correction keeps them apart.
 
-    ``link`` is the pair of core points that would have joined them (of anchors, where a ``join``
-    is refused), ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept
-    apart, of ``a`` and of ``b``. ``a`` was founded before ``b``. A pair of places has only one.
+    ``link`` is the pair of core points, or of a ``join``'s anchors, that would have joined them,
+    ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept apart, of
+    ``a``, founded first, and of ``b``. A pair of places has only one.
     """
 
     offset: Offset
@@ -296,10 +300,8 @@ class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectEstimated(msgspec.Struct, frozen=True, gc=False):
-    """An Object's position, estimated from the bearings of its observations; new values.
-
-    Position in µm, covariance in µm² (rounded to integers), and the number of spots (places to
-    stand, 0.35 m apart) that it was seen from. Only fusion by evidence emits it.
+    """An Object's position, estimated from the bearings of its observations; new values:
+    µm, µm², and the number of spots, 0.35 m apart, that it was seen from. Only by evidence.
     """
 
     offset: Offset
@@ -323,8 +325,8 @@ class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
 class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
     """An Object was not seen where it should have been; new values.
 
-    ``misses`` is the number of keyframes of the run that should show it and do not. ``missing`` is
-    whether it counts as missing by that; it is False again once it is seen there.
+    ``misses`` counts the keyframes of the run that should show it and do not. ``missing`` is
+    whether that makes it missing; it is False again once it is seen there.
     """
 
     offset: Offset
@@ -335,10 +337,8 @@ class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
-    """An Object was found at another position; its estimate leaves out earlier observations.
-
-    ``from_x_um`` … is the estimate that it had, ``to_x_um`` … the first one at the new position.
-    """
+    """An Object was found elsewhere; its estimate, ``from_x_um`` … before and ``to_x_um`` … now,
+    leaves out earlier observations."""
 
     offset: Offset
     object: ObjectOrdinal

@@ -65,6 +65,8 @@ def content_digest(accepted: Accepted) -> bytes:
         content += (envelope.floor, envelope.map_z)
     if envelope.pose_covariance is not None:
         content += (("pose_covariance", *envelope.pose_covariance),)
+    if any(d.position_z is not None or d.size is not None for d in envelope.detections):
+        content += (("bodies", *((d.position_z, d.size) for d in envelope.detections)),)
     # Format version 2 has no references, so equal values give equal bytes.
     return hashlib.blake2b(marshal.dumps(content, 2), digest_size=_DIGEST_BYTES).digest()
 

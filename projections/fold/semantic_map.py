@@ -60,7 +60,7 @@ from .places import Places
 from .relations import Adjacency, LocatedIn, PlaceNames
 from .rooms import Rooms
 from .settings import Settings
-from .sights import camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
+from .sights import body_of, camera_of, pose_error_of, pose_of, sightings_of, with_small_yaw
 from .standing import Standing
 
 Reducer: TypeAlias = (
@@ -228,9 +228,7 @@ class SemanticMap:
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
         """Replace the names of places, as if they had been known from the start; returns the
-        deltas.
-
-        In everything else ``corrections`` must be those of the map: ValueError if they are not.
+        deltas. All else in ``corrections`` must be as in the map: ValueError if it is not.
         """
         if not corrections.differs_in_names_only(self.corrections):
             raise ValueError("these corrections differ in more than names; fold the log again")
@@ -336,6 +334,7 @@ class SemanticMap:
                     unit[1] if unit is not None and is_member else None,
                     unit is not None and not is_member,
                     detection.depth_m is not None or detection.position is not None,
+                    body_of(detection),
                 )
             )
             if unit is not None and is_member:

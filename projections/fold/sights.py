@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import MAX_DEPTH_M, Detection, DetId, Envelope, StatedCamera
 
-from .deltas import FusibleObservation, ObservationOrdinal, Pose
+from .deltas import Body, FusibleObservation, ObservationOrdinal, Pose
 from .evidence import EvidenceConstants
 from .exact import cos_sin, log, metres_to_um
 from .settings import CameraConstants, CameraSettings
@@ -265,6 +265,17 @@ def sightings_of(accepted: Accepted, fusible: Sequence[FusibleObservation]) -> l
         )
         for observation, det_id, class_name, vector, norm2 in fusible[:MOST_OF_A_PICTURE]
     ]
+
+
+def body_of(detection: Detection) -> Body | None:
+    """The measured height and size of a thing; None without either."""
+    z = None if detection.position is None else detection.position_z
+    if z is None and detection.size is None:
+        return None
+    z_um = None if z is None else metres_to_um(z)
+    if detection.size is None:
+        return Body(z_um)
+    return Body(z_um, *map(metres_to_um, detection.size))
 
 
 def _depth(detection: Detection) -> tuple[float, float] | None:

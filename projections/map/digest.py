@@ -6,9 +6,10 @@ names it, an embedding enters by its checksum. Settings and the number of events
 the same map reached another way has the same digest. Under corrections there are two more sections:
 the places' names, and the corrections' fingerprint. Under fusion by evidence there is one more
 before them: of each Object its estimate, whether it is missing, and its relocations. Where any
-keyframe's floor has a name there is one before that: of each of these keyframes the floor. With an
-occupancy map there is one more, of its cells and where they lie, before those of corrections; maps
-that name a floor follow it, by name.
+keyframe's floor has a name there is one before that: of each of these keyframes the floor. Where a
+height or a size is measured there is one of these observations. With an occupancy map there is one
+more, of its cells and where they lie, before those of corrections; maps that name a floor follow
+it, by name.
 """
 
 import hashlib
@@ -47,6 +48,8 @@ def _computed(view: MapView) -> str:
         digest.update(b"evidence\n")
         for line in _evidence(view):
             digest.update(line.encode())
+    if view.has_bodies:
+        digest.update(f"bodies\n{''.join(_bodies(view))}".encode())
     if (given := view.maps.get(None)) is not None:
         digest.update(f"map\n{_line(given.map.digest())}".encode())
     if named := sorted((floor, g.map) for floor, g in view.maps.items() if floor is not None):
@@ -106,6 +109,12 @@ def _evidence(view: MapView) -> Iterator[str]:
             for r in o.relocations
         ]
         yield _line((o.ordinal, estimate, o.misses, o.missing_in, relocations))
+
+
+def _bodies(view: MapView) -> Iterator[str]:
+    for o in view.observations:
+        if (e := o.body) is not None:
+            yield _line((o.ordinal, e.z_um, e.length_um, e.width_um, e.height_um))
 
 
 def _number(value: int | None) -> str:

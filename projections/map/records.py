@@ -7,8 +7,9 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Final
 
 import msgspec
 
@@ -99,7 +100,7 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
 
     ``embedding`` is None when there is none, when it is of a foreign space, or when the view was
     made with ``keep_embeddings=False``; ``embedding_crc`` is there even then. ``measured`` is
-    whether it has a depth or a position.
+    whether it has a depth or a position, ``body`` its measured height and size.
     """
 
     ordinal: deltas.ObservationOrdinal
@@ -115,6 +116,7 @@ class ObservationRecord(msgspec.Struct, eq=False, gc=False):
     object: deltas.ObjectOrdinal | None = None
     similarity_q40: int | None = None
     measured: bool = False
+    body: deltas.Body | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +218,36 @@ class ObjectRecord:
     def mean_y(self) -> float:
         """Metres; the mean of the positions the robot observed it from."""
         return mean_m(self.sum_y_um, self.obs_count)
+
+
+def measured_body(
+    found: ObjectRecord, observations: Sequence[ObservationRecord]
+) -> deltas.Body | None:
+    """The medians of the heights and sizes that the Object's observations have, of an even number
+    the lower one; None without any. Its height is that of the observations since it was found
+    elsewhere."""
+    since = found.relocations[-1].observation if found.relocations else 0
+    seen = [(o, e) for o in found.observations if (e := observations[o].body) is not None]
+    heights = [e.z_um for o, e in seen if o >= since and e.z_um is not None]
+    sizes = [[part for _, e in seen if (part := getattr(e, name)) is not None] for name in _SIZE]
+    medians = [sorted(each)[(len(each) - 1) // 2] if each else None for each in (heights, *sizes)]
+    return None if medians == [None] * 4 else deltas.Body(*medians)
+
+
+def body_fields(body: deltas.Body | None) -> dict[str, Any]:
+    """``z``, and ``size`` as length, width and height, metres, where they are known."""
+    if body is None:
+        return {}
+    fields: dict[str, Any] = {}
+    if body.z_um is not None:
+        fields["z"] = body.z_um / UM_PER_M
+    parts = [getattr(body, name) for name in _SIZE]
+    if None not in parts:
+        fields["size"] = [part / UM_PER_M for part in parts]
+    return fields
+
+
+_SIZE: Final = ("length_um", "width_um", "height_um")
 
 
 class PlaceContents:

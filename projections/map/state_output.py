@@ -18,7 +18,7 @@ from .confirmed import objects_text
 from .naming import ShortIds, things_of
 from .phrases import command_document, seen_times
 from .place_regions import place_regions
-from .records import ObjectRecord
+from .records import ObjectRecord, body_fields
 from .view import MapView
 
 
@@ -149,6 +149,7 @@ def _objects(view: MapView) -> list[dict[str, Any]]:
             **seen_times(o.first_seen, o.last_seen),
             "det_ids": [det_ids[i] for i in o.observations],
             "confirmed": o.confirmed,
+            **body_fields(view.body_of(o)),
             **(_evidence(view, o) if view.settings.fusion == "evidence" else {}),
         }
         for o in view.objects.values()

@@ -1,9 +1,8 @@
 """The map as data, built from deltas alone.
 
-A view does not depend on reducers: the same deltas, from a live fold, a log or a test, give the
-same view. Applying a delta twice does no harm. A merge moves the smaller member list into the
-larger one and leaves keyframes with the place they joined; `KeyframeRecord.place` looks its
-survivor up, so a merge costs little however many keyframes move.
+The same deltas, from wherever, give the same view; applying one twice does no harm. A merge moves
+the smaller member list into the larger one and leaves keyframes with the place they joined, whose
+survivor `KeyframeRecord.place` looks up: it costs little however many keyframes move.
 """
 
 from bisect import insort
@@ -39,8 +38,7 @@ class MapView:
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
     ``floors`` numbers the floors that have a name by their first keyframe. ``maps`` are the last
     occupancy maps by the floor that they name, each with the offset of its event. ``next_offset``
-    is the number of events that went into the view; ``corrections`` are those they were folded
-    under.
+    is the number of events in the view; ``corrections`` are those they were folded under.
     """
 
     def __init__(
@@ -57,6 +55,7 @@ class MapView:
         self.runs: list[records.RunRecord] = []
         self.keyframes: list[records.KeyframeRecord] = []
         self.observations: list[records.ObservationRecord] = []
+        self.has_bodies = False  # whether any observation has one
         self.all_objects: list[records.ObjectRecord] = []
         self.objects: dict[ObjectOrdinal, records.ObjectRecord] = {}
         self.object_survivors = ObjectSurvivors()
@@ -124,6 +123,10 @@ class MapView:
         """The type of room that a place is, by its Objects or its name; None if unknown."""
         return place_type(self.contents.of(place), self.all_places[place].name)
 
+    def body_of(self, found: records.ObjectRecord) -> deltas.Body | None:
+        """The height and size of an Object by its observations; None where none has any."""
+        return records.measured_body(found, self.observations) if self.has_bodies else None
+
     def det_ids(self) -> Sequence[str]:
         """The det_id of each observation."""
         return [each.det_id for each in self.observations]
@@ -189,8 +192,10 @@ class MapView:
                 None if vector is None else crc32(vector.data),
                 delta.foreign_space,
                 measured=delta.measured,
+                body=delta.body,
             )
         )
+        self.has_bodies = self.has_bodies or delta.body is not None
 
     def _event_skipped(self, delta: deltas.EventSkipped) -> None:
         if delta.offset >= self.next_offset:
@@ -225,8 +230,7 @@ class MapView:
     def _place_changed(self, delta: deltas.PlaceChanged) -> None:
         place = self.all_places[delta.place]
         place.keyframe_count = delta.keyframe_count
-        place.sum_x_um = delta.sum_x_um
-        place.sum_y_um = delta.sum_y_um
+        place.sum_x_um, place.sum_y_um = delta.sum_x_um, delta.sum_y_um
 
     def _place_named(self, delta: deltas.PlaceNamed) -> None:
         place = self.all_places[delta.place]
@@ -255,8 +259,7 @@ class MapView:
         survivor = self.all_objects[delta.survivor]
         absorbed = self.objects.pop(delta.absorbed, None)
         if absorbed is not None:
-            moved = tuple(absorbed.observations)
-            for observation in moved:
+            for observation in (moved := tuple(absorbed.observations)):
                 self.observations[observation].object = delta.survivor
             small, large = sorted((absorbed.observations, survivor.observations), key=len)
             for observation in small:  # to sort all takes long where an Object absorbs many
@@ -284,8 +287,7 @@ class MapView:
 
     def _object_missing(self, delta: deltas.ObjectMissing) -> None:
         found = self.all_objects[delta.object]
-        found.misses = delta.misses
-        found.missing_in = delta.run if delta.missing else None
+        found.misses, found.missing_in = delta.misses, delta.run if delta.missing else None
 
     def _object_relocated(self, delta: deltas.ObjectRelocated) -> None:
         found = self.all_objects[delta.object]
@@ -335,9 +337,8 @@ class MapView:
     }
 
     def counts(self) -> dict[str, int]:
-        """Counts by name; the eight in capitals are of the graph's edges by label. Things that
-        corrections leave out are counted at the end, if there are any, and the pictures of a camera
-        that neither their envelopes nor the settings state, if positions depend on it."""
+        """Counts by name; the eight in capitals are of the graph's edges by label. What corrections
+        leave out and pictures of a camera that nothing states come at the end, if they count."""
         posed, fused, foreign = self._sums()
         unstated = self.without_camera() if self.settings.wants_camera else 0
         placed = sum(p.keyframe_count for p in self.places.values())

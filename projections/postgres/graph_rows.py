@@ -26,7 +26,7 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.fold.exact import Q40, UM_PER_M
 from projections.map.changes import BatchChanges, FollowedRegions
 from projections.map.place_regions import place_regions
-from projections.map.records import KeyframeRecord, ObjectRecord
+from projections.map.records import KeyframeRecord, ObjectRecord, body_fields
 from projections.map.view import MapView
 
 from .labels import LABELS, EdgeLabel, Label, adjacency_number, floor_part_number, graphid_base
@@ -262,6 +262,8 @@ def object_rows(view: MapView, objects: Iterable[int]) -> Iterator[VertexRow]:
     for i in objects:
         o = view.all_objects[i]
         more = _evidence(view, o) if by_evidence else ""
+        measured = body_fields(view.body_of(o))
+        more += "".join(f', "{name}": {value!r}' for name, value in measured.items())
         properties = (
             f'{{"object_id": {text(o.object_id)}, "class_name": {text(o.class_name)},'
             f' "mean_x": {o.mean_x!r}, "mean_y": {o.mean_y!r}, "obs_count": {o.obs_count},'

@@ -72,9 +72,9 @@ _LEFT_OUT: Final = {
     "observation": ("run_id", "keyframe_id"),  # those of its keyframe
     "map": ("map",),  # it is read from the log
 }
-_SIGNED: Final = ("similarity_q40",)
+_SIGNED: Final = ("similarity_q40", "z_um")
 """Optional integers that may be negative."""
-_PREFIXED: Final = ("camera",)
+_PREFIXED: Final = ("camera", "body")
 """The fields with parts of the same name as another field's: theirs have the field's before it."""
 _UNIQUE: Final = ("det_id", "place_id", "object_id")
 _SCALARS: Final[Mapping[type, Kind]] = {

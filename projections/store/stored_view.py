@@ -8,13 +8,14 @@ before the view is changed.
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise, repeat
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import (
+    Body,
     Delta,
     KeyframeAdded,
     KeyframeOrdinal,
@@ -83,6 +84,7 @@ class StoredView(MapView):
         self.floors = {name: number for number, name in enumerate(_floors(moment))}
         for given in history.maps[: moment.count("map")] if moment.count("map") else ():
             self.maps[given.map.floor] = given
+        self.has_bodies = bool(moment.column("observation", "body").any())
         keyframes: Chunks[KeyframeRecord] = Chunks(
             moment.count("keyframe"), partial(_keyframes, moment, self.survivors)
         )
@@ -212,8 +214,15 @@ def _observations(moment: Moment, first: int, last: int) -> list[ObservationReco
             [None if each == NONE else each for each in objects],
             [None if q40 == NO_INT else q40 for q40 in similarities],
             found["measured"],
+            _bodies(found),
         )
     )
+
+
+def _bodies(found: dict[str, list[Any]]) -> Iterable[Body | None]:
+    there, *parts = (found[name] for name in TABLES["observation"] if name.startswith("body"))
+    made = (Body(*each) for each in zip(*parts, strict=True))
+    return (each if is_there else None for each, is_there in zip(made, there, strict=True))
 
 
 class StoredPlace(PlaceRecord):

@@ -110,6 +110,25 @@ def test_the_report_says_what_was_used_and_what_was_not(
     assert (counts.unused, about.notes, about.is_useless) == ({}, [], False)
 
 
+def test_things_in_three_dimensions_have_positions_and_what_mapfold_shows_is_no_input(
+    tmp_path: Path,
+) -> None:
+    seen = ros.solids(START, "map", ros.solid("chair", flat(2.0, 1.0, 0.0, 0.4), 0.5, 0.6, 0.9))
+    shown = ("/mapfold/objects", START, seen)
+    tree = ros.tf(ros.transform("map", "base_link", START, flat(0.0, 0.0, 0.0)))
+    recorded = [("/tf", START, tree), shown, ("/things", START, seen)]
+    bag = write_bag(tmp_path / "drive", recorded)
+    (about,) = imported(tmp_path / "log", bag).bags
+    assert {t.topic for t in about.topics if not t.used_for} == {"/mapfold/objects"}
+    assert about.streams["/things"].with_position == 1
+    ((chair,),) = (each["detections"] for each in envelopes(tmp_path / "log"))
+    assert (chair["position"], chair["position_z"]) == ([2.0, 1.0], 0.4)
+    assert chair["size"] == [0.6, 0.5, 0.9]
+    flat_too = [*recorded, ("/detections", START, ros.detections(START, "map"))]
+    (about,) = imported(tmp_path / "other", write_bag(tmp_path / "again", flat_too)).bags
+    assert list(about.streams) == ["/detections"]
+
+
 def test_a_second_import_changes_no_map(drives: dict[str, Path], tmp_path: Path) -> None:
     log = tmp_path / "log"
     imported(log, drives["mcap none"])
@@ -243,7 +262,7 @@ def test_frames_are_found_under_other_names(tmp_path: Path) -> None:
     ("options", "said"),
     [
         ({"detections": ("/nothing",)}, "no messages of that topic"),
-        ({"detections": ("/tf",)}, "not vision_msgs/msg/Detection2DArray; of that type it has /d"),
+        ({"detections": ("/tf",)}, "or vision_msgs/msg/Detection3DArray; of that type it has /d"),
         ({"pose": "/odom"}, "it has none of that type"),
         ({"embeddings": "/tf"}, "std_msgs/msg/String"),
         ({"camera": "/x"}, "--camera /x"),

@@ -69,7 +69,7 @@ class Room:
                 if rng.random() < 0.5:
                     fields["depth_sigma_m"] = 0.2
             if rng.random() < 0.1:
-                fields["position"] = [tx, ty]
+                fields |= {"position": [tx, ty], "position_z": x - 2.0, "size": [0.3, 0.2, y + 0.1]}
             vector = None if rng.random() < 0.05 else [v + rng.gauss(0, 0.2) for v in look]
             label = rng.choice(CLASSES) if rng.random() < 0.15 else name
             clipped = [min(max(v, 0.0), m) for v, m in zip(box, (640, 400) * 2, strict=True)]

@@ -214,6 +214,7 @@ def view_at(history: History, latest: MapView, end: Offset) -> MapView:
         if keyframe.floor is not None:
             view.floors.setdefault(keyframe.floor, len(view.floors))
     view.observations = _observations(history, latest, end)
+    view.has_bodies = any(each.body is not None for each in view.observations)
     view.all_objects = _objects(history, end)
     for merge in history.object_merges[: count_before(history.object_merges, end)]:
         view.object_survivors.merge(merge.survivor, (merge.absorbed,))

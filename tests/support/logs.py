@@ -288,7 +288,8 @@ def _envelope(rng: random.Random, number: int) -> dict[str, Any]:
 def _seen(rng: random.Random) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     if rng.random() < 0.2:
-        fields |= {"depth_m": 2.5, "position": [rng.random(), 1.0]}
+        fields |= {"depth_m": 2.5, "position": [height := rng.random(), 1.0]}
+        fields |= {"position_z": -height, "size": [1.0, 0.5, height + 0.01]}
     if rng.random() < 0.1:
         fields["det_id"] = f"det {rng.randrange(10**6)}"
     which = rng.randrange(len(WEIRD))

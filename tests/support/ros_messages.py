@@ -127,6 +127,18 @@ def detection(results: Sequence[tuple[str, float]], bbox: Any, id_: str = "") ->
     )
 
 
+def solid(name: str, t: Transform, *size: float) -> Any:
+    """A Detection3D."""
+    (result,) = detection([(name, 0.8)], box(0, 0, 0, 0)).results
+    bbox = make("vision_msgs/msg/BoundingBox3D", center=pose(t), size=vector("Vector3", *size))
+    made = {"header": header(0, ""), "results": [result], "bbox": bbox, "id": ""}
+    return make("vision_msgs/msg/Detection3D", **made)
+
+
+def solids(ns: int, frame: str, *each: Any) -> Any:
+    return make("vision_msgs/msg/Detection3DArray", header=header(ns, frame), detections=[*each])
+
+
 def detections(ns: int, frame: str, *each: Any) -> Any:
     return make("vision_msgs/msg/Detection2DArray", header=header(ns, frame), detections=[*each])
 

@@ -68,7 +68,7 @@ _EVERY_TRANSFORM: Final = 101
 _LAST_TRANSFORM: Final = 100_000
 _FIRST_PARAMETERS: Final = 10_000
 _FIRST_WANTED: Final = (
-    *(ros.DETECTIONS, ros.LABELS, ros.VISION_INFO, ros.CAMERA_INFO),
+    *(*ros.DETECTION_TYPES, ros.LABELS, ros.VISION_INFO, ros.CAMERA_INFO),
     *(ros.POSE, ros.ODOMETRY),
     *IMAGES,
 )
@@ -90,6 +90,10 @@ Sampled = Callable[[str, int], bool]
 """Returns whether to keep a message of this type with this number on its topic as a sample."""
 
 
+_OWN_TOPICS: Final = "/mapfold/"
+"""Where `mapfold ros` publishes."""
+
+
 @dataclass
 class BagContents:
     """Topics and time span of a bag. ``first_ns`` and ``last_ns`` are when its first and last
@@ -105,6 +109,17 @@ class BagContents:
     def count(self) -> int:
         """Number of messages on all topics."""
         return sum(topic.count for topic in self.topics.values())
+
+    def detections(self, under: str = "") -> list[str]:
+        """The topics ``under`` a namespace of Detection2DArray; without any, those of
+        Detection3DArray, but not of the things that mapfold itself shows. By name."""
+        kinds = {t.name: t.type_name for t in self.topics.values() if t.name.startswith(under)}
+        in_picture = sorted(name for name, kind in kinds.items() if kind == ros.DETECTIONS)
+        return in_picture or sorted(
+            name
+            for name, kind in kinds.items()
+            if kind == ros.DETECTIONS_3D and not name.startswith(_OWN_TOPICS)
+        )
 
     def span(self, received_ns: int) -> None:
         """Extend the time span by a message's time of receipt."""

@@ -112,8 +112,8 @@ class Chooser:
     def _detections(self) -> Sequence[str]:
         given = self._options.detections
         for topic in given:
-            self._check("--detections", topic, ros.DETECTIONS)
-        return given or self._of_type(ros.DETECTIONS)
+            self._check("--detections", topic, *ros.DETECTION_TYPES)
+        return given or self._contents.detections()
 
     def _add_stream(self, topic: str, *, several: bool) -> None:
         made, options = self._made, self._options

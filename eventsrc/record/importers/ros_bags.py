@@ -14,7 +14,7 @@ from eventsrc.envelope.system_events import Excerpt
 from eventsrc.record.append import CROP_FORMAT
 from eventsrc.ros.assembler import Assembled, Assembler, RosMessage
 from eventsrc.ros.library import MessageTypes, Undecodable
-from eventsrc.ros.messages import DETECTIONS, FLOATS, TEXT, BadMessage
+from eventsrc.ros.messages import DETECTION_TYPES, FLOATS, TEXT, BadMessage
 from eventsrc.ros.stream import Counts
 
 from .bag_files import Bag, BagContents, BagMessage, bag_name, sampled
@@ -200,7 +200,9 @@ def _report(name: str, contents: BagContents, choice: Choice) -> BagReport:
     if is_useless:
         types = sorted({topic.type_name for topic in contents.topics.values()})
         has = f"it has {', '.join(types[:8])}" if types else "it is empty"
-        notes.append(f"nothing to import: no topic is of type {DETECTIONS}; {has}")
+        notes.append(
+            f"nothing to import: no topic is of type {' or '.join(DETECTION_TYPES)}; {has}"
+        )
     counted = name, contents.count, duration, topics
     return BagReport(*counted, notes=notes, is_useless=is_useless)
 

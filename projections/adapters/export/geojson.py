@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from projections.adapters.scene import Point, places_of
+from projections.map.records import body_fields
 from projections.map.view import MapView
 
 _WGS84_A_M: Final = 6_378_137.0
@@ -110,6 +111,7 @@ def _objects(view: MapView, at: _Placing) -> Iterable[dict[str, Any]]:
             sigma_m=None if found.estimate is None else found.estimate.est_sigma_m,
             missing=True if found.missing_in is not None else None,
             confirmed=found.confirmed,
+            **body_fields(view.body_of(found)),
         )
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from eventsrc.base.text import visible
 from projections.map.place_regions import place_regions
+from projections.map.records import body_fields
 from projections.map.view import MapView
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def graph_of(view: MapView) -> "networkx.Graph":
                 obs_count=found.obs_count,
                 missing=True if found.missing_in is not None else None,
                 confirmed=found.confirmed,
+                z=body_fields(view.body_of(found)).get("z"),
             ),
         )
         if found.place is not None:

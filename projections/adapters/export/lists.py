@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import yaml
 
-from projections.map.records import PlaceRecord
+from projections.map.records import ObjectRecord, PlaceRecord, body_fields
 from projections.map.view import MapView
 
 _Table = tuple[Sequence[str], Iterable[Sequence[Any]]]
@@ -83,11 +83,18 @@ def _objects(view: MapView) -> _Table:
                 found.last_seen,
                 "true" if found.missing_in is not None else "false",
                 "true" if found.confirmed else "false",
+                *(_body(view, found) if view.has_bodies else ()),
             )
         )
     names = ("object_id", "class_name", "place_id", "mean_x", "mean_y", "est_x", "est_y")
     more = ("est_sigma_m", "obs_count", "first_seen", "last_seen", "missing", "confirmed")
-    return (*names, *more), rows
+    body = ("z", "length", "width", "height") if view.has_bodies else ()
+    return (*names, *more, *body), rows
+
+
+def _body(view: MapView, found: ObjectRecord) -> Sequence[float | None]:
+    fields = body_fields(view.body_of(found))
+    return fields.get("z"), *fields.get("size", (None,) * 3)
 
 
 def _keyframes(view: MapView) -> _Table:

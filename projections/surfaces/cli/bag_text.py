@@ -93,7 +93,9 @@ class BagChoice:
     detections: Annotated[
         list[str] | None,
         _topic(
-            "--detections", "Topic of vision_msgs/Detection2DArray; may be repeated. Default: all."
+            "--detections",
+            "Topic of vision_msgs/Detection2DArray or Detection3DArray; may be repeated. Default: "
+            "all of the first type, else of the second.",
         ),
     ] = None
     pose: Annotated[
@@ -250,7 +252,8 @@ def _keyframes(counts: Counts) -> str:
     )
     parts = [f"{number:,} {what}" for number, what in lacks if number]
     seen = counted(counts.detections, "detection")
-    parts.append(f"{seen}, {counts.with_embedding:,} with an embedding")
+    measured = f", {counts.with_position:,} with a position" if counts.with_position else ""
+    parts.append(f"{seen}, {counts.with_embedding:,} with an embedding{measured}")
     if counts.crops or counts.without_picture or counts.outside:
         parts.append(counted(counts.crops, "crop"))
     if counts.without_picture:

@@ -93,8 +93,8 @@ class BridgeChoice:
         _option(
             "--detections",
             "TOPIC",
-            "Topic of vision_msgs/Detection2DArray; may be repeated. [default: all, with --ros2dds "
-            f"{_DETECTIONS}]",
+            "Topic of vision_msgs/Detection2DArray or Detection3DArray; may be repeated. "
+            f"[default: all, with --ros2dds {_DETECTIONS}]",
         ),
     ] = None
     pose: Annotated[

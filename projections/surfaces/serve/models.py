@@ -124,6 +124,12 @@ class MapObject(TypedDict):
     est_xy: NotRequired[float]
     est_yy: NotRequired[float]
     est_spots: NotRequired[int]
+    z: NotRequired[
+        Annotated[float, Field(description="Median height of its middle, where it was measured.")]
+    ]
+    size: NotRequired[
+        Annotated[list[float], Field(description="Median length, width and height, metres.")]
+    ]
     missing: NotRequired[
         Annotated[bool, Field(description="Whether it was not seen where it should have been.")]
     ]
