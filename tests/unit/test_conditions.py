@@ -94,31 +94,35 @@ def test_expressions_hold(text: str, holds: bool) -> None:
 @pytest.mark.parametrize(
     ("text", "column", "says"),
     [
-        ("", 1, "expected a number, a text or a function, not the end"),
-        ("place_count <", 14, "not the end"),
+        ("", 1, "invalid syntax; compare by"),
+        ("place_count <", 14, "invalid syntax"),
         ("place_count < 3 and placecount > 2", 21, "did you mean 'place_count'?"),
         ("wibble > 1", 1, "there are keyframe_count, located_in"),
-        ("place_count = 3", 13, "write '=='"),
-        ("place_count < 'three'", 13, "cannot compare a number with a text or none"),
-        ("place_of('a:1') < 'a_p0'", 17, "texts have no order"),
+        ("place_count = 3", 13, "invalid syntax; compare by < <= =="),
+        ("place_count < 'three'", 15, "cannot compare a number with a text or none"),
+        ("place_of('a:1') < 'a_p0'", 19, "texts have no order"),
         ("place_count", 1, "must be true or false, and this is a number"),
         ("place_count and 1 < 2", 1, "an operand of and"),
         ("1 < 2 or 'x'", 10, "an operand of or"),
         ("not place_count", 5, "the operand of not"),
-        ("1 < 2 < 3", 7, "one comparison at a time"),
-        ("(1 < 2", 7, "to close the parenthesis"),
-        ("1 < 2)", 6, "did not expect ')'"),
+        ("1 < 2 < 3", 9, "one comparison at a time"),
+        ("1 in 3", 1, "expected a number, a text in quotes or a function"),
+        ("True", 1, "expected a number, a text in quotes or a function"),
+        ("merged(place='a_p0')", 1, "expected a number, a text in quotes or a function"),
+        ("(1 < 2", 1, "was never closed"),
+        ("1 < 2)", 6, "unmatched ')'"),
         ("same_place('a:1')", 1, "write it as same_place(keyframe, keyframe)"),
-        ("same_place('a:1' 'a:2')", 18, "expected ','"),
         ("object_count(chair) > 1", 14, "takes texts in quotes"),
-        ("merged('a_p0", 8, "not closed"),
-        ("place_count < 3.5", 16, "numbers are whole"),
-        ("place_count < 3 && 1 < 2", 17, "write and, or, not"),
-        ("(1 < 2) == (2 < 3)", 9, "true and false cannot be compared"),
+        ("merged('a_p0", 8, "unterminated string"),
+        ("merged('\u00e4') or merged('a\\d')", 23, "invalid escape sequence"),
+        ("  merged('\u00e4') or\t3.5 > 1", 18, "numbers are whole"),
+        ("place_count < 3 && 1 < 2", 18, "join by and, or, not"),
+        ("(1 < 2) == (2 < 3)", 13, "true and false cannot be compared"),
         ("__import__('os') == 'x'", 1, "no function '__import__'"),
-        ("place_count < 3; 1", 16, "has no meaning here"),
-        (" or ".join(["place_count"] * 1_500), 15_001, "more than 2,000 words and signs"),
-        ("1 < 2 or 3 < -" + "9" * 4301, 14, "a number of more than 4300 digits"),
+        ("place_count < 3; 1", 16, "invalid syntax"),
+        ("merged('a\0')", 13, "null bytes"),
+        ("merged('a\udc80')", 1, "surrogates not allowed"),
+        (" or ".join(["place_count"] * 300), 4_000, "more than 4,000 characters"),
     ],
 )
 def test_an_error_points_at_its_column(text: str, column: int, says: str) -> None:
@@ -139,34 +143,14 @@ def test_the_pointer_stands_under_the_column() -> None:
 
 def test_deep_nesting_is_an_error_and_no_overflow() -> None:
     assert Expression("(" * 90 + "1 < 2" + ")" * 90).holds(FakeFacts())
-    for text in ("(" * 1_500 + "1 < 2", "not " * 1_500 + "1 < 2"):
-        with pytest.raises(ExpressionError, match="nested more than"):
+    for text in ("(" * 1_500 + "1 < 2", "not " * 500 + "1 < 2", "-" * 3_000 + "1 < 2"):
+        with pytest.raises(ExpressionError, match="nested"):
             Expression(text)
 
 
 def test_ids_may_hold_quotes_and_backslashes() -> None:
     facts = FakeFacts({r"it's:1": "p", 'b"\\s:1': "p"})
     assert Expression(r"""same_place('it\'s:1', "b\"\\s:1")""").holds(facts)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "place_of('a\nb:1') == none",
-        "place_of('a\rb:1') == none",
-        "place_of('a\0b:1') == none",
-        "place_of('a\udc80b:1') == none",
-        "place_count < 007",
-        "place_count < \u0663",  # three in Arabic-Indic digits
-        "place_count\u00a0< 3",
-        "place_count\n< 3",
-    ],
-    ids=ascii,
-)
-def test_what_python_refuses_in_a_text_or_between_tokens_is_accepted(text: str) -> None:
-    expression = Expression(text)
-    assert expression.holds(FakeFacts())
-    assert [mention.text for mention in expression.mentions()] == text.split("'")[1:2]
 
 
 def test_mentions_and_readings() -> None:
