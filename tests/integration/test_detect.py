@@ -198,16 +198,6 @@ def test_a_camera_has_no_last_picture(
     assert not report.stopped
 
 
-def test_a_stream_on_stdin(stage: Stage, tmp_path: Path) -> None:
-    pictures = sorted(stage.pictures.glob("*.jpg"))[:3]
-    stream = b"".join(p.read_bytes() for p in pictures)
-    words = ("--images", "-", "--fps", "2", "--start", "2026-05-04T09:00:00Z")
-    out = tmp_path / "run.jsonl"
-    stage.run("detect", *words, *stage.models, "--out", out, stdin=stream)
-    stamps = [json.loads(line)["timestamp"] for line in out.read_text().splitlines()]
-    assert stamps == [1777885200.0, 1777885200.5, 1777885201.0]
-
-
 @pytest.mark.slow
 def test_a_recorder_that_is_away_costs_nothing(
     stage: Stage, tmp_path: Path, endpoint: str, start: Callable[..., Program]

@@ -1,6 +1,5 @@
 """Pictures as bytes: sizes, ends, streams, damage; and what is decoded from them."""
 
-import io
 import random
 import struct
 import zlib
@@ -8,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from eventsrc.adapters.detector.picture import PictureError, check_picture, split_stream
+from eventsrc.adapters.detector.picture import PictureError, check_picture
 from eventsrc.adapters.detector.vision import decode, encode_jpeg, fitted
 from eventsrc.envelope.grey_images import encode_png
 
@@ -113,36 +112,6 @@ def _png_of_size(width: int, height: int) -> bytes:
 def test_what_is_no_picture_is_one_line(data: bytes, reason: str) -> None:
     with pytest.raises(PictureError, match=reason):
         decode(data)
-
-
-def _split(data: bytes, step: int) -> list[bytes | str]:
-    stream = io.BytesIO(data)
-    return [
-        part if isinstance(part, bytes) else str(part)
-        for part in split_stream(lambda size: stream.read(min(step, size)))
-    ]
-
-
-@pytest.mark.parametrize("step", [1, 7, 1000, 1 << 20])
-def test_a_stream_is_split_into_its_pictures(step: int) -> None:
-    assert _split(JPEG + PNG + JPEG, step) == [JPEG, PNG, JPEG]
-    cut, *rest = _split(JPEG[:100] + PNG + JPEG, step)
-    assert rest[-2:] == [PNG, JPEG]
-    assert isinstance(cut, str)
-    parts = _split(JPEG + b"garbage" + PNG + JPEG[:-1], step)
-    assert [part for part in parts if isinstance(part, bytes)] == [JPEG, PNG]
-    assert len(parts) == 4
-    assert _split(b"", step) == []
-
-
-def test_a_picture_is_given_before_the_next_one_comes() -> None:
-    pieces = [JPEG]
-
-    def read(_size: int) -> bytes:
-        assert pieces, "it asked for more than the picture needs"
-        return pieces.pop()
-
-    assert next(split_stream(read)) == JPEG
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (3, 200), (640, 400)])

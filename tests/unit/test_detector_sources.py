@@ -1,6 +1,5 @@
-"""Where pictures and poses come from: folders, streams, paths, messages of Zenoh."""
+"""Where pictures and poses come from: folders, videos, messages of Zenoh."""
 
-import io
 import itertools
 import json
 import math
@@ -30,10 +29,6 @@ PIXELS = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 JPEG = encode_jpeg(PIXELS)
 
 
-def _never(_size: int) -> bytes:
-    raise AssertionError("stdin is not asked")
-
-
 def _stamps(pictures: Any) -> list[tuple[str, float]]:
     return [(Path(p.name).name, p.stamp_s) for p in pictures]
 
@@ -42,7 +37,7 @@ def test_a_folder_is_in_the_order_of_its_numbers(tmp_path: Path) -> None:
     names = ("10.5.jpg", "10.25.jpg", "10.05.jpg", "9.25.JPG", "1403636579.jpeg", "notes.txt")
     for name in (*names, "1403636579763555584.png"):
         (tmp_path / name).write_bytes(JPEG)
-    found = list(open_images(str(tmp_path), _never, Timing()))
+    found = list(open_images(str(tmp_path), Timing()))
     assert _stamps(found) == [
         ("9.25.JPG", 9.25),
         ("10.05.jpg", 10.05),
@@ -57,25 +52,25 @@ def test_a_folder_is_in_the_order_of_its_numbers(tmp_path: Path) -> None:
 def test_a_folder_at_a_rate(tmp_path: Path) -> None:
     for name in ("frame2.jpg", "frame10.jpg", "frame1.jpg"):
         (tmp_path / name).write_bytes(JPEG)
-    found = _stamps(open_images(str(tmp_path), _never, Timing(100.0, 4.0)))
+    found = _stamps(open_images(str(tmp_path), Timing(100.0, 4.0)))
     assert found == [("frame1.jpg", 100.0), ("frame2.jpg", 100.25), ("frame10.jpg", 100.5)]
     for name in ("frame1.jpg", "000017.jpg", "1.jpg", "12345678901.jpg", "1.jpg.jpg"):
         (tmp_path / name).write_bytes(JPEG)
         expected = rf"{re.escape(name)}: its name is no time; .* give --fps N"
         with pytest.raises(MisuseError, match=expected):
-            list(open_images(str(tmp_path / name), _never, Timing()))
+            list(open_images(str(tmp_path / name), Timing()))
 
 
 def test_where_there_are_no_pictures(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(MisuseError, match=r"no \.jpg, \.jpeg or \.png in this folder"):
-        open_images(str(tmp_path), _never, Timing())
+        open_images(str(tmp_path), Timing())
     with pytest.raises(MisuseError, match="no such folder or video"):
-        open_images(str(tmp_path / "none"), _never, Timing())
+        open_images(str(tmp_path / "none"), Timing())
     (tmp_path / "film.mp4").write_bytes(b"no film")
     for data in (b"no film", b"", b"\0\0\0\x18ftypmp42" + bytes(500), b"RIFF\0\0\0\0AVI LIST"):
         (tmp_path / "film.mp4").write_bytes(data)
         with pytest.raises(MisuseError, match="cannot be opened as a video"):
-            open_images(str(tmp_path / "film.mp4"), _never, Timing())
+            open_images(str(tmp_path / "film.mp4"), Timing())
     assert capfd.readouterr().err == ""
 
 
@@ -86,41 +81,9 @@ def test_a_video_counts_by_its_rate(tmp_path: Path) -> None:
     for _ in range(5):
         writer.write(PIXELS)
     writer.release()
-    pictures = open_images(str(path), _never, Timing(50.0))
+    pictures = open_images(str(path), Timing(50.0))
     found = [(p.stamp_s, p.pixels().shape) for p in pictures]
     assert found == [(50.0 + k / 8, (24, 32, 3)) for k in range(5)]
-
-
-def _reader(data: bytes, step: int = 1000) -> Any:
-    stream = io.BytesIO(data)
-    return lambda size: stream.read(min(size, step))
-
-
-@pytest.mark.parametrize("step", [1, 5, 1000])
-def test_stdin_with_a_stream(step: int) -> None:
-    data = JPEG + b"junk" + JPEG
-    found = list(open_images("-", _reader(data, step), Timing(7.0, 2.0)))
-    assert [p.stamp_s for p in found] == [7.0, 7.5, 8.0]
-    assert found[0].pixels().shape == found[2].pixels().shape == (24, 32, 3)
-    with pytest.raises(PictureError):
-        found[1].pixels()
-
-
-@pytest.mark.parametrize("step", [1, 5, 1000])
-def test_stdin_with_paths(tmp_path: Path, step: int) -> None:
-    text = "".join(f"{tmp_path}/{n}.jpg\n" for n in (1.5, 2.5)) + f"\n{tmp_path}/3.0.jpg"
-    found = list(open_images("-", _reader(text.encode(), step), Timing()))
-    assert _stamps(found) == [("1.5.jpg", 1.5), ("2.5.jpg", 2.5), ("3.0.jpg", 3.0)]
-    with pytest.raises(PictureError, match="No such file"):
-        found[0].pixels()
-
-
-def test_stdin_with_neither() -> None:
-    assert list(open_images("-", _reader(b""), Timing())) == []
-    with pytest.raises(MisuseError, match="neither pictures"):
-        list(open_images("-", _reader(b"ab\0" * 10_000), Timing()))
-    with pytest.raises(MisuseError, match="neither pictures"):
-        list(open_images("-", _reader(b"x" * 100_000), Timing()))
 
 
 def test_poses_of_a_file(tmp_path: Path) -> None:

@@ -1,13 +1,11 @@
 """Pictures from files and over Zenoh.
 
-Files are a folder, a video, or stdin with a stream of pictures or a list of paths. The time at
-which a picture was taken:
+Files are a folder or a video. The time at which a picture was taken:
 
-* Of a folder or a list of paths it is in the file's name, in seconds with a point or in
-  nanoseconds, as in the data sets of TUM and EuRoC: ``1777885200.05.jpg``,
-  ``1403636579763555584.png``. For other names a rate in pictures a second must be given.
-* Of a video's frames it follows from a start and the video's rate. Of a stream's pictures it is the
-  time of receipt, unless a rate is given.
+* Of a folder it is in the file's name, in seconds with a point or in nanoseconds, as in the data
+  sets of TUM and EuRoC: ``1777885200.05.jpg``, ``1403636579763555584.png``. For other names a rate
+  in pictures a second must be given.
+* Of a video's frames it follows from a start and the video's rate.
 
 Over Zenoh a picture is a JPEG or PNG as it is, or in CDR sensor_msgs/CompressedImage or
 sensor_msgs/Image, as a bridge of ROS 2 forwards them. Without a stamp of its own it has its time of
@@ -21,8 +19,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -43,9 +42,6 @@ _TIME: Final = re.compile(r"[0-9]{1,10}\.[0-9]{1,9}|[0-9]{10}|[0-9]{16,19}", re.
 """A time in a file's name. ``000017`` is the number of a picture, not a time."""
 _NANOSECOND_DIGITS: Final = 16
 _PARTS: Final = re.compile(r"([0-9]+)", re.ASCII)
-_MAX_PATH: Final = 8_192
-Read: TypeAlias = Callable[[int], bytes]
-"""Returns up to so many bytes, none at the end."""
 
 
 class Timing(NamedTuple):
@@ -60,11 +56,9 @@ class Timing(NamedTuple):
         return None if rate is None else self.start_s + index / rate
 
 
-def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[picture.Picture]:
+def open_images(text: str, timing: Timing) -> Iterator[picture.Picture]:
     """The pictures of ``--images``. Raises MisuseError before the first, and where a picture has no
     time."""
-    if text == "-":
-        return _from_stdin(stdin, timing)
     path = Path(text)
     if path.is_dir():
         found = sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_in_order)
@@ -74,14 +68,14 @@ def open_images(text: str, stdin: Read, timing: Timing) -> Iterator[picture.Pict
             found.sort(key=_stamp_in)  # 5.25 before 5.5
         return _from_paths(found, timing)
     if not path.is_file():
-        raise MisuseError(f"--images {text}: no such folder or video; - reads stdin")
+        raise MisuseError(f"--images {text}: no such folder or video")
     if path.suffix.lower() in SUFFIXES:
         return _from_paths([path], timing)
     try:
         video = Video(path)
     except picture.PictureError as error:
         raise MisuseError(
-            f"--images {text}: {error}; give a folder of pictures, a video, or -"
+            f"--images {text}: {error}; give a folder of pictures or a video"
         ) from None
     return _from_video(path, video, timing)
 
@@ -145,56 +139,6 @@ def _from_video(path: Path, video: Video, timing: Timing) -> Iterator[picture.Pi
             raise MisuseError(f"--images {path}: no frame in this video can be read")
     finally:
         video.close()
-
-
-def _from_stdin(read: Read, timing: Timing) -> Iterator[picture.Picture]:
-    """The pictures of a stream if it begins like a picture, else those of a path a line."""
-    start = b""
-    while len(start) < len(picture.PNG_START) and b"\n" not in start:
-        piece = read(len(picture.PNG_START) - len(start))
-        if not piece:
-            break
-        start += piece
-    if start.startswith((picture.JPEG_START, picture.PNG_START)):
-        yield from _from_stream(start, read, timing)
-    elif start.strip():
-        yield from _from_paths(_paths(start, read), timing)
-
-
-def _from_stream(start: bytes, read: Read, timing: Timing) -> Iterator[picture.Picture]:
-    pending = [start]
-    parts = picture.split_stream(lambda size: pending.pop() if pending else read(size))
-    for index, part in enumerate(parts):
-        stamp_s = timing.stamp_s(index)
-        stamp_s = system_clock() / 1e9 if stamp_s is None else stamp_s
-        yield picture.Picture(f"stdin, picture {index}", stamp_s, _decoder(part))
-
-
-def _decoder(part: bytes | picture.PictureError) -> Callable[[], picture.Pixels]:
-    def pixels() -> picture.Pixels:
-        if isinstance(part, picture.PictureError):
-            raise part
-        return decode(part)
-
-    return pixels
-
-
-def _paths(start: bytes, read: Read) -> Iterator[Path]:
-    rest = start
-    ended = False
-    while rest or not ended:
-        line, newline, behind = rest.partition(b"\n")
-        if len(line) > _MAX_PATH or b"\0" in line:
-            raise MisuseError("--images -: neither pictures (JPEG, PNG) nor a path a line")
-        if not newline and not ended:
-            piece = read(_MAX_PATH)
-            ended = not piece
-            rest += piece
-            continue
-        rest = behind
-        text = line.decode("utf-8", "surrogateescape").strip()
-        if text:
-            yield Path(text)
 
 
 QUEUE: Final = 4
@@ -288,13 +232,17 @@ class LivePictures:
             try:
                 yield picture_of(message.payload, name, received_s)
             except MessageError as error:
-                yield picture.Picture(name, received_s, _decoder(picture.PictureError(str(error))))
+                yield picture.Picture(name, received_s, partial(_refuse, str(error)))
         with suppress(TransportError):
             self._session.confirm()  # what the router has by now is here, and counted
         self.queue.close()
 
     def _now_s(self) -> float:
         return self._clock() / 1e9
+
+
+def _refuse(reason: str) -> picture.Pixels:
+    raise picture.PictureError(reason)
 
 
 _CHANNELS: Final[Mapping[str, int]] = {"bgr8": 3, "rgb8": 3, "8UC3": 3, "mono8": 1, "8UC1": 1}

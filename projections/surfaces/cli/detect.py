@@ -46,9 +46,8 @@ def detect(
     images: Annotated[
         str | None,
         typer.Option(
-            metavar="DIR|VIDEO|-",
-            help="Folder of JPEG and PNG pictures, a video, or on stdin a stream of pictures or"
-            " paths.",
+            metavar="DIR|VIDEO",
+            help="Folder of JPEG and PNG pictures, or a video.",
             rich_help_panel=_PICTURES,
         ),
     ] = None,
@@ -271,7 +270,7 @@ def detect(
 ) -> None:
     """Find objects in pictures and publish them as envelopes.
 
-    Pictures come from a folder, a video, stdin or Zenoh; poses from a file or Zenoh. A picture
+    Pictures come from a folder, a video or Zenoh; poses from a file or Zenoh. A picture
     becomes a keyframe when the robot has moved or turned far enough, or after a time. Its objects
     are found and their crops encoded by ONNX models of your own; without them, this command prints
     where to get some. Ctrl-C ends it.
@@ -312,9 +311,7 @@ def detect(
         if session is not None and (zenoh_image or zenoh_pose):
             live = LivePictures(session, zenoh_image, zenoh_pose, stop, queue=queue)
         pictures: Iterable[Picture] = (
-            live
-            if images is None and live
-            else open_images(images or "", detect_checks.stdin_until(stop), timing)
+            live if images is None and live else open_images(images or "", timing)
         )
         keyframes = Keyframes(
             finder,
@@ -342,7 +339,7 @@ def detect(
         if address is not None:
             stack.enter_context(metrics_of(address, detection))
         where = str(out) if out is not None else key
-        said = zenoh_image or ("stdin" if images == "-" else images)
+        said = zenoh_image or images
         say(f"detecting in {said}, run {name}, to {where}; Ctrl-C ends it")
         with show_status() as watch:
             detection.run(pictures, watch)

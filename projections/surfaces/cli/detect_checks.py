@@ -3,11 +3,7 @@
 import datetime
 import math
 import os
-import select
 import socket
-import sys
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +17,6 @@ from eventsrc.envelope.model import MAX_TIMESTAMP_S, RunId
 from eventsrc.record.transport.session import check_keys
 
 _MAX_RUN: Final = 200
-_POLL_S: Final = 0.25
 
 
 def check_sources(
@@ -91,18 +86,3 @@ def limits_of(moved: float, turned: float, after: float | None, *, posed: bool) 
 def spool_path() -> Path:
     """The default of ``--spool``."""
     return Path(os.environ.get("MAPFOLD_HOME") or ".mapfold") / "detect-spool.sqlite"
-
-
-def stdin_until(stop: threading.Event) -> Callable[[int], bytes]:
-    """A function that reads up to a number of bytes from stdin; it returns none at the end or once
-    ``stop`` is set."""
-
-    def read(size: int) -> bytes:
-        number = sys.stdin.fileno()
-        while not stop.is_set():
-            ready, _, _ = select.select([number], [], [], _POLL_S)
-            if ready:
-                return os.read(number, size)
-        return b""
-
-    return read
