@@ -12,6 +12,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def mapfold(log: Path) -> Commands:
     return Commands.in_folder(log.parent)
+
+
+@pytest.fixture(scope="module")
+def printed(mapfold: Commands, log: Path) -> Callable[[str, tuple[str, ...]], Any]:
+    """What a command prints, run once however often it is asked for."""
+    return cache(lambda name, words: mapfold(name, log, *words, "--json").json)
 
 
 @pytest.fixture(scope="module")
@@ -230,25 +237,30 @@ def agent(log: Path) -> Iterator[Any]:
 
 @pytest.mark.parametrize("number", range(15), ids=[question[0] for question in QUESTIONS])
 def test_an_agent_gets_what_the_command_prints(
-    number: int, mapfold: Commands, agent: Any, log: Path
+    number: int, printed: Callable[[str, tuple[str, ...]], Any], agent: Any
 ) -> None:
     from tests.support.agents import tool
 
     _, (name, *words), *_, is_right = QUESTIONS[number]
+    told = printed(name, tuple(words))
     called, arguments = BY_AGENT[number]
     answer = tool(agent, called, **arguments)
     assert is_right(answer["answer"])
-    assert answer["answer"] == mapfold(name, log, *words, "--json").json
+    assert answer["answer"] == told
     assert answer["offsets"]
     assert answer["map"]["digest"]
 
 
 @pytest.mark.parametrize("question", QUESTIONS, ids=[question[0] for question in QUESTIONS])
 def test_each_is_answered_rightly_and_alike_everywhere(
-    question: Question, mapfold: Commands, house: Map, http: str, log: Path
+    question: Question,
+    printed: Callable[[str, tuple[str, ...]], Any],
+    house: Map,
+    http: str,
+    log: Path,
 ) -> None:
     _, (name, *words), in_python, url, is_right = question
-    by_command = mapfold(name, log, *words, "--json").json
+    by_command = printed(name, tuple(words))
     assert is_right(by_command)
     if name == "changes":
         with Timeline(log) as timeline:

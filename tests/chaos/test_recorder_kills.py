@@ -11,7 +11,7 @@ from tests.support.thorough import rounds
 
 
 def test_a_few_kills(tmp_path: Path) -> None:
-    _kill(tmp_path, rounds(6, 4), 1, 300.0, 20260324)
+    _kill(tmp_path, rounds(6, 2), 1, 300.0, 20260324)
 
 
 @pytest.mark.slow

@@ -82,6 +82,7 @@ def test_postgres_is_killed_again_and_again(tmp_path: Path, own_server: Embedded
     assert all_rows(targets) == tailed
 
 
+@pytest.mark.slow
 def test_a_server_that_does_not_start_at_once_is_tried_again(
     tmp_path: Path, own_server: EmbeddedServer
 ) -> None:
@@ -152,6 +153,7 @@ def test_commits_the_server_lost_are_written_again(tmp_path: Path, one_database:
     assert all_rows(one_database) == tailed
 
 
+@pytest.mark.slow
 def test_commits_lost_while_no_event_comes_are_written_again(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +208,7 @@ def test_a_connection_cut_again_while_the_checkpoint_is_read(
     assert (report.next_offset, len(cuts)) == (40, again + 1)
 
 
+@pytest.mark.slow
 def test_a_new_pass_waits_for_a_database_that_is_away(
     tmp_path: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,7 @@ from projections.postgres.connection import Targets, connect
 from projections.postgres.queries.candidate_search import prepare_graph
 from projections.postgres.queries.live_view import read_view
 from projections.store.history_recorder import map_after
-from projections.surfaces.python import fold
+from projections.surfaces.python import Map, fold
 from tests.support.commands import Commands
 from tests.support.evidence_drives import long_drive
 from tests.support.logs import SAMPLE, write_log
@@ -31,8 +31,13 @@ FULL = Settings(places="rooms", fusion="evidence")
 
 
 @pytest.fixture(scope="module")
-def sample() -> MapView:
-    return fold(SAMPLE, embeddings=False).view
+def house() -> Map:
+    return fold(SAMPLE, embeddings=False)
+
+
+@pytest.fixture(scope="module")
+def sample(house: Map) -> MapView:
+    return house.view
 
 
 @pytest.fixture
@@ -69,7 +74,7 @@ def has_goal(view: MapView, object_id: str) -> bool:
 
 
 def test_the_databases_answer_as_the_log(tmp_path: Path, one_database: Targets) -> None:
-    log = write_log(tmp_path / "log", long_drive(5))
+    log = write_log(tmp_path / "log", long_drive(5, each=30))
     rebuild(log, one_database, FULL)
     with LogReader(log) as reader:
         view = map_after(reader, FULL, reader.next_offset)
@@ -81,16 +86,18 @@ def test_the_databases_answer_as_the_log(tmp_path: Path, one_database: Targets) 
     assert any(each["moved_from"] for each in answers(live)[4]["answers"])
 
 
-def test_the_databases_have_the_walls(mapfold: Commands, one_database: Targets) -> None:
+def test_the_databases_have_the_walls_and_python_gives_the_same(
+    mapfold: Commands, one_database: Targets, house: Map
+) -> None:
     mapfold("replay", SAMPLE, "--db", one_database.graph_url)
-    for words in (
-        ("find", "sinks", "--from", "1,1"),
-        ("find", "chair", "--goal", "json"),
-        ("room", "kitchen"),
-        ("path", "kitchen", "bathroom"),
+    for (command, *rest), found in (
+        (("find", "sinks", "--from", "1,1"), house.find("sinks", start=(1, 1))),
+        (("find", "oven", "--goal", "json"), house.goal("oven")),
+        (("room", "kitchen"), house.room("kitchen")),
+        (("path", "1,1", "oven"), house.path((1, 1), "oven")),
     ):
-        command, *rest = words
         live = mapfold(command, *rest, "--json", "--db", one_database.graph_url).json
+        assert live == same(found.document())
         assert live == mapfold(command, SAMPLE, *rest, "--json").json
     said = mapfold("find", "--db", one_database.graph_url, "sinks", "--in", "kitchen").out
     assert "1 kitchen" in said
@@ -182,29 +189,18 @@ def test_a_goal_is_clear_of_walls_and_sees_the_thing(sample: MapView) -> None:
     assert free >= 0.9 * goals
 
 
-def test_a_goal_is_printed_for_ros(mapfold: Commands) -> None:
-    goal = mapfold("find", SAMPLE, "oven", "--goal", "json").json
+def test_a_goal_is_printed_for_ros(mapfold: Commands, house: Map) -> None:
+    goal = same(house.goal("oven").document())
     yaml = mapfold("find", SAMPLE, "oven", "--goal", "yaml").out
     line = mapfold("path", SAMPLE, "bathroom", "oven", "--goal", "ros2").out
     assert f"position: {{x: {goal['x']:.3f}, y: {goal['y']:.3f}, z: 0.0}}" in yaml
     assert yaml.startswith("header:\n")
     assert line.startswith("ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '{")
     assert f"x: {goal['x']:.3f}" in line
-    way = mapfold("path", SAMPLE, "bathroom", "oven", "--json").json
+    way = same(house.path("bathroom", "oven").document())
     assert way["goal"] == goal
     assert way["way_points"][-1] == [goal["x"], goal["y"]]
     assert "passage" in mapfold("path", SAMPLE, "bathroom", "oven").out
-
-
-def test_python_gives_the_same(mapfold: Commands) -> None:
-    house = fold(SAMPLE, embeddings=False)
-    for words, found in (
-        (("room", SAMPLE, "kitchen"), house.room("kitchen")),
-        (("path", SAMPLE, "1,1", "oven"), house.path((1, 1), "oven")),
-        (("find", SAMPLE, "oven", "--goal", "json"), house.goal("oven")),
-        (("find", SAMPLE, "--from", "p3"), house.find(start="p3")),
-    ):
-        assert same(found.document()) == mapfold(*words, "--json").json
 
 
 def test_the_way_to_a_thing_counts_not_the_straight_line(sample: MapView) -> None:
@@ -229,8 +225,8 @@ def test_runs_that_never_meet_have_no_way_between_them(tmp_path: Path, mapfold: 
     assert "no way from 0,0 to 500,0: no robot drove one in steps of 5 m or less" in said
 
 
-def test_room_tells_what_it_is_and_holds(mapfold: Commands, sample: MapView) -> None:
-    document = mapfold("room", SAMPLE, "kitchen", "--json").json
+def test_room_tells_what_it_is_and_holds(mapfold: Commands, house: Map, sample: MapView) -> None:
+    document = same(house.room("kitchen").document())
     (place,) = (p for p in sample.places.values() if p.place_id == document["place_id"])
     inside = [o for o in sample.objects.values() if o.place == place.ordinal]
     assert {o["object_id"] for o in document["objects"]} == {

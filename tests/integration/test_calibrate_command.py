@@ -199,12 +199,18 @@ def test_a_camera_that_nothing_states_is_estimated_and_recorded(tmp_path: Path) 
     assert f"camera.hfov_deg={camera['hfov_deg']}" in after.out
     answer = mapfold("relocalize", "--class", "lamp", "--log", "log", "--hfov", "90")
     assert "no camera is stated" not in answer.err
+
+
+@pytest.mark.slow
+def test_an_estimated_camera_is_not_recorded_again(tmp_path: Path) -> None:
+    write_room(tmp_path / "log", count=COUNT, camera=False)
+    mapfold = Commands.in_folder(tmp_path)
+    camera = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE).json["camera"]
     again = mapfold("calibrate", "log", "--write").out
     assert f"field of view {camera['hfov_deg']:g}° ± {camera['hfov_error_deg']:g}°" in again
     assert again.endswith("the log has these constants already; nothing is recorded\n")
 
 
-@pytest.mark.seconds
 def test_relocalize_names_the_camera_that_only_the_question_states(tmp_path: Path) -> None:
     write_room(tmp_path / "log", count=20, camera=False)
     write_room(tmp_path / "stated", count=20)
@@ -214,6 +220,13 @@ def test_relocalize_names_the_camera_that_only_the_question_states(tmp_path: Pat
         said = mapfold(*asked, "--hfov", "90")
         assert ("keyframes of the map, as it is for the question" in said.err) is is_named
         assert "no camera is stated" not in mapfold(*asked).err
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_stated_is_not_estimated(tmp_path: Path) -> None:
+    write_room(tmp_path / "log", count=20, camera=False)
+    write_room(tmp_path / "stated", count=20)
+    mapfold = Commands.in_folder(tmp_path)
     few = mapfold("calibrate", "log", "--set", "camera.hfov_deg=none").out
     assert "field of view" in few
     stated = mapfold("calibrate", "stated", "--json").json
@@ -229,7 +242,7 @@ THIN: dict[str, tuple[list[dict[str, Any]], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", mostly_slow(THIN, 3))
+@pytest.mark.parametrize("name", mostly_slow(THIN, 2))
 def test_thin_maps_keep_their_priors_and_say_why(tmp_path: Path, name: str) -> None:
     documents, reason = THIN[name]
     write_log(tmp_path / "log", documents)

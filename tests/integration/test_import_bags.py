@@ -18,7 +18,7 @@ from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log
 from tests.support.ros_bags import DRIVE, RUN, Drive, Raw, envelopes, imported, write_bag
 from tests.support.ros_messages import START, flat
-from tests.support.thorough import every_other
+from tests.support.thorough import every_other, mostly_slow
 
 
 @pytest.fixture(scope="module")
@@ -356,7 +356,7 @@ def test_the_command_exits_with_3_for_nothing_and_2_for_a_wrong_option(mapfold: 
         assert told in mapfold("import", "log", "drive", *options, code=2).err
 
 
-@pytest.mark.parametrize("topic", ["/label_info", "/far/label_info"])
+@pytest.mark.parametrize("topic", mostly_slow(["/label_info", "/far/label_info"]))
 def test_numbered_classes_get_the_names_of_a_label_info(mapfold: Commands, topic: str) -> None:
     seen = [ros.detection([(name, 0.9)], ros.box(9, 9, 2, 2)) for name in ("0", "17", "7")]
     shown = ("/detections", START, ros.detections(START, "camera", *seen))

@@ -26,7 +26,7 @@ ASKED = [
     ("room", "LOG", "sim-7-a_p0"),
     ("export", "LOG", "--graphml", "map.graphml"),
     ("relocalize", "--class", "toilet", "--log", "LOG"),
-    ("draw", "LOG", "--out", "map.svg", "--merges"),
+    pytest.param(("draw", "LOG", "--out", "map.svg", "--merges"), marks=pytest.mark.slow),
     ("state", "LOG"),
 ]
 

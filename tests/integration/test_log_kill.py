@@ -103,7 +103,7 @@ def _digests(log: Path) -> set[str]:
 
 
 def _kill(log: Path, fsync: str, times: int, *, mixed: bool = False) -> None:
-    longest_s = LONGEST_LIFE_S if THOROUGH else LONGEST_LIFE_S / 3  # all of it is read again
+    longest_s = LONGEST_LIFE_S if THOROUGH else LONGEST_LIFE_S / 6  # all of it is read again
     rng = random.Random(SEED)
     lived = list(lives(log, times, fsync, rng, mixed=mixed, longest_s=longest_s))
     assert lived

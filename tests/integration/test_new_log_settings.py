@@ -81,14 +81,22 @@ def test_a_camera_that_nothing_states_is_named_once_by_what_records_it(run: Comm
 
 @pytest.mark.parametrize(
     ("source", "options", "settings", "told"),
-    [
-        ("bag", (), FULL, "a new log with --preset full, for input of ROS, said at offset 0"),
-        ("bag", ("--preset", "classic"), CLASSIC, "with --preset classic, said at offset 0"),
-        ("bag", ("--set", "eps_m=1"), Settings(eps_m=1.0), "a new log with --set eps_m=1, said"),
-        ("run.jsonl", (), None, "a new log of --preset classic; with --preset full places are"),
-        ("run.jsonl", ("--preset", "full"), FULL, "a new log with --preset full, said at"),
-        ("run.jsonl", ("--preset", "page"), CLASSIC, "a new log with --preset page, said at"),
-    ],
+    mostly_slow(
+        [
+            ("bag", (), FULL, "a new log with --preset full, for input of ROS, said at offset 0"),
+            ("run.jsonl", (), None, "a new log of --preset classic; with --preset full places are"),
+            (
+                "bag",
+                ("--set", "eps_m=1"),
+                Settings(eps_m=1.0),
+                "a new log with --set eps_m=1, said",
+            ),
+            ("bag", ("--preset", "classic"), CLASSIC, "with --preset classic, said at offset 0"),
+            ("run.jsonl", ("--preset", "full"), FULL, "a new log with --preset full, said at"),
+            ("run.jsonl", ("--preset", "page"), CLASSIC, "a new log with --preset page, said at"),
+        ],
+        quick=2,
+    ),
 )
 def test_what_a_new_log_says(
     run: Commands, source: str, options: tuple[str, ...], settings: Settings | None, told: str
@@ -238,8 +246,7 @@ def test_a_source_with_settings_that_no_fold_can_use_does_not_begin_a_log(run: C
 
 
 def test_a_file_of_a_simulated_run_says_them(run: Commands) -> None:
-    for _ in range(2):  # the same file again
-        run("simulate", "--seed", "3", "--out", "s.jsonl", "--preset", "full")
+    run("simulate", "--seed", "3", "--out", "s.jsonl", "--preset", "full")
     run("import", "log", "s.jsonl")
     assert said_by(run.folder / "log") == FULL
     said = run("simulate", "--preset", "full", code=2).err

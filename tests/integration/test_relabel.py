@@ -17,6 +17,7 @@ from projections.postgres.queries.live_view import read_view
 from tests.integration.test_types_of_places import DOCUMENTS, KITCHEN
 from tests.support.commands import Commands
 from tests.support.logs import write_log
+from tests.support.thorough import mostly_slow
 
 NUMBERS = {"refrigerator": "72", "sink": "71", "toilet": "61", "box": "4"}
 NAMES = {number: name for name, number in NUMBERS.items()}
@@ -40,14 +41,17 @@ def log(tmp_path: Path) -> Path:
     return write_log(tmp_path / "log", map(numbered, DOCUMENTS))
 
 
+RULES: list[Any] = [[], ["--preset", "rooms", "--set", "fusion=evidence"]]
+
+
 def classes(mapfold: Commands, log: Path, *options: str) -> list[str]:
     state = mapfold("state", log, "--json", *options).json
     return sorted(each["class_name"] for each in state["objects"])
 
 
-@pytest.mark.parametrize("rules", [(), ("--preset", "rooms", "--set", "fusion=evidence")])
+@pytest.mark.parametrize("rules", mostly_slow(RULES))
 def test_the_map_is_that_of_a_log_with_the_names(
-    mapfold: Commands, log: Path, rules: tuple[str, ...]
+    mapfold: Commands, log: Path, rules: list[str]
 ) -> None:
     def parts(of: Path, *options: str) -> list[Any]:
         state = mapfold("state", of, "--json", *rules, *options).json

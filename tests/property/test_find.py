@@ -91,7 +91,7 @@ def test_answers_are_those_of_the_state(documents: list[dict[str, Any]], wanted:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_log(tmp_path_factory.mktemp("find") / "log", long_drive(5))
+    folder = write_log(tmp_path_factory.mktemp("find") / "log", long_drive(5, each=30))
     append_command(folder, command(UseSettings, settings={"places": "rooms", "fusion": "evidence"}))
     return folder
 

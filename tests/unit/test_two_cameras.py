@@ -14,6 +14,7 @@ from projections.map.view import MapView
 from tests.support.envelopes import payload
 from tests.support.folds import fold
 from tests.support.seen_rooms import CAMERA, drive
+from tests.support.thorough import mostly_slow
 
 NARROW = {"hfov_deg": 50.0, "width_px": 320.0, "height_px": 240.0, "yaw_rad": 1.2}
 """Of a robot that looks to its left."""
@@ -56,7 +57,7 @@ def _accepted(documents: Sequence[Mapping[str, Any]]) -> Iterator[Accepted]:
         yield found
 
 
-@pytest.mark.parametrize("fusion", ["evidence", "page"])
+@pytest.mark.parametrize("fusion", mostly_slow(["evidence", "page"]))
 def test_a_map_of_two_cameras_answers_each_as_a_map_of_its_own_does(fusion: str) -> None:
     both = fold([*run("a", "wide"), *run("b", "narrow")], fusion=fusion).view
     for by in CAMERAS:

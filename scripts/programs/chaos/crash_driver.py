@@ -1,5 +1,5 @@
 """Run as a program: kill a tail at its n-th step, let another finish, for every n there is
-when the tests are thorough, else for every forty-first.
+when the tests are thorough, else for every eighty-first.
 
 A step is a statement about to be sent, a transaction about to end, or one that has just ended. Each
 round forks a child that tails and kills itself (SIGKILL) at step n, then tails to the end without
@@ -87,7 +87,7 @@ def main() -> None:
             wrong.append(step)
         if not killed:
             break
-        step += stride(41)
+        step += stride(81)
     sys.stdout.write(json.dumps({"steps": step, "wrong": wrong}) + "\n")
 
 
