@@ -106,7 +106,7 @@ def house(log: Path) -> api.Map:
     [
         (["cups"], {"what": "cups"}),
         (["chair", "--near", "1.5,2", "--all"], {"what": "chair", "near": (1.5, 2), "every": True}),
-        (["--in", "p0", "--top", "3"], {"room": "p0", "top": 3}),
+        (["--in", "run-0_p0", "--top", "3"], {"room": "run-0_p0", "top": 3}),
         (["--moved"], {"moved": True}),
         (["--missing"], {"missing": True}),
         (
