@@ -6,10 +6,13 @@ equal ones the first.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Final, NamedTuple
 
+from eventsrc.base.user_files import written_whole
 from eventsrc.envelope.model import DetId
+from eventsrc.log import LogReader
 from eventsrc.record.kept_crops import KeptCrops
 from projections.map.records import ObjectRecord, ObservationRecord
 from projections.map.view import MapView
@@ -52,3 +55,18 @@ def best_views(
         jpeg = crops.jpeg(seen.det_id, view.keyframes[seen.keyframe].offset)
         if jpeg is not None:
             yield View(seen.det_id, jpeg)
+
+
+def write_best(view: MapView, object_ids: Iterable[str], log: Path, folder: Path) -> dict[str, str]:
+    """Write the best crop that the log keeps of each Object that has one; the files by Object."""
+    files: dict[str, str] = {}
+    records = {each.object_id: each for each in view.objects.values()}
+    with LogReader(log) as reader:
+        kept = KeptCrops(reader)
+        for object_id in object_ids:
+            best = best_view(view, records[object_id], kept)
+            if best is not None:
+                files[object_id] = str(folder / f"{object_id}.jpg")
+                with written_whole(Path(files[object_id])) as file:
+                    file.write(best.jpeg)
+    return files

@@ -1,24 +1,19 @@
 """Where things are: the Objects of a map that a person asks for.
 
-`find` is pure over a `MapView`. What is asked for is an Object's id, nothing, which is everything,
-or classes by these rules, of which the first that finds one counts:
+`find` is pure over a `MapView` and what `Words` of it answer. What is asked for is an Object's id,
+nothing, which is everything, or words (`projections.ask.words`).
 
-1. ``exact``: the class's name, whatever its letter case and with an article or without; spaces,
-   ``_`` and ``-`` are equal,
-2. ``plural``: its plural, such as chairs, knives or people,
-3. ``words``: every word asked for, or its plural, is a word of the class: table finds coffee table,
-4. ``spelling``: the classes spelled most like it (`difflib`, ratio of `_LEAST_RATIO` or more).
-
-Answers are ordered by way where ``start`` is given, by distance where ``near`` is; else those that
-are where they were last seen come before those that are missing, then the ones seen most often.
+Answers of the classes meant come before those that only look like the words. Both are ordered by
+way where ``start`` is given, by distance where ``near`` is; else those that are where they were
+last seen come before those that are missing, then those with the best score where words were
+compared with embeddings, then the ones seen most often.
 """
 
-import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Final, Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Literal, NamedTuple
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, visible
@@ -31,92 +26,18 @@ from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 from .driven_ground import DrivenGround
+from .words import (
+    ClassMatch,
+    NotComparedError,
+    Words,
+    classes_meant,
+    looking_like,
+    near_classes,
+    scores,
+)
 
-ClassMatch = Literal["exact", "plural", "words", "spelling"]
-"""The rule by which classes are what was asked for."""
-MOST_CLASSES: Final = 5
-"""Classes that are the nearest in spelling, at most."""
-
-_LEAST_RATIO: Final = 0.75
-_IRREGULAR: Final = {
-    "person": "people",
-    "man": "men",
-    "woman": "women",
-    "child": "children",
-    "mouse": "mice",
-    "foot": "feet",
-    "tooth": "teeth",
-    "knife": "knives",
-    "shelf": "shelves",
-    "bookshelf": "bookshelves",
-    "loaf": "loaves",
-    "leaf": "leaves",
-    "scarf": "scarves",
-}
-
-
-def classes_meant(what: str, classes: Iterable[str]) -> tuple[ClassMatch, set[str]]:
-    """The classes among some that a text means, and the rule by which; none for none."""
-    asked = _plain(what)
-    by_name: dict[str, set[str]] = {}
-    for each in classes:
-        by_name.setdefault(_plain(each), set()).add(each)
-    if asked not in by_name:
-        asked = re.sub("^(a|an|the) ", "", asked)
-    if asked in by_name:
-        return "exact", by_name[asked]
-    plural = [name for name in by_name if asked in _plurals(name)]
-    if plural:
-        return "plural", _union(by_name, plural)
-    words = [name for name in by_name if asked and _has_words(name, asked)]
-    if words:
-        return "words", _union(by_name, words)
-    forms = {form: name for name in sorted(by_name) for form in (name, *_plurals(name))}
-    near = difflib.get_close_matches(asked, forms, MOST_CLASSES, _LEAST_RATIO)
-    if near:
-        best = _ratio(asked, near[0])
-        names = [forms[each] for each in near if _ratio(asked, each) == best]
-        return "spelling", _union(by_name, names)
-    return "spelling", set()
-
-
-def _ratio(asked: str, form: str) -> float:
-    return difflib.SequenceMatcher(None, form, asked).ratio()
-
-
-def _union(by_name: Mapping[str, set[str]], names: Iterable[str]) -> set[str]:
-    return set().union(*(by_name[name] for name in names))
-
-
-def _plain(text: str) -> str:
-    return " ".join(re.split(r"[\s_-]+", text.casefold())).strip()
-
-
-def _plurals(name: str) -> set[str]:
-    """The plurals of a class, of which the last word is one."""
-    start, _, last = name.rpartition(" ")
-    before = f"{start} " if start else ""
-    forms = {f"{last}s", f"{last}es"}
-    if last.endswith("y"):
-        forms.add(f"{last[:-1]}ies")
-    if last in _IRREGULAR:
-        forms.add(_IRREGULAR[last])
-    return {before + form for form in forms}
-
-
-def _has_words(name: str, asked: str) -> bool:
-    """Whether each word asked for is a word of a name, or the plural of one."""
-    words = name.split()
-    return all(any(word == w or word in _plurals(w) for w in words) for word in asked.split())
-
-
-def near_classes(what: str, classes: Iterable[str]) -> list[str]:
-    """The classes spelled most like what was asked for, for a message; none if none is like it."""
-    return difflib.get_close_matches(_plain(what), sorted(classes), MOST_CLASSES, 0.5)
-
-
-Match = Literal["id", "everything"] | ClassMatch
-"""How an Object is what was asked for."""
+Match = Literal["id", "everything", "look"] | ClassMatch
+"""How an Object is what was asked for; ``look`` is by its embeddings alone."""
 
 _MAX_SHOWN: Final = 256
 _NUMBER: Final = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
@@ -166,7 +87,8 @@ class FoundObject:
     largest, None where they are the mean position of the robot that saw it. ``distance_m`` is from
     what it should be near, ``way_m`` the way to it over driven ground, None for none.
     ``missing_in`` is the run that should have seen it and did not, ``moved_from`` where it stood
-    before, in metres. ``offsets`` are the events that saw it.
+    before, in metres. ``offsets`` are the events that saw it. ``score`` is how much more it looks
+    like the words than all Objects do, in standard deviations; None where that was not compared.
     """
 
     object_id: str
@@ -187,6 +109,7 @@ class FoundObject:
     missing_in: str | None
     moved_from: tuple[float, float] | None
     offsets: tuple[int, ...]
+    score: float | None = None
 
     def __repr__(self) -> str:
         at = f"({self.x:.2f}, {self.y:.2f})"
@@ -201,7 +124,9 @@ class FoundObject:
 class FoundObjects:
     """The answers, best first, of ``count`` that there are; ``unconfirmed`` more were seen once.
 
-    ``match`` is the rule by which ``classes`` are what was asked for.
+    ``match`` is the rule by which ``classes`` are what was asked for. ``text_encoder`` is the model
+    that compared the words with embeddings, None if none did; ``remark`` is then why, where that
+    matters.
     """
 
     match: Match
@@ -209,6 +134,8 @@ class FoundObjects:
     count: int
     unconfirmed: int
     answers: tuple[FoundObject, ...]
+    text_encoder: str | None = None
+    remark: str | None = None
 
     def __repr__(self) -> str:
         return f"<{len(self.answers):,} of {self.count:,} found: {list(self.answers[:3])}>"
@@ -218,8 +145,8 @@ class FoundObjects:
         return asdict(self)
 
 
-def find(view: MapView, wanted: Wanted) -> FoundObjects:
-    """The Objects of a map that answer a question.
+def find(view: MapView, wanted: Wanted, words: Words | None = None) -> FoundObjects:
+    """The Objects of a map that answer a question; ``words`` compare its text with embeddings.
 
     Raises MisuseError, also NoSuchThing and SeveralThings, for what the map does not have or what
     means several things, and for a question that its settings cannot answer.
@@ -236,8 +163,8 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
         room = view.survivors.find(ordinal)
     spot = None if wanted.near is None else spot_of(wanted.near, things)
     ways = None if wanted.start is None else _Ways(view, spot_of(wanted.start, things))
-    match, objects = _meant(view, wanted.what, things)
-    classes = tuple(sorted({each.class_name for each in objects}))
+    meant = _meant(view, wanted.what, things, words)
+    match, objects = meant.match, meant.objects
     since, before = _seconds(wanted.seen_since), _seconds(wanted.not_seen_since)
     objects = [o for o in objects if since is None or o.last_seen >= since]
     objects = [o for o in objects if before is None or o.last_seen < before]
@@ -248,20 +175,32 @@ def find(view: MapView, wanted: Wanted) -> FoundObjects:
 
     way_to = {} if ways is None else {each.ordinal: ways.to(each) for each in kept}
 
-    def order(each: ObjectRecord) -> tuple[float, float, bool, int, int]:
+    def order(each: ObjectRecord) -> tuple[bool, float, float, bool, float, int, int]:
         way = 0.0 if ways is None else way_to[each.ordinal]
         distance = 0.0 if spot is None else math.dist(each.spot, spot)
         return (
+            each.class_name not in meant.classes,
             math.inf if way is None else way,
             distance,
             each.missing_in is not None,
+            -meant.scores.get(each.object_id, 0.0),
             -each.obs_count,
             each.ordinal,
         )
 
     best = sorted(kept, key=order)[: wanted.top]
-    answers = [answer_of(view, each, match, spot, way_to.get(each.ordinal)) for each in best]
-    return FoundObjects(match, classes, len(kept), len(found) - len(kept), tuple(answers))
+    answers = [
+        replace(
+            answer_of(view, each, match, spot, way_to.get(each.ordinal)),
+            match=match if each.class_name in meant.classes else "look",
+            score=meant.scores.get(each.object_id),
+        )
+        for each in best
+    ]
+    return FoundObjects(
+        *(match, tuple(sorted(meant.classes)), len(kept), len(found) - len(kept), tuple(answers)),
+        *(meant.text_encoder, meant.remark),
+    )
 
 
 def _seconds(time: float | str | None) -> float | None:
@@ -274,28 +213,55 @@ def _seconds(time: float | str | None) -> float | None:
     return time_ns / 1e9
 
 
-def _meant(
-    view: MapView, what: str | None, things: list[Thing]
-) -> tuple[Match, list[ObjectRecord]]:
-    """The Objects that are what is asked for, and the rule by which."""
+class _Meant(NamedTuple):
+    """The Objects that are what is asked for: by a rule those of some classes, and others that look
+    like it."""
+
+    match: Match
+    objects: list[ObjectRecord]
+    classes: set[str]
+    scores: Mapping[str, float] = {}
+    text_encoder: str | None = None
+    remark: str | None = None
+
+
+def _meant(view: MapView, what: str | None, things: list[Thing], words: Words | None) -> _Meant:
+    """What is asked for."""
     standing = list(view.objects.values())
     if what is None:
-        return "everything", standing
-    what = what if len(what) <= _MAX_SHOWN else f"{what[:_MAX_SHOWN]}…"  # no name is as long
-    rule, called = matches(what, (thing for thing in things if thing.kind == "object"))
+        return _Meant("everything", standing, {each.class_name for each in standing})
+    shown = what if len(what) <= _MAX_SHOWN else f"{what[:_MAX_SHOWN]}…"  # no name is as long
+    rule, called = matches(shown, (thing for thing in things if thing.kind == "object"))
     if rule in (Rule.ID, Rule.SHORT):
-        one = thing_called(what, called, ["object"])
-        found = view.object_survivors.find(ObjectOrdinal(one.ordinal))
-        return "id", [view.all_objects[found]]
-    match, classes = classes_meant(what, {each.class_name for each in standing})
+        one = thing_called(shown, called, ["object"])
+        found = view.all_objects[view.object_survivors.find(ObjectOrdinal(one.ordinal))]
+        return _Meant("id", [found], {found.class_name})
+    match, classes = classes_meant(shown, {each.class_name for each in standing})
+    of_class = [each for each in standing if each.class_name in classes]
+    is_class = bool(classes) and match != "spelling"
+    places = matches(shown, (thing for thing in things if thing.kind == "place"))[1]
+    remark = None if is_class else _NO_TEXT_ENCODER
+    if words is not None and (is_class or not places):
+        try:
+            scored, model = scores(words.cosines(what)), words.model
+        except NotComparedError as error:
+            remark = str(error)
+        else:
+            kept = classes if is_class else set[str]()
+            objects = [*(of_class if is_class else ()), *looking_like(scored, standing, kept)]
+            return _Meant(match if is_class else "look", objects, kept, scored, model)
     if not classes:
-        raise _nothing(what, standing, things)
-    return match, [each for each in standing if each.class_name in classes]
+        raise _nothing(shown, standing, places, remark)
+    return _Meant(match, of_class, classes, remark=remark)
 
 
-def _nothing(what: str, standing: list[ObjectRecord], things: list[Thing]) -> MisuseError:
+_NO_TEXT_ENCODER: Final = "without a text encoder words are compared with names of classes only"
+
+
+def _nothing(
+    what: str, standing: list[ObjectRecord], places: list[Thing], remark: str | None
+) -> MisuseError:
     """The error for a class that the map does not have."""
-    places = matches(what, (thing for thing in things if thing.kind == "place"))[1]
     if places:
         listed = ", ".join(str(place) for place in places[:MOST_NEAR])
         lists = visible(advised("find", "--in", what))
@@ -306,7 +272,7 @@ def _nothing(what: str, standing: list[ObjectRecord], things: list[Thing]) -> Mi
     near = near_classes(what, classes)
     listed = f"near it: {', '.join(near)}" if near else f"there are {', '.join(classes[:10])}"
     more = f" and {len(classes) - 10} more" if not near and len(classes) > 10 else ""
-    return MisuseError(f"no class like {what!r} in this map; {listed}{more}")
+    return MisuseError(f"no class like {what!r} in this map; {listed}{more}; {remark}")
 
 
 def point_of(text: str) -> tuple[float, float] | None:

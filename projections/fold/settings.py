@@ -128,8 +128,8 @@ class LocalizerConstants(BaseModel):
 _YOUNGER = {
     "fusion": ("fusion", "camera", "evidence"),
     "places": ("places", "rooms"),
-    "localizer": ("localizer",),
-    "floor_height_m": ("floor_height_m",),
+    **{name: (name,) for name in ("localizer", "floor_height_m")},
+    "text_encoder": ("text_encoder", "text_encoder_sha256"),
 }
 """Settings that older versions did not have, by the setting that activates them."""
 
@@ -167,6 +167,9 @@ class Settings(BaseModel):
     floor_height_m: Annotated[float, Field(ge=0.5, le=1000.0)] = 3.0
     """The height of a storey. An envelope with a height ``map_z`` but no ``floor`` is on the floor
     whose number times this is nearest to ``map_z``."""
+    text_encoder: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    """The file of the text encoder by which words find things; the fold does not use it."""
+    text_encoder_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -222,9 +225,8 @@ class Settings(BaseModel):
         before, here = base.by_name(), self.by_name()
         names = [*here, *(name for name in before if name not in here)]
         changed = {name: here.get(name) for name in names if here.get(name) != before.get(name)}
-        if _HFOV in changed and here[_HFOV_ERROR] is not None:
-            changed[_HFOV_ERROR] = here[_HFOV_ERROR]  # which a new value takes away
-        return changed
+        taken = [of for name, of in _OF_A_VALUE.items() if name in changed and here[of] is not None]
+        return changed | {of: here[of] for of in taken}  # which a new value takes away
 
     def with_assignments(self, assignments: Iterable[str], option: str = "--set") -> "Settings":
         """These settings changed by ``name=value`` texts, as ``option`` takes them. ``preset=NAME``
@@ -255,14 +257,13 @@ class Settings(BaseModel):
         if not isinstance(document, dict):
             raise SettingsError('no JSON object; write one such as {"eps_m": 1.0}')
         try:
-            settings = cls.model_validate(document)
+            return cls.model_validate(document)
         except ValidationError as error:
             first = error.errors()[0]
             name = _dotted(first)
             if first["type"] == "extra_forbidden":
                 raise SettingsError(_no_setting(name)) from None
             raise SettingsError(f"{name} is {_shown(first['input'])}: {_rule(first)}") from None
-        return settings
 
 
 MAX_SETTINGS_BYTES: Final = 64 * 1024
@@ -286,8 +287,7 @@ def _rule(error: ErrorDetails) -> str:
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
+    return text if len(text := repr(value)) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."
 
 
 def _plain(text: str) -> str:
@@ -341,7 +341,8 @@ def _tree(settings: Settings) -> dict[str, Any]:
     return {n: v.model_dump() if isinstance(v, BaseModel) else v for n, v in settings}
 
 
-_HFOV, _HFOV_ERROR = "camera.hfov_deg", "camera.hfov_error_deg"
+_OF_A_VALUE = {"camera.hfov_deg": "camera.hfov_error_deg", "text_encoder": "text_encoder_sha256"}
+"""Settings that are of the value of another, and go with it."""
 _SIZES = "evidence.sizes_m."
 _EXAMPLES = {
     "camera": "camera.hfov_deg=90",
@@ -395,5 +396,5 @@ def _assign(values: dict[str, Any], name: str, value: str) -> None:
     if isinstance(inner[key], dict):
         raise SettingsError(f"it has several values; give one of them, such as {_EXAMPLES[name]}")
     inner[key] = given
-    if name == _HFOV:
-        inner["hfov_error_deg"] = None  # it was that of the value before
+    if name in _OF_A_VALUE:
+        inner[_OF_A_VALUE[name].rpartition(".")[2]] = None

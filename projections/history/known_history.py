@@ -115,13 +115,14 @@ class KnownHistory:
     def at(self, end: Offset | None = None) -> MapView:
         """The map after the first ``end`` events, all of them for None; the caller may change it.
 
-        Its observations carry no embeddings, only their checksums. The first call folds the
-        history, unless one was kept; from then on it is a look-up.
+        Its observations carry no embeddings, only their checksums; where words are compared with
+        them it has `vectors`. The first call folds the history, unless one was kept; from then on
+        it is a look-up.
         """
         wanted = self._checked(end)
         if self._recorder.end < wanted:
             self.covering(wanted)  # folds the whole log, not only up to ``wanted``
-        return self._recorder.at(wanted)
+        return self._recorder.at(wanted, embeddings=self.settings.text_encoder is not None)
 
     def deltas(
         self, start: Offset = FIRST_OFFSET, end: Offset | None = None

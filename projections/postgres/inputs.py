@@ -27,7 +27,10 @@ SettingsOf: TypeAlias = Callable[[Corrections], Settings]
 """The settings that a map is made with under a log's corrections, which may name some."""
 _PAGE_FUSION: Final = {
     name: Settings.model_fields[name].default
-    for name in ("fusion", "camera", "evidence", "localizer")
+    for name in (
+        *("fusion", "camera", "evidence", "localizer"),
+        *("text_encoder", "text_encoder_sha256"),
+    )
 }
 """The settings that change Objects alone, or nothing in the map, with their defaults."""
 

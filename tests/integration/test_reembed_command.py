@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from eventsrc.adapters.detector.onnx_model import weight_files
 from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.envelope.crops import (
     MAX_CROP_BYTES,
@@ -26,7 +27,7 @@ from eventsrc.envelope.model import DetId
 from eventsrc.log import LogReader, VerbatimEvent
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.library import MessageTypes
-from projections.surfaces.cli.reembed import OnnxCropEncoder, weight_files
+from projections.surfaces.cli.reembed import OnnxCropEncoder
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.fixtures_zenoh import Program

@@ -66,15 +66,20 @@ class Graph:
         names: Mapping[str, str] | None = None,
         kind: int = TensorProto.FLOAT,
         metadata: Mapping[str, str] | None = None,
+        answers: int | None = None,
     ) -> Path:
-        """Write the model; ``names`` renames values to outputs."""
+        """Write the model; ``names`` renames values to outputs. ``kind`` is the type of the inputs,
+        and of the outputs unless ``answers`` is."""
         for output, value in (names or {}).items():
             self.nodes.append(helper.make_node("Identity", [value], [output]))
         graph = helper.make_graph(
             self.nodes,
             "tiny",
             [helper.make_tensor_value_info(n, kind, list(s)) for n, s in inputs.items()],
-            [helper.make_tensor_value_info(n, kind, list(s)) for n, s in outputs.items()],
+            [
+                helper.make_tensor_value_info(n, answers or kind, list(s))
+                for n, s in outputs.items()
+            ],
             self.constants,
         )
         model = helper.make_model(
@@ -200,6 +205,43 @@ def mean_colour_encoder(path: Path, size: int = 32, batch: int | str = "n") -> P
         "std": [0.5, 0.5, 0.5],
     }
     path.with_suffix(".json").write_text(json.dumps(preparation))
+    return path
+
+
+def text_tower(path: Path, vectors: Mapping[str, Vector], model: str, **said: Any) -> Path:
+    """A text tower that gives each word its vector, as CLIP's do: the mean over the tokens that are
+    none that fill up, made a unit vector. Writes the JSON and the tokenizer too."""
+    from tokenizers import Tokenizer
+    from tokenizers.models import WordLevel
+    from tokenizers.pre_tokenizers import Whitespace
+
+    vocabulary = {"[PAD]": 0, "[UNK]": 1, **{word: n for n, word in enumerate(vectors, 2)}}
+    tokenizer = Tokenizer(WordLevel(vocabulary, unk_token="[UNK]"))
+    tokenizer.pre_tokenizer = Whitespace()
+    tokenizer.save(str(path.with_name("tokenizer.json")))
+    dimension = len(next(iter(vectors.values())))
+    unknown = [np.zeros(dimension), np.full(dimension, 1e-3)]
+    table = np.vstack([*unknown, *vectors.values()]).astype(np.float32)
+    g = Graph()
+    rows = g.add("Gather", g.constant(table), "input_ids")
+    used = g.add("Cast", "attention_mask", to=TensorProto.FLOAT)
+    mean = g.add(
+        "ReduceMean",
+        g.add("Mul", rows, g.add("Unsqueeze", used, g.constant([2], int))),
+        axes=[1],
+        keepdims=0,
+    )
+    answer = g.add("LpNormalization", mean, axis=1)
+    shape = (1, "tokens")
+    g.save(
+        path,
+        {"input_ids": shape, "attention_mask": shape},
+        {"text_embeds": (1, dimension)},
+        {"text_embeds": answer},
+        kind=TensorProto.INT64,
+        answers=TensorProto.FLOAT,
+    )
+    path.with_suffix(".json").write_text(json.dumps({"model": model, "context": 8, **said}))
     return path
 
 

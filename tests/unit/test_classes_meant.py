@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.ask.find import ClassMatch, classes_meant
+from projections.ask.words import ClassMatch, classes_meant
 
 CLASSES = (
     *("chair", "Office Chair", "coffee table", "dining table", "knife", "person", "bus", "battery"),

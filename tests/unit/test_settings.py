@@ -160,7 +160,7 @@ def test_dotted_names_change_one_value_of_a_group() -> None:
             "rooms.drive_m=4.0: should be at most 20 times cell_m, which is 0.01",
         ),
         ("eps_m.x=1", "no setting 'eps_m.x'; there are embedding_dim, embedding_model, eps_m"),
-        ("where=1", "min_samples, places, camera.NAME, evidence.NAME, localizer.NAME, rooms.NAME"),
+        ("where=1", "text_encoder_sha256, camera.NAME, evidence.NAME, localizer.NAME, rooms.NAME"),
         ("eps_m.neighbourhood=x", "no setting 'eps_m.neighbourhood'"),
     ],
 )

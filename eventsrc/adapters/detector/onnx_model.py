@@ -1,17 +1,22 @@
 """Run ONNX models by onnxruntime. Only this module imports it, when the first model is opened.
 
+A JSON file beside a model, of the same name, describes its input (`read_description`).
 docs/decisions/dependencies.md says why onnxruntime.
 """
 
+import hashlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from eventsrc.base.text import command_line
+from eventsrc.base.user_files import FileFault, open_file, read_file
+from eventsrc.envelope.model import Text
 
 Device: TypeAlias = Literal["cpu", "cuda"]
 Array: TypeAlias = NDArray[np.floating[Any]]
@@ -43,20 +48,75 @@ def shape_text(shape: tuple[int | None, ...]) -> str:
     return " × ".join("?" if size is None else f"{size}" for size in shape) or "a number"
 
 
-class OnnxModel:
-    """A model that takes pictures, (n, 3, height, width), as its only input.
+class Description(BaseModel):
+    """What the JSON file beside a model says: ``model`` names the space of its vectors."""
 
-    Raises MisuseError if the file is missing or onnxruntime cannot do what is asked, ModelError
-    if the file is no such model.
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    EXAMPLE: ClassVar[str]
+    model: Text
+
+
+Described = TypeVar("Described", bound=Description)
+_MAX_DESCRIPTION_BYTES: Final = 64 * 1024
+
+
+def read_description(model: Path, kind: type[Described]) -> Described:
+    """The description of a model. Raises MisuseError."""
+    path = model.with_suffix(".json")
+    try:
+        text = read_file(path, _MAX_DESCRIPTION_BYTES)
+    except FileFault as fault:
+        raise MisuseError(
+            f"{path}: {fault}; this file describes the input of {model.name}, such as"
+            f" {kind.EXAMPLE}; see docs/detector.md"
+        ) from None
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise MisuseError(f"{path}: {place}: {first['msg']}; see docs/detector.md") from None
+
+
+def model_sha256(path: Path, description: Description, *more: bytes) -> str:
+    """SHA-256 of a model with its description, its files of weights and more, in hex."""
+    model = path.read_bytes()
+    parts = (model, description.model_dump_json().encode(), *more)
+    digest = hashlib.sha256(b"\0".join(parts))
+    for name in weight_files(model):
+        with open_file(path.parent / name) as weights:
+            digest.update(hashlib.file_digest(weights, "sha256").digest())
+    return digest.hexdigest()
+
+
+def weight_files(model: bytes) -> list[str]:
+    """The files beside an ONNX model that hold its weights, as newer exporters write them.
+
+    Found as the values of the keys ``location`` of the model's external data (onnx.proto,
+    ``StringStringEntryProto``).
     """
+    names = set()
+    for found in _LOCATION.finditer(model):
+        length = found[1][0]  # below 128, the whole of protobuf's variable-length integer
+        names.add(model[found.end() : found.end() + length].decode("utf-8", "surrogateescape"))
+    return sorted(names)
+
+
+_LOCATION: Final = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])")
+
+
+class OnnxFile:
+    """A model. Raises MisuseError if the file is missing or onnxruntime, which ``extra`` installs,
+    cannot do what is asked, ModelError if the file is no model."""
+
+    extra: ClassVar[str] = "words"
 
     def __init__(self, path: Path, device: Device = "cpu", threads: int | None = None) -> None:
         self.path = path
         if not path.is_file():
-            raise MisuseError(
-                f"{path}: no such model; see `{command_line('detect')}` without models"
-            )
-        ort, self._faults = _onnxruntime()
+            raise MisuseError(f"{path}: no such model; see docs/detector.md")
+        ort, self._faults = _onnxruntime(self.extra)
         options = ort.SessionOptions()
         options.log_severity_level = 4  # faults come as exceptions
         if threads is not None:
@@ -71,26 +131,14 @@ class OnnxModel:
                 "--device cuda: onnxruntime could not start CUDA, whose libraries may be missing"
                 " or of another version; use --device cpu"
             )
+        self.inputs = tuple(_tensor(each) for each in self._session.get_inputs())
         self.outputs = tuple(_tensor(each) for each in self._session.get_outputs())
-        self.input = self._only_input()
-        self._dtype = _TYPES[self.input.type]
 
     @property
     def metadata(self) -> Mapping[str, str]:
         """The metadata that the exporter wrote into the file."""
         found: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
         return found
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Width and height of the input in pixels; None if they are not fixed."""
-        _, _, height, width = self.input.shape
-        return None if width is None or height is None else (width, height)
-
-    @property
-    def batch(self) -> int | None:
-        """The number of pictures that it takes at once; None if that is not fixed."""
-        return self.input.shape[0]
 
     def output(self, *names: str) -> str:
         """The first of ``names`` that is an output, else the name of the only output. Raises
@@ -106,26 +154,51 @@ class OnnxModel:
             )
         return there[0]
 
-    def run(self, pictures: NDArray[np.float32], output: str) -> Array:
-        """The output for ``pictures``, shape (n, 3, height, width). Raises ModelError."""
-        given = {self.input.name: pictures.astype(self._dtype, copy=False)}
+    def answer(self, given: Mapping[str, NDArray[Any]], output: str) -> Array:
+        """The output for some inputs. Raises ModelError."""
         try:
-            (answer,) = self._session.run([output], given)
+            (answer,) = self._session.run([output], dict(given))
         except self._faults as fault:
             raise ModelError(f"{self.path}: {_reason(fault)}") from None
         if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
             raise ModelError(f"{self.path}: output {output} is no array of floating point numbers")
         return answer
 
+
+class OnnxModel(OnnxFile):
+    """A model that takes pictures, (n, 3, height, width), as its only input. Raises as `OnnxFile`
+    does, and ModelError for another input."""
+
+    extra = "detector"
+
+    def __init__(self, path: Path, device: Device = "cpu", threads: int | None = None) -> None:
+        super().__init__(path, device, threads)
+        self.input = self._only_input()
+        self._dtype = _TYPES[self.input.type]
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the input in pixels; None if they are not fixed."""
+        _, _, height, width = self.input.shape
+        return None if width is None or height is None else (width, height)
+
+    @property
+    def batch(self) -> int | None:
+        """The number of pictures that it takes at once; None if that is not fixed."""
+        return self.input.shape[0]
+
+    def run(self, pictures: NDArray[np.float32], output: str) -> Array:
+        """The output for ``pictures``, shape (n, 3, height, width). Raises ModelError."""
+        return self.answer({self.input.name: pictures.astype(self._dtype, copy=False)}, output)
+
     def _only_input(self) -> Tensor:
-        inputs = tuple(_tensor(each) for each in self._session.get_inputs())
-        if len(inputs) != 1:
-            names = ", ".join(each.name for each in inputs) or "none"
+        if len(self.inputs) != 1:
+            names = ", ".join(each.name for each in self.inputs) or "none"
             raise ModelError(
                 f"{self.path}: it has the inputs {names}; one that takes pictures is needed"
                 " (of CLIP, export the image tower alone)"
             )
-        found = inputs[0]
+        found = self.inputs[0]
         if len(found.shape) != 4 or found.shape[1] not in (3, None) or found.type not in _TYPES:
             raise ModelError(
                 f"{self.path}: its input {found.name} is {found.type} of {found.text}; "
@@ -139,7 +212,7 @@ def _tensor(described: Any) -> Tensor:
     return Tensor(described.name, described.type, shape)
 
 
-def _onnxruntime() -> tuple[Any, tuple[type[Exception], ...]]:
+def _onnxruntime(extra: str) -> tuple[Any, tuple[type[Exception], ...]]:
     """The module, and the exceptions that it raises. MisuseError if it is not installed."""
     try:
         import onnxruntime
@@ -148,8 +221,8 @@ def _onnxruntime() -> tuple[Any, tuple[type[Exception], ...]]:
         if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from None  # in the import, where pybind11 hides it
         raise MisuseError(
-            "ONNX models need onnxruntime; install mapfold with the extra detector: "
-            "pip install 'mapfold[detector]'"
+            f"ONNX models need onnxruntime; install mapfold with the extra {extra}: "
+            f"pip install 'mapfold[{extra}]'"
         ) from None
     kinds = [kind for kind in vars(state).values() if isinstance(kind, type)]
     faults = tuple(kind for kind in kinds if issubclass(kind, Exception))

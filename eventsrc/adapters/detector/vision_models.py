@@ -15,15 +15,15 @@ from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
-from eventsrc.base.user_files import FileFault, read_file, read_label_file
+from eventsrc.base.user_files import read_label_file
 from eventsrc.envelope.model import MAX_DIMENSION, Text
 
 from .heads import HEADS, Boxes, HeadError, suppress
-from .onnx_model import ModelError, OnnxModel
+from .onnx_model import Description, ModelError, OnnxModel, read_description
 from .picture import Pixels
 from .vision import Canvas, Fit, Scaling, fitted, planes
 
@@ -189,17 +189,16 @@ _Channel = Annotated[float, Field(ge=-10.0, le=10.0)]
 _Spread = Annotated[float, Field(ge=1e-3, le=1000.0)]
 
 
-class Preparation(BaseModel):
-    """The content of the JSON file beside a model.
+class Preparation(Description):
+    """The content of the JSON file beside an encoder.
 
     ``size`` is width and height or the side of a square. From values of 0 to 1 ``mean`` is
     subtracted, and the result divided by ``std``, for red, green and blue. ``resize`` uses the
     middle of a crop (``crop``), all of it stretched, or all of it with black around (``pad``).
     """
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+    EXAMPLE = '{"model": "NAME", "size": 224, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5, 0.5]}'
 
-    model: Text
     size: _Side | Annotated[list[_Side], Field(min_length=2, max_length=2)]
     mean: Annotated[list[_Channel], Field(min_length=3, max_length=3)]
     std: Annotated[list[_Spread], Field(min_length=3, max_length=3)]
@@ -216,26 +215,9 @@ class Preparation(BaseModel):
         return self.size[0], self.size[1]
 
 
-_MAX_PREPARATION_BYTES: Final = 64 * 1024
-
-
 def read_preparation(model: Path) -> Preparation:
     """The preparation of a model. Raises MisuseError."""
-    path = model.with_suffix(".json")
-    try:
-        text = read_file(path, _MAX_PREPARATION_BYTES)
-    except FileFault as fault:
-        raise MisuseError(
-            f"{path}: {fault}; this file describes the input of {model.name},"
-            ' such as {"model": "NAME", "size": 224, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5,'
-            " 0.5]}; see docs/detector.md"
-        ) from None
-    try:
-        return Preparation.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise MisuseError(f"{path}: {place}: {first['msg']}; see docs/detector.md") from None
+    return read_description(model, Preparation)
 
 
 class Encoder:

@@ -9,19 +9,30 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 from psycopg import sql
 
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import KeyframeId, Offset, RunId, StatedCamera
+from projections.ask.words import ObjectVectors
 from projections.fold import deltas
-from projections.fold.exact import UM_PER_M, metres_to_um
+from projections.fold.exact import UM_PER_M, UNIT, metres_to_um
 from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.map import records
 from projections.map.view import MapView
 from projections.postgres import checkpoints, map_table
-from projections.postgres.connection import Connection, describe_connection, statements, tables
+from projections.postgres.connection import (
+    Connection,
+    Targets,
+    connect,
+    describe_connection,
+    statements,
+    tables,
+)
+from projections.postgres.labels import number_of
 
+from .candidate_search import prepare_graph
 from .graph_reads import map_errors
 
 _UM2_PER_M2 = 1e12
@@ -70,6 +81,43 @@ def read_view(connection: Connection) -> LiveView:
             f" mapfold made it; run `{advised('replay')}`, which makes it again"
         ) from None
     return view
+
+
+def live_view(targets: Targets) -> LiveView:
+    """The map of databases, over a connection of its own."""
+    with _connection(targets.graph_url) as graph:
+        prepare_graph(graph)
+        return read_view(graph)
+
+
+def live_vectors(targets: Targets) -> ObjectVectors:
+    """`read_object_vectors`, over connections of its own."""
+    with _connection(targets.graph_url) as graph, _connection(targets.vector_url) as vectors:
+        prepare_graph(graph)
+        return read_object_vectors(graph, vectors)
+
+
+def _connection(url: str) -> Connection:
+    return connect(url, application="mapfold find", autocommit=True)
+
+
+def read_object_vectors(graph: Connection, vectors: Connection) -> ObjectVectors:
+    """The mean vectors of the Objects of a map; with one database both are one connection."""
+    with map_errors(graph.info.dsn):
+        ids, names, seen, things = graph.execute(
+            statements("objects")["object_observations"].format(**tables()), binary=True
+        ).fetchall()[0]
+    with map_errors(vectors.info.dsn), vectors.transaction():
+        vectors.execute("SET LOCAL enable_hashjoin = on")
+        rows = vectors.execute(
+            statements("vectors")["mean_vectors"],
+            {"det_pks": [number_of(each) for each in seen], "things": things},
+            binary=True,
+        ).fetchall()
+    called = dict(zip(ids, names, strict=True))
+    means = np.array([mean for _, mean, _ in rows], np.float64).reshape(len(rows), -1)
+    model = rows[0][2] if rows else None
+    return ObjectVectors(tuple(called[thing] for thing, _, _ in rows), means * UNIT, model)
 
 
 def _fill(view: LiveView, rows: dict[str, list[Any]]) -> None:

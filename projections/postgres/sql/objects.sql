@@ -35,6 +35,15 @@ FROM {observes} AS seen
 JOIN {has_observation} AS made ON made.end_id = seen.start_id
 ORDER BY seen.start_id
 
+-- name: object_observations
+-- In one row: the ids of all Objects and their names, and the observations of Objects and whose they are.
+SELECT ARRAY(SELECT id FROM {object} ORDER BY id)::text::bigint[],
+       ARRAY(SELECT ag_catalog.agtype_access_operator(
+                 VARIADIC ARRAY[properties, '"object_id"'::ag_catalog.agtype])::text
+             FROM {object} ORDER BY id),
+       ARRAY(SELECT start_id FROM {observes} ORDER BY start_id)::text::bigint[],
+       ARRAY(SELECT end_id FROM {observes} ORDER BY start_id)::text::bigint[]
+
 -- name: near_places
 SELECT properties FROM {place}
 WHERE ag_catalog.agtype_access_operator(VARIADIC ARRAY[properties, '"centroid_x"'::ag_catalog.agtype])::float8

@@ -110,3 +110,10 @@ SELECT EXISTS (
     JOIN pg_am a ON a.oid = c.relam
     WHERE i.indrelid = to_regclass('public.detection_embeddings') AND a.amname = 'hnsw'
 )
+
+-- name: mean_vectors
+-- The mean vector of the observations of each thing, and their space.
+SELECT given.thing, avg(seen.embedding)::real[], min(seen.embedding_model)
+FROM unnest(%(det_pks)s::bigint[], %(things)s::bigint[]) AS given (det_pk, thing)
+JOIN public.detection_embeddings AS seen USING (det_pk)
+GROUP BY given.thing ORDER BY given.thing

@@ -20,6 +20,7 @@ from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory,
 from projections.edit.current import MapToEdit
 from projections.edit.effect import edits_document, edits_text, effects_of
 from projections.edit.make import Stamp
+from projections.surfaces.text_encoders import with_text_encoder
 
 from .edit_command import EditOptions, NewCommand
 from .folded_log import AssignedSettings, LogArgument, LogSettings, settings_from
@@ -272,9 +273,8 @@ def _use_settings(
         raise MisuseError("give FILE, --preset NAME or --set NAME=VALUE")
 
     def command(current: MapToEdit, stamp: Stamp) -> Command:
-        return make.use_settings(
-            current, stamp, settings_from(file, chosen.assignments, current.corrections)
-        )
+        settings = settings_from(file, chosen.assignments, current.corrections)
+        return make.use_settings(current, stamp, with_text_encoder(settings, current))
 
     options.record(command)
 

@@ -11,16 +11,15 @@ import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised, counted, shorten_by, table, visible
-from eventsrc.base.user_files import written_whole
-from eventsrc.log import LogReader
-from eventsrc.record.kept_crops import KeptCrops
-from projections.ask.best_views import best_view
+from projections.ask.best_views import write_best
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
+from projections.ask.words import ObjectVectors, Words
 from projections.map.naming import ShortIds, things_of
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
+from projections.surfaces.text_encoders import words_of
 
 from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
 from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument
@@ -72,30 +71,30 @@ class AskedMap(FoldSettings):
             raise MisuseError(f"--db asks the databases, not the log {self.log}; give one of them")
         return [None if self.log is None else str(self.log), *given[:-1]]
 
-    def view(self) -> MapView:
-        """The map that is asked; texts printed from here on have its short ids."""
-        view = self._view()
+    def view(self, text_encoder: Path | None = None) -> MapView:
+        """The map that is asked, with another text encoder than its own where one is given; texts
+        printed from here on have its short ids."""
+        view = self._view(embeddings=text_encoder is not None)
+        if text_encoder is not None:
+            named = {"text_encoder": str(text_encoder), "text_encoder_sha256": None}
+            view.settings = view.settings.model_copy(update=named)
         shorten_by(ShortIds.of(things_of(view)).text)
         return view
 
     def write_crops(self, view: MapView, found: FoundObjects, folder: Path) -> dict[str, str]:
         """Write the best crop of each answer that has one; the files by Object."""
-        files: dict[str, str] = {}
-        records = {each.object_id: each for each in view.objects.values()}
-        with LogReader(self.log or Path()) as reader:
-            kept = KeptCrops(reader)
-            for each in found.answers:
-                best = best_view(view, records[each.object_id], kept)
-                if best is not None:
-                    files[each.object_id] = str(folder / f"{each.object_id}.jpg")
-                    with written_whole(Path(files[each.object_id])) as file:
-                        file.write(best.jpeg)
+        best = [each.object_id for each in found.answers]
+        files = write_best(view, best, self.log or Path(), folder)
         if len(files) < len(found.answers):
             count = counted(len(found.answers) - len(files), "answer")
             say(f"{self.log} keeps no crop of {count}; an import with --keep-crops keeps them")
         return files
 
-    def _view(self) -> MapView:
+    def compared(self, view: MapView) -> Words | None:
+        """What compares words with the embeddings of the map; None where nothing does."""
+        return words_of(view) if self.db is None else words_of(view, lambda _: self._vectors())
+
+    def _view(self, *, embeddings: bool) -> MapView:
         if self.db is None:
             source = CachedLog(
                 preset=self.preset,
@@ -105,24 +104,28 @@ class AskedMap(FoldSettings):
                 log=self.log or Path(),
             )
             with source.opened(self.at, self.known_at) as (reader, end, _, corrections, settings):
-                cache = not self.no_cache
                 return map_after(
-                    reader, settings, end, corrections=corrections, note=say, cache=cache
+                    *(reader, settings, end),
+                    corrections=corrections,
+                    note=say,
+                    cache=not self.no_cache,
+                    embeddings=embeddings or settings.text_encoder is not None,
                 )
         self.of_past_map(None)  # refuses settings
         if self.at != "end" or self.known_at is not None:
             raise MisuseError("--at and --known-at ask a past map, which only the log knows")
         # Imported here: the drivers take as long to import as a small map to fold.
-        from projections.postgres.connection import connect
-        from projections.postgres.queries.candidate_search import prepare_graph
-        from projections.postgres.queries.live_view import read_view
+        from projections.postgres.queries.live_view import live_view
 
-        with (
-            Databases(db=self.db or None).opened() as targets,
-            connect(targets.graph_url, application="mapfold find", autocommit=True) as connection,
-        ):
-            prepare_graph(connection)
-            return read_view(connection)
+        with Databases(db=self.db or None).opened() as targets:
+            return live_view(targets)
+
+    def _vectors(self) -> ObjectVectors:
+        """The mean vectors of the Objects in the databases."""
+        from projections.postgres.queries.live_view import live_vectors
+
+        with Databases(db=self.db or None).opened() as targets:
+            return live_vectors(targets)
 
 
 def find_things(
@@ -132,7 +135,8 @@ def find_things(
         str | None,
         typer.Argument(
             metavar="WHAT",
-            help="A class, such as chair or chairs, or an object's id [default: everything].",
+            help="A class, such as chair or chairs, what it looks like, such as red mug, by a text"
+            " encoder, or an object's id [default: everything].",
         ),
     ] = None,
     in_: Annotated[
@@ -170,10 +174,16 @@ def find_things(
     ] = None,
     top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Most answers.")] = 10,
     every: Annotated[bool, typer.Option("--all", help="Also what was seen once.")] = False,
+    text_encoder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL.onnx",
+            help="Compare WHAT with embeddings by this text tower instead of the log's own.",
+        ),
+    ] = None,
     crops: Annotated[
         Path | None,
         typer.Option(
-            "--crops",
             metavar="FOLDER",
             help="Write the best crop that the log keeps of each answer there, and name its file.",
         ),
@@ -201,8 +211,8 @@ def find_things(
         top=top,
         every=every,
     )
-    view = asked.view()
-    found = find(view, wanted)
+    view = asked.view(text_encoder)
+    found = find(view, wanted, asked.compared(view))
     files = {} if crops is None else asked.write_crops(view, found, crops)
     if goal is not None:
         if not found.answers:
@@ -329,11 +339,9 @@ def _path_text(found: DrivenPath) -> str:
 
 def _table(found: FoundObjects, files: Mapping[str, str]) -> str:
     header = ["object", "class", "place", "position (m)", "seen", "last seen"]
-    away, way = (
-        any(getattr(each, name) is not None for each in found.answers)
-        for name in ("distance_m", "way_m")
-    )
-    header[4:4] = [*(["away (m)"] if away else []), *(["way (m)"] if way else [])]
+    measures = {"away (m)": "distance_m", "way (m)": "way_m", "score": "score"}
+    rated = {n for n in measures.values() if any(getattr(e, n) is not None for e in found.answers)}
+    header[4:4] = [title for title, name in measures.items() if name in rated]
     rows = []
     for each in found.answers:
         row = [
@@ -344,11 +352,11 @@ def _table(found: FoundObjects, files: Mapping[str, str]) -> str:
             f"{each.obs_count:,}×",
             _last(each),
         ]
-        measured = [each.distance_m] * away + [each.way_m] * way
-        row[4:4] = ["none" if metres is None else f"{metres:.2f}" for metres in measured]
+        measured = (getattr(each, name) for name in measures.values() if name in rated)
+        row[4:4] = ["none" if value is None else f"{value:.2f}" for value in measured]
         rows.append([*row, visible(files.get(each.object_id, "none"))] if files else row)
     header += ["crop"] if files else []
-    return table(header, rows, right=("seen", "away (m)", "way (m)"))
+    return table(header, rows, right=("seen", *measures))
 
 
 def _place(each: FoundObject) -> str:
@@ -380,6 +388,8 @@ def _last(each: FoundObject) -> str:
 
 def _remarks(wanted: Wanted, found: FoundObjects) -> list[str]:
     remarks = []
+    if found.remark is not None:
+        remarks.append(found.remark)
     if wanted.what is not None and found.match in ("words", "spelling"):
         classes = ", ".join(map(visible, found.classes))
         remarks.append(f"no class {wanted.what!r}; found {classes}")

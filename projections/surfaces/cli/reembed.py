@@ -1,7 +1,5 @@
 """`mapfold reembed`: add vectors of another encoder to a log, made from its crops of detections."""
 
-import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,13 +8,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from eventsrc.adapters.detector.onnx_model import Device, OnnxModel
+from eventsrc.adapters.detector.onnx_model import Device, OnnxModel, model_sha256
 from eventsrc.adapters.detector.picture import PictureError, Pixels
 from eventsrc.adapters.detector.vision import check_installed, decode
 from eventsrc.adapters.detector.vision_models import Encoder, read_preparation
 from eventsrc.adapters.reembedding import DEFAULT_BATCH, Reembedding, Vector, reembed
 from eventsrc.base.text import advised, counted, visible
-from eventsrc.base.user_files import open_file
 from eventsrc.envelope.crops import CROPS_TOPIC
 from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
@@ -35,12 +32,7 @@ class OnnxCropEncoder:
         check_installed()
         self._encoder = Encoder(OnnxModel(path, device, threads), preparation)
         self.space, self.dimension = self._encoder.name, self._encoder.dimension
-        model = path.read_bytes()
-        digest = hashlib.sha256(model + b"\0" + preparation.model_dump_json().encode())
-        for name in weight_files(model):
-            with open_file(path.parent / name) as weights:
-                digest.update(hashlib.file_digest(weights, "sha256").digest())
-        self.sha256 = digest.hexdigest()
+        self.sha256 = model_sha256(path, preparation)
 
     def encode(self, jpegs: Sequence[bytes]) -> list[Vector | str]:
         """A vector for each JPEG, of NaN where the model has none; or why it cannot be decoded."""
@@ -52,22 +44,6 @@ class OnnxCropEncoder:
             crop if isinstance(crop, str) else none if (vector := next(vectors)) is None else vector
             for crop in decoded
         ]
-
-
-def weight_files(model: bytes) -> list[str]:
-    """The files beside an ONNX model that hold its weights, as newer exporters write them.
-
-    Found as the values of the keys ``location`` of the model's external data (onnx.proto,
-    ``StringStringEntryProto``).
-    """
-    names = set()
-    for found in _LOCATION.finditer(model):
-        length = found[1][0]  # below 128, the whole of protobuf's variable-length integer
-        names.add(model[found.end() : found.end() + length].decode("utf-8", "surrogateescape"))
-    return sorted(names)
-
-
-_LOCATION = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])")
 
 
 def _decoded(jpeg: bytes) -> Pixels | str:

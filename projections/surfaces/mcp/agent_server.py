@@ -146,7 +146,8 @@ class _Tools:
     def find(
         self,
         what: Annotated[
-            _Text | None, Field(description="A class, such as chairs, or an object's id.")
+            _Text | None,
+            Field(description="A class, such as chairs, what it looks like, or an object's id."),
         ] = None,
         room: Annotated[_Text | None, Field(description="The place that it is in.")] = None,
         near: Annotated[_Thing | None, Field(description="Nearest to this first.")] = None,
@@ -175,7 +176,7 @@ class _Tools:
             every=every,
         )
         cited = self._maps.map(at, known_at)
-        return _answer(cited, find(cited.view, wanted).document())
+        return _answer(cited, find(cited.view, wanted, self._maps.words(cited)).document())
 
     def room(self, name: _Text, at: _At = "end", known_at: _KnownAt = None) -> dict[str, Any]:
         """What a place is, what is in it, its neighbours, and when robots were there. It is named
@@ -227,7 +228,7 @@ class _Tools:
     ) -> dict[str, Any]:
         """The pose to which a robot can drive and from which it sees a thing."""
         cited = self._maps.map(at, known_at)
-        found = find(cited.view, Wanted(what=thing, top=1))
+        found = find(cited.view, Wanted(what=thing, top=1), self._maps.words(cited))
         if not found.answers:
             raise MisuseError(f"{thing!r} was seen once only, so there is no goal; ask by its id")
         best = found.answers[0]

@@ -15,6 +15,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
+from projections.ask.words import Words
 from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.edit.record import MakeCommand, OpenSession, record_command, recorded_document
@@ -25,6 +26,7 @@ from projections.map.digest import map_digest
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 from projections.surfaces.serve import Pools
+from projections.surfaces.text_encoders import words_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +86,10 @@ class LogMaps:
         """The map at a moment, not to be changed; the log's end is that of now. Raises MisuseError,
         as all questions do."""
         return self._at(*self._moment(at, known_at))
+
+    def words(self, cited: CitedMap) -> Words | None:
+        """What compares words with the embeddings of a map; None where nothing does."""
+        return words_of(cited.view)
 
     def candidates(
         self, crops: Sequence[QuestionCrop], at: str, known_at: str | None
@@ -168,6 +174,10 @@ class LiveMaps:
         self._refuse_past(at, known_at)
         view = self._pools.view()
         return CitedMap(view, MapName(view.log_id, view.next_offset, None, None))
+
+    def words(self, cited: CitedMap) -> Words | None:
+        """What compares words with the embeddings of the map; None where nothing does."""
+        return words_of(cited.view, lambda _: self._pools.object_vectors())
 
     def candidates(
         self, crops: Sequence[QuestionCrop], at: str, known_at: str | None

@@ -41,6 +41,7 @@ from projections.map.naming import thing_called, things_of
 from projections.map.own_events import read_corrections
 from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
+from projections.surfaces.text_encoders import words_of
 
 from .known_things import KnownObject, KnownPlace, KnownThings
 
@@ -132,7 +133,8 @@ class Map:
         top: int = 10,
         every: bool = False,
     ) -> FoundObjects:
-        """The Objects that are ``what``, such as ``"chairs"`` or an id, None for all, best first.
+        """The Objects that are ``what``, such as ``"chairs"`` or an id, best first; None for all.
+        The text encoder of the settings compares words such as ``"red mug"`` with embeddings.
 
         ``room`` is the Place they are in, ``near`` the point in metres or the thing from which they
         are ordered, ``start`` that from which the way over driven ground counts. Times are ISO 8601
@@ -158,6 +160,7 @@ class Map:
                 top=top,
                 every=every,
             ),
+            words_of(self.view),
         )
 
     def room(self, name: str) -> Room:

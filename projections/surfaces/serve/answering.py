@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple, TypeVar, cast, get_args
 
 from eventsrc.base.errors import LogError, MapfoldError
+from projections.ask.words import ObjectVectors
 from projections.fold.map_errors import (
     DatabaseError,
     DatabaseUnavailable,
@@ -36,7 +37,9 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.question import Movement
 from projections.localize.relocalize.track import Track, movement_of
+from projections.map.view import MapView
 from projections.postgres.queries.live_view import LiveView
+from projections.surfaces.text_encoders import words_of
 
 from .asked import (
     NO_LOG,
@@ -272,8 +275,12 @@ class Answerer:
     def find(self, query: FindQuery) -> dict[str, Any]:
         """The Objects that are asked for, in a past map by the log. Raises NotInMapError."""
         if query.at is None and query.known_at is None:
-            return self.ask(query.question())
+            return self.ask(query.question(lambda view: words_of(view, self._vectors)))
         return self._ask_log(NO_LOG_OF_THE_PAST, lambda log, view: log.find(view, query))
+
+    def _vectors(self, _: MapView) -> ObjectVectors:
+        with self._reporting_errors():
+            return self._pools.object_vectors()
 
     def changes(self, query: ChangesQuery) -> dict[str, Any]:
         """A page of what changed in the building. Raises NotInMapError."""

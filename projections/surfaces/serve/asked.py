@@ -23,6 +23,7 @@ from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find
 from projections.ask.room_and_path import goal_of, path, room
 from projections.ask.what_changed import ChangeKind
+from projections.ask.words import Words
 from projections.fold.deltas import ObjectOrdinal
 from projections.fold.map_errors import LogPointError, ProjectionMismatch, QuestionError
 from projections.fold.settings import Settings
@@ -31,6 +32,7 @@ from projections.localize.relocalize import describe_value
 from projections.map.naming import thing_called, things_of
 from projections.map.view import MapView
 from projections.postgres.queries.live_view import LiveView
+from projections.surfaces.text_encoders import words_of
 
 from .states import CURSOR, MAX_PAGE
 
@@ -87,7 +89,9 @@ class FindQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid", populate_by_name=False)
 
-    what: _Text | None = Field(None, description="A class or an Object's id; all if not given.")
+    what: _Text | None = Field(
+        None, description="A class, words or an Object's id; all if not given."
+    )
     room: _Text | None = Field(None, alias="in", description="The Place it is in.")
     near: _Text | None = Field(None, description="X,Y in metres, an Object or a Place.")
     start: _Text | None = Field(None, alias="from", description="Nearest by way from there.")
@@ -113,8 +117,8 @@ class FindQuery(BaseModel):
             name, said = first["loc"][-1], first["msg"].lower()
             raise QuestionError(f"{name} is {describe_value(first['input'])}; {said}") from None
 
-    def question(self) -> MapQuestion:
-        """What is asked."""
+    def question(self, words: Callable[[MapView], Words | None] = words_of) -> MapQuestion:
+        """What is asked; ``words`` gives what compares words with the embeddings of a map."""
 
         def answer(view: MapView) -> dict[str, Any]:
             first, until = int(self.cursor), int(self.cursor) + self.limit
@@ -130,7 +134,7 @@ class FindQuery(BaseModel):
                 top=until,
                 every=self.every == "true",
             )
-            document = find(view, wanted).document()
+            document = find(view, wanted, words(view)).document()
             more = {"next": str(until)} if document["count"] > until else {}
             return {**document, "answers": document["answers"][first:], **more}
 
@@ -323,6 +327,8 @@ class FoundPageShape(TypedDict):
     count: Annotated[int, Field(ge=0)]
     unconfirmed: Annotated[int, Field(ge=0)]
     answers: list[FoundObject]
+    text_encoder: Annotated[str | None, Field(description="The model that compared the words.")]
+    remark: Annotated[str | None, Field(description="Why none compared them, if that matters.")]
     next: NotRequired[Annotated[str, Field(description="The cursor of the next page.")]]
 
 

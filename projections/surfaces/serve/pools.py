@@ -14,6 +14,7 @@ from typing import Final, Self, TypeVar
 from psycopg_pool import ConnectionPool, PoolTimeout
 
 from eventsrc.base.text import advised
+from projections.ask.words import ObjectVectors
 from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import MapCandidates, QuestionCrop
 from projections.postgres import checkpoints
@@ -27,7 +28,7 @@ from projections.postgres.connection import (
 from projections.postgres.labels import SinkName
 from projections.postgres.queries import candidate_search
 from projections.postgres.queries.candidate_rows import ConstantsMemory
-from projections.postgres.queries.live_view import LiveView, read_view
+from projections.postgres.queries.live_view import LiveView, read_object_vectors, read_view
 
 from .asked import MapMemory
 
@@ -138,6 +139,18 @@ class Pools:
         return self.on_graph(
             lambda graph: self._map.view(checkpoints.load(graph, "graph"), lambda: read_view(graph))
         )
+
+    def object_vectors(self) -> ObjectVectors:
+        """The mean vectors of the map's Objects."""
+
+        def once(wait_s: float) -> ObjectVectors:
+            with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:
+                if self._graph is self._vectors:
+                    return read_object_vectors(vectors, vectors)
+                with self._borrow(self._graph, self._targets.graph_url, wait_s) as graph:
+                    return read_object_vectors(graph, vectors)
+
+        return self._ask(once)
 
     def _candidates(self, crops: Sequence[QuestionCrop], wait_s: float) -> MapCandidates:
         with self._borrow(self._vectors, self._targets.vector_url, wait_s) as vectors:

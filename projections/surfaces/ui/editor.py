@@ -32,6 +32,7 @@ from projections.edit.record import (
 from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
 from projections.history.diff_rendering import difference_text
+from projections.surfaces.text_encoders import with_text_encoder
 
 from .comparisons import MOST_LINES
 from .log_map import Opened, PrefixReader
@@ -99,7 +100,8 @@ def _metres(text: str) -> float:
 def _use_settings(*assignments: str) -> MakeCommand:
     def command(current: Any, stamp: Stamp) -> Any:
         logged: Settings = current.corrections.settings or Settings()
-        return make.use_settings(current, stamp, logged.with_assignments(assignments))
+        settings = with_text_encoder(logged.with_assignments(assignments), current)
+        return make.use_settings(current, stamp, settings)
 
     return command
 

@@ -16,6 +16,7 @@ from projections.history.names import find_keyframe, keyframe_name
 from projections.map.naming import matches
 from projections.map.records import ObservationRecord
 from projections.store.history import History
+from projections.surfaces.text_encoders import words_of
 
 from .log_map import LogMap
 from .requests import AskedPoint, number_of, text_of
@@ -137,12 +138,13 @@ def find_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     if top == 0:
         raise QuestionError("top is 0; give how many answers there may be")
     wanted = Wanted(what=what, room=place, near=near, top=top, every=every)
+    view = asked.known.at(asked.end)
     words = [] if what is None else [what]
     words += [w for name in ("in", "near") if query.get(name) for w in (f"--{name}", query[name])]
     words += ["--top", str(top), *(["--all"] if every else [])]
     return {
         **asked.document(),
-        **find(asked.known.at(asked.end), wanted).document(),
+        **find(view, wanted, words_of(view)).document(),
         "command": asked.command("find", *words),
     }
 
