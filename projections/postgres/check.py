@@ -46,7 +46,6 @@ from .map_table import MapRow, map_of, map_rows
 from .origin import command_for, refuse_mismatch, rows_dropped
 from .sink import Checkpoint
 from .vector_rows import VectorRow, new_rows
-from .vector_sink import refuse_older_vectors
 
 _RELATION_KINDS: Final = {"v": "VIEW", "m": "MATERIALIZED VIEW", "f": "FOREIGN TABLE"}
 
@@ -195,7 +194,7 @@ def _check_sink(
                 )
             if not locked:
                 raise rows_dropped(checkpoint, sink, describe_target(url), log, known.latest)
-            inputs = known.at(checkpoint.known_to)
+            inputs = known.at(checkpoint.known_at)
             refuse_mismatch(checkpoint, sink, describe_target(url), log, reader, inputs)
             fold = LiveFold(inputs.settings, corrections=inputs.corrections, reader=reader)
             folding = _folded(fold, _events(connection, reader, checkpoint, sink))
@@ -209,7 +208,7 @@ def _check_sink(
         comparison.differing,
         tuple(comparison.differences),
         foreign,
-        checkpoint.known_to,
+        checkpoint.known_at,
     )
 
 
@@ -295,7 +294,6 @@ def _compare_vectors(
     expected = (
         _vector_row(row) for _ in folding for row in new_rows(fold.tracker.drain(), fold.view)
     )
-    refuse_older_vectors(connection)
     # Binary, so that a float32 arrives as the float32 it is.
     with connection.cursor(name="check", binary=True) as cursor:
         cursor.itersize = STREAM_ROWS

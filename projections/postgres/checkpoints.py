@@ -5,19 +5,26 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Final
 
-import psycopg
 from psycopg import sql
 
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
-from projections.fold.map_errors import CheckpointMoved, DatabaseError, ProjectionBusy
+from projections.fold.map_errors import (
+    CheckpointMoved,
+    DatabaseError,
+    ProjectionBusy,
+    ProjectionMismatch,
+)
 
 from .connection import Connection, describe_connection, statements
 from .labels import SINKS, SinkName
 from .sink import Checkpoint
 
-_COMMENT_PREFIX: Final = "mapfold"
+_OURS: Final = "mapfold"
+_OF_THIS_VERSION: Final = "mapfold 2:"
+"""The beginning of the schema's comment. Another number is another layout of the tables, the graph
+or the vectors, which nothing but a replay reads."""
 FOLLOWING: Final = "mapfold tail"
 REFOLDING: Final = "mapfold tail, refolding"
 """The names of a tail's sessions."""
@@ -65,36 +72,38 @@ def writer(connection: Connection, sink: SinkName) -> str | None:
 
 
 def has_schema(connection: Connection) -> bool:
-    """Whether the schema ``mapfold`` exists. Raises DatabaseError when it is not ours."""
+    """Whether the schema ``mapfold`` exists. Raises DatabaseError when it is not ours, and
+    ProjectionMismatch when another version of mapfold made it."""
+    made_by = _made_by(connection)
+    if made_by is not None and not made_by.startswith(_OF_THIS_VERSION):
+        raise ProjectionMismatch(
+            f"{describe_connection(connection)}: another version of mapfold made the map there; run"
+            f" `{advised('replay')}`, which makes it again"
+        )
+    return made_by is not None
+
+
+def _made_by(connection: Connection) -> str | None:
     row = connection.execute(statements("checkpoint")["schema_owner"]).fetchone()
-    if row is None:
-        return False
-    if not str(row[0]).startswith(_COMMENT_PREFIX):
+    if row is not None and not str(row[0]).startswith(_OURS):
         raise DatabaseError(
             f"{describe_connection(connection)}: has a schema mapfold that mapfold did not make;"
             " use another database"
         )
-    return True
+    return None if row is None else str(row[0])
 
 
 def ensure_schema(connection: Connection) -> None:
-    """Create the schema ``mapfold`` and its tables, or the columns that an older version lacks."""
+    """Create the schema ``mapfold`` and its tables."""
     if not has_schema(connection):
         connection.execute(statements("checkpoint")["create"])
-    elif connection.execute(statements("checkpoint")["lacks_columns"]).fetchone() is None:
-        _add_columns(connection)
 
 
-def _add_columns(connection: Connection) -> None:
-    try:
-        with connection.transaction():
-            connection.execute(statements("checkpoint")["add_columns"])
-    except psycopg.errors.InsufficientPrivilege:
-        raise DatabaseError(
-            f"{describe_connection(connection)}: mapfold.checkpoint was made by an older version,"
-            " and only its owner may change that; have the owner run"
-            f" `{advised('replay')}`, then start again"
-        ) from None
+def drop_other_version(connection: Connection) -> None:
+    """Drop the schema ``mapfold`` if another version made it."""
+    made_by = _made_by(connection)
+    if made_by is not None and not made_by.startswith(_OF_THIS_VERSION):
+        connection.execute("DROP SCHEMA mapfold CASCADE")
 
 
 def load(connection: Connection, sink: SinkName) -> Checkpoint | None:

@@ -7,7 +7,7 @@ from psycopg import sql
 
 from .connection import Connection, statements
 from .cypher import FIRST_ENFORCING_VERSION
-from .labels import SINKS, Label
+from .labels import SINKS
 
 _PRIVILEGES: Final = {
     "SELECT": sql.SQL("SELECT"),
@@ -28,15 +28,6 @@ FROM pg_class c CROSS JOIN aclexplode(c.relacl) a LEFT JOIN pg_roles r ON r.oid 
 WHERE c.relnamespace = (SELECT oid FROM pg_namespace WHERE nspname = %s)
   AND a.grantee <> c.relowner AND c.relkind = 'r' AND (%s::text IS NULL OR c.relname = %s)
 """
-_TABLES: Final = """
-SELECT relname FROM pg_class
-WHERE relnamespace = (SELECT oid FROM pg_namespace WHERE nspname = %s) AND relkind = 'r'
-"""
-_LIKE: Final[dict[str, tuple[Label, ...]]] = {
-    "Place": ("Floor", "Building"),
-    "ADJACENT_TO": ("PART_OF",),
-}
-"""Labels that graphs of older versions do not have, by the label whose grants they get then."""
 
 
 def copy_privileges(
@@ -49,11 +40,8 @@ def copy_privileges(
     if table is None:
         for role, privilege in connection.execute(_SCHEMA_GRANTS, [old]).fetchall():
             _grant(connection, privilege, sql.SQL("SCHEMA {}").format(sql.Identifier(new)), role)
-    there = {name for (name,) in connection.execute(_TABLES, [old]).fetchall()}
     for name, role, privilege in connection.execute(_TABLE_GRANTS, [old, table, table]).fetchall():
-        younger = [] if table else [label for label in _LIKE.get(name, ()) if label not in there]
-        for each in (name, *younger):
-            _grant(connection, privilege, sql.Identifier(new, each), role)
+        _grant(connection, privilege, sql.Identifier(new, name), role)
 
 
 def copy_table_privileges(connection: Connection, schema: str, old: str, new: str) -> None:

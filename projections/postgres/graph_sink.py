@@ -15,8 +15,7 @@ from typing import Final
 
 from psycopg import sql
 
-from eventsrc.base.text import advised
-from projections.fold.map_errors import DatabaseError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
@@ -61,8 +60,7 @@ class GraphSink:
     name: Final[SinkName] = "graph"
 
     def ensure(self, connection: Connection) -> bool:
-        """Create an empty graph if there is none, or one without labels. Raises ProjectionMismatch
-        for that of an older version."""
+        """Create an empty graph if there is none, or one without labels."""
         ensure_extension(connection, "age")
         _adopt_if_empty(connection, GRAPH)
         if not graph_exists(connection, GRAPH):
@@ -70,7 +68,6 @@ class GraphSink:
         elif _is_bare(connection, GRAPH):
             _add_labels(connection, GRAPH)
         else:
-            _refuse_older(connection, GRAPH)
             map_table.refuse_missing(connection)
             return False
         index_graph(connection, GRAPH)
@@ -298,16 +295,6 @@ def _label_ids(connection: Connection, graph: str) -> dict[str, int]:
     return dict(rows)
 
 
-def _refuse_older(connection: Connection, graph: str) -> None:
-    """Raise ProjectionMismatch for a graph that an older mapfold made, which lacks labels."""
-    missing = [label for label in LABELS if label not in _label_ids(connection, graph)]
-    if missing:
-        raise ProjectionMismatch(
-            f"{describe_connection(connection)}: an older mapfold made the graph there: it has no"
-            f" {', '.join(missing)}; run `{advised('replay')}`, which makes it again"
-        )
-
-
 def index_graph(
     connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
 ) -> None:
@@ -338,7 +325,7 @@ def count_graph(connection: Connection, graph: str) -> dict[str, int]:
 
 
 def _lock(connection: Connection, graph: str) -> None:
-    """Lock all tables of a graph exclusively, if it is there; an older version's has fewer."""
+    """Lock all tables of a graph exclusively, if it is there; another version's may have fewer."""
     if graph_exists(connection, graph):
         there = _label_ids(connection, graph)
         names = [*PARENTS, *filter(there.__contains__, LABELS)]

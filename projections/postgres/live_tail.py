@@ -314,8 +314,8 @@ class TailPass:
         self.plan.progress.update(self.report)
         # Only the graph has names, so it decides which names the map has now.
         first = self.checkpoints.get("graph") or next(iter(self.checkpoints.values()))
-        self.current = self.inputs.at(first.known_to)
-        others = [self.inputs.at(c.known_to) for c in self.checkpoints.values()]
+        self.current = self.inputs.at(first.known_at)
+        others = [self.inputs.at(c.known_at) for c in self.checkpoints.values()]
         return not faults and all(
             map(self.current.differs_only_in_names, [self.inputs.latest, *others])
         )

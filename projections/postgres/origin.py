@@ -99,10 +99,10 @@ def refuse_other_origin(
     fault = origin_fault(found, log_id, inputs)
     if fault == "log":
         raise ProjectionMismatch(f"{made} from log {found.log_id}, not from {log_id}; {advice}")
-    if fault == "corrections" and not _is_of_another_version(found, inputs):
+    if fault == "corrections":
         raise ProjectionMismatch(
             f"{made} under other corrections than the log's commands before offset"
-            f" {found.known_to:,} give; {advice}"
+            f" {found.known_at:,} give; {advice}"
         )
     if fault is not None:
         options = _options_to_match(found.settings, inputs.settings)
@@ -113,17 +113,11 @@ def refuse_other_origin(
         )
 
 
-def _is_of_another_version(found: Checkpoint, inputs: MapInputs) -> bool:
-    """Whether the fingerprints differ although neither the log nor the checkpoint has
-    corrections."""
-    return found.known_at is None and not (inputs.corrections.fingerprint() or inputs.vectors)
-
-
 def refuse_mismatch(
     found: Checkpoint, sink: SinkName, where: str, log: Path, reader: LogReader, inputs: MapInputs
 ) -> None:
     """Raise ProjectionMismatch unless ``found`` was made from this log, as it is, and ``inputs``,
-    which are as of the checkpoint's `Checkpoint.known_to`.
+    which are as of the checkpoint's `Checkpoint.known_at`.
 
     ``where`` names the database in the message.
     """
@@ -137,7 +131,7 @@ def is_under_other_corrections(
 ) -> bool:
     """Whether ``found`` was made from this log, as it is, under other corrections than its commands
     give. Raises ProjectionMismatch for another log or other settings."""
-    inputs = known.at(found.known_to)
+    inputs = known.at(found.known_at)
     if origin_fault(found, reader.log_id, inputs) != "corrections":
         refuse_mismatch(found, sink, where, log, reader, inputs)
         return False

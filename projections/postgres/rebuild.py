@@ -150,7 +150,9 @@ def rebuild(
         def notify_stage(stage: str) -> None:
             notify(RebuildProgress(stage, total, total))
 
-        opened = open_stores(targets, inputs.settings, only=only, application="mapfold replay")
+        opened = open_stores(
+            targets, inputs.settings, only=only, application="mapfold replay", remake=True
+        )
         with opened as stores, ParsedLog(reader, total, workers) as parsed:
             swap = swap_in_new_map(stores, reader.log_id, fold_into, notify_stage)
             index = drop_replaced(stores, notify_stage, hnsw=hnsw)

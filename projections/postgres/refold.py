@@ -156,8 +156,7 @@ class Refold:
         Parked events are tried again, and one that can be folded now would move all later rows.
         """
         found = self.found[sink]
-        observed = found.fingerprint if found.observed is None else found.observed
-        return SINKS[sink].is_kept and observed == self.base.observed and not self.parked
+        return SINKS[sink].is_kept and found.observed == self.base.observed and not self.parked
 
     def _swaps_indexed_vectors(self) -> bool:
         return any(

@@ -42,8 +42,7 @@ class Checkpoint:
     under the corrections of the commands before ``known_at``; ``fingerprint`` is of both.
     ``last_event`` is `event_hash` of the last event, "" for none: it detects a log that was cut and
     continued differently. ``digest`` is the map's, when known. ``observed`` is as in
-    `inputs.MapInputs`. ``maps`` identifies the occupancy maps, None for none. Checkpoints of older
-    versions have neither ``known_at`` nor ``observed`` nor ``maps``.
+    `inputs.MapInputs`. ``maps`` identifies the occupancy maps, None for none.
     """
 
     log_id: str
@@ -51,15 +50,10 @@ class Checkpoint:
     settings: str
     next_offset: Offset
     last_event: str
-    digest: str | None = None
-    known_at: Offset | None = None
-    observed: str | None = None
+    digest: str | None
+    known_at: Offset
+    observed: str
     maps: str | None = None
-
-    @property
-    def known_to(self) -> Offset:
-        """``known_at``, for older versions ``next_offset``."""
-        return self.next_offset if self.known_at is None else self.known_at
 
 
 @dataclass(frozen=True, slots=True)

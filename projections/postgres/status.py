@@ -110,6 +110,8 @@ def _reachable_status(
         opened = connect(url, application="mapfold status", autocommit=True)
         with opened as connection, database_errors(url):
             return _sink_status(connection, sink, reader, settings)
+    except ProjectionMismatch as error:
+        return SinkStatus(sink, describe_target(url), "other", note=str(error))
     except DatabaseError as error:
         return SinkStatus(sink, describe_target(url), "unreachable", note=str(error))
 
@@ -166,12 +168,12 @@ def _condition(
     """The condition of a sink that no process writes, and why."""
     advice, end = replay_advice(reader.path, inputs.latest), reader.next_offset
     try:
-        refuse_other_origin(found, sink, where, reader.log_id, inputs.at(found.known_to), advice)
+        refuse_other_origin(found, sink, where, reader.log_id, inputs.at(found.known_at), advice)
     except ProjectionMismatch as error:
         return "other", str(error)
     if found.next_offset > end:
         return "other", f"the log has only {end:,} events; {advice}"
-    unknown = inputs.since(found.known_to)
+    unknown = inputs.since(found.known_at)
     if found.next_offset == end and not unknown:
         return "idle", None
     note = f"no process writes it; run: {command_for('tail', reader.path, inputs.latest)}"

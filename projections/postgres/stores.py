@@ -77,12 +77,14 @@ def open_stores(
     *,
     only: Only,
     application: str,
+    remake: bool = False,
 ) -> Iterator[list[Store]]:
-    """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy."""
+    """The stores of ``targets``, each sink's writer lock held. Raises ProjectionBusy, and
+    ProjectionMismatch for those of another version, which are dropped to ``remake`` them."""
     stores: list[Store] = []
     try:
         for url, sinks in _sinks_by_url(targets, settings, only).items():
-            stores.append(Store(url, application, sinks, _open(url, application, sinks)))
+            stores.append(Store(url, application, sinks, _open(url, application, sinks, remake)))
         yield stores
     finally:
         for store in stores:
@@ -100,7 +102,9 @@ def _sinks_by_url(
     return found
 
 
-def _open(url: str, application: str, sinks: tuple[DatabaseSink, ...]) -> Connection:
+def _open(
+    url: str, application: str, sinks: tuple[DatabaseSink, ...], remake: bool = False
+) -> Connection:
     connection = connect(url, application=application, autocommit=True)
     try:
         _refuse_encoding(connection, url)
@@ -110,6 +114,8 @@ def _open(url: str, application: str, sinks: tuple[DatabaseSink, ...]) -> Connec
             pin_session_settings(connection)
             for sink in sinks:
                 checkpoints.lock_writer(connection, sink.name)
+            if remake:
+                checkpoints.drop_other_version(connection)
             _ensure_schema(connection)
     except BaseException:
         connection.close()

@@ -24,7 +24,7 @@ from psycopg import sql
 from psycopg.rows import TupleRow
 
 from eventsrc.base.text import advised, counted
-from projections.fold.map_errors import DatabaseError, ProjectionMismatch
+from projections.fold.map_errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
@@ -77,15 +77,13 @@ class VectorSink:
         self._type: sql.Composable = sql.Identifier("vector")
 
     def ensure(self, connection: Connection) -> bool:
-        """Create the table if there is none; learn the dimension it has. Raises ProjectionMismatch
-        for that of an older version."""
+        """Create the table if there is none; learn the dimension it has."""
         ensure_extension(connection, "vector")
         self._type = vector_type(connection)
         dimension = _declared_dimension(connection)
         if dimension is None:
             create_vectors(connection, READERS, self._type, self._dimension)
             return True
-        refuse_older_vectors(connection)
         self._dimension = dimension
         return False
 
@@ -211,18 +209,6 @@ def _declared_dimension(connection: Connection) -> int | None:
             " make; rename or drop it, or use another database"
         )
     return int(row[1])
-
-
-def refuse_older_vectors(connection: Connection) -> None:
-    """Raise ProjectionMismatch for a table that an older mapfold made, which has no cameras."""
-    row = connection.execute(
-        statements("vectors")["state"], {"table": f"{READERS}.{TABLE}"}
-    ).fetchone()
-    if row is not None and not row[2]:
-        raise ProjectionMismatch(
-            f"{describe_connection(connection)}: an older mapfold made the table {TABLE}: it has no"
-            f" column camera; run `{advised('replay')}`, which makes it again"
-        )
 
 
 def create_vectors(

@@ -1,4 +1,4 @@
-"""Floors in the databases: replay, tail and check agree; a graph of an older version is refused."""
+"""Floors in the databases: replay, tail and check agree."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from projections.fold.map_errors import ProjectionMismatch
 from projections.fold.settings import Settings
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check
@@ -77,22 +76,3 @@ def test_check_names_a_wrong_floor(log: Path, one_database: Targets) -> None:
     graph, _ = check(log, one_database, SETTINGS)
     (difference,) = graph.differences
     assert (difference.table, difference.kind) == ("PART_OF", "missing")
-
-
-@pytest.mark.slow
-def test_a_graph_of_an_older_version_is_refused_until_a_replay(
-    log: Path, one_database: Targets
-) -> None:
-    rebuild(log, one_database, SETTINGS)
-    with psycopg.connect(one_database.graph_url, autocommit=True) as connection:
-        connection.execute("LOAD 'age'")
-        connection.execute("SET search_path = ag_catalog, public")
-        for label in ("PART_OF", "Building", "Floor"):
-            connection.execute("SELECT drop_label('semantic_map', %s)", [label])
-    with pytest.raises(
-        ProjectionMismatch, match=r"no Floor, Building, PART_OF; run `mapfold replay"
-    ):
-        tail(log, one_database, SETTINGS, once=True)
-    rebuild(log, one_database, SETTINGS)
-    tail(log, one_database, SETTINGS, once=True)
-    assert parsed(graph_rows(one_database.graph_url)) == expected_graph(view_of(log))

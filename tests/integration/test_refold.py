@@ -346,18 +346,3 @@ def test_the_command_line_tells_of_a_refold(
     assert "refolded 1 time because of commands; the databases are at offset 121" in after
     assert "events written" not in after
     assert "0 events written in 0 batches; the databases are at offset 121" in told()
-
-
-@pytest.mark.slow
-def test_checkpoints_of_an_older_version_are_used(
-    log: Path, one_database: Targets, pg: psycopg.Connection, third_database: Targets
-) -> None:
-    rebuild(log, one_database, SETTINGS)
-    for column in ("known_at", "observed", "maps"):
-        pg.execute(f"ALTER TABLE mapfold.checkpoint DROP COLUMN {column}")  # type: ignore[arg-type]
-    status = projection_status(log, one_database, SETTINGS)
-    assert [s.condition for s in status.sinks] == ["idle", "idle"]
-    assert [c.sound for c in check(log, one_database, SETTINGS)] == [True, True]
-    append_command(log, forget_run("run-b"))
-    assert tail(log, one_database, SETTINGS, once=True).refolds == 1
-    assert all_rows(one_database) == fresh_rows(log, third_database)

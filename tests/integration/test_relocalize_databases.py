@@ -18,6 +18,7 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.queries.candidate_search import CandidateReader, relocalize
+from projections.postgres.status import projection_status
 from tests.support.commands import Commands
 from tests.support.envelopes import detection
 from tests.support.logs import WEIRD, walk, write_log
@@ -163,22 +164,28 @@ def test_an_empty_database_says_what_to_do(one_database: Targets) -> None:
         relocalize(one_database, read_question([detection("cup", [1.0] * 8)]).crops)
 
 
-def test_a_table_of_an_older_version_is_refused_until_it_is_made_again(
+def test_a_map_of_another_version_is_refused_until_it_is_made_again(
     log: Path, one_database: Targets
 ) -> None:
-    """It lacks the cameras of its observations."""
     rebuild(log, one_database, SETTINGS)
     crops = next(questions())
     with psycopg.connect(one_database.vector_url, autocommit=True) as connection:
         connection.execute("ALTER TABLE detection_embeddings DROP COLUMN camera")
+        connection.execute("COMMENT ON SCHEMA mapfold IS 'mapfold: progress'")
     again = "an older mapfold made the .*camera.*run `mapfold replay`, which makes it again"
     with pytest.raises(ProjectionMismatch, match=again):
         relocalize(one_database, crops)
+    again = (
+        "another version of mapfold made the map there; run `mapfold replay`, which makes it again"
+    )
     with pytest.raises(ProjectionMismatch, match=again):
         tail(log, one_database, SETTINGS, once=True)
     with pytest.raises(ProjectionMismatch, match=again):
         check(log, one_database, SETTINGS)
+    status = projection_status(log, one_database, SETTINGS)
+    assert [sink.condition for sink in status.sinks] == ["other", "other"]
     rebuild(log, one_database, SETTINGS)
+    assert projection_status(log, one_database, SETTINGS).healthy
     assert relocalize(one_database, crops).places
     assert all(report.differing == 0 for report in check(log, one_database, SETTINGS))
 

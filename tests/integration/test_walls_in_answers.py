@@ -198,23 +198,20 @@ def test_each_floor_has_its_walls_in_answers(
     assert set(index.search(asked.crops).walls) == {"0", "1"}
 
 
-def test_a_projection_of_an_older_version_is_answered_without_walls(
+def test_a_tail_refuses_a_projection_whose_table_of_maps_was_dropped(
     tmp_path: Path, one_database: Targets
 ) -> None:
-    """It has no table of maps; a tail refuses it, a replay makes it again."""
     log = tmp_path / "log"
     _append(log, _house(), *_drive("a")[:60])
     rebuild(log, one_database, SETTINGS)
     with psycopg.connect(one_database.graph_url) as connection:
         connection.execute("DROP TABLE mapfold.occupancy_map")
-        connection.execute("ALTER TABLE mapfold.checkpoint DROP COLUMN maps")
+    with pytest.raises(ProjectionMismatch, match=r"no table mapfold\.occupancy_map") as told:
+        tail(log, one_database, SETTINGS, once=True)
+    assert "run `mapfold replay" in str(told.value)
+    rebuild(log, one_database, SETTINGS)
     asked = parse_question(_questions()[0])
     with CandidateReader(one_database) as reader:
-        assert reader.candidates(asked.crops).walls == {}
-        with pytest.raises(ProjectionMismatch, match=r"no table mapfold\.occupancy_map") as told:
-            tail(log, one_database, SETTINGS, once=True)
-        assert "run `mapfold replay" in str(told.value)
-        rebuild(log, one_database, SETTINGS)
         assert list(reader.candidates(asked.crops).walls) == [None]
     _append(log, payload(envelope(9_000, 1.0, 1.0, run_id="late")))
     assert tail(log, one_database, SETTINGS, once=True).events == 1

@@ -7,7 +7,7 @@ SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHER
 
 -- name: create
 CREATE SCHEMA mapfold;
-COMMENT ON SCHEMA mapfold IS 'mapfold: progress of the projections; made and removed by mapfold';
+COMMENT ON SCHEMA mapfold IS 'mapfold 2: progress of the projections; made and removed by mapfold';
 CREATE TABLE mapfold.checkpoint (
     sink         text PRIMARY KEY,
     log_id       text NOT NULL,
@@ -18,8 +18,8 @@ CREATE TABLE mapfold.checkpoint (
     digest       text,                    -- of the whole map, when a rebuild computed it
     moved_at     timestamptz NOT NULL DEFAULT now(),
     heartbeat_at timestamptz,             -- when a tail last said that it lives
-    known_at     bigint,                  -- the corrections are those of the commands before it
-    observed     text,                    -- fingerprint of what the observations depend on
+    known_at     bigint NOT NULL,         -- the corrections are those of the commands before it
+    observed     text NOT NULL,           -- fingerprint of what the observations depend on
     maps         text                     -- key of the rows of mapfold.occupancy_map, null for none
 );
 CREATE TABLE mapfold.dead_letter (
@@ -32,22 +32,9 @@ CREATE TABLE mapfold.dead_letter (
     PRIMARY KEY (sink, log_offset)
 );
 
--- name: lacks_columns
--- No row when an older version made the table.
-SELECT 1 FROM pg_attribute
-WHERE attrelid = 'mapfold.checkpoint'::regclass AND attname = 'maps'
-
--- name: add_columns
-ALTER TABLE mapfold.checkpoint
-    ADD COLUMN IF NOT EXISTS known_at bigint, ADD COLUMN IF NOT EXISTS observed text,
-    ADD COLUMN IF NOT EXISTS maps text
-
 -- name: load
--- By name through JSON, as a reader may meet a table that an older version made.
-SELECT c.log_id, c.fingerprint, c.settings, c.next_offset, c.last_event, c.digest,
-       (to_jsonb(c) ->> 'known_at')::bigint, to_jsonb(c) ->> 'observed',
-       to_jsonb(c) ->> 'maps'
-FROM mapfold.checkpoint c WHERE c.sink = %(sink)s
+SELECT log_id, fingerprint, settings, next_offset, last_event, digest, known_at, observed, maps
+FROM mapfold.checkpoint WHERE sink = %(sink)s
 
 -- name: rows_exist
 SELECT to_regclass(%(table)s) IS NOT NULL

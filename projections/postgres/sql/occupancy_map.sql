@@ -35,7 +35,7 @@ FROM mapfold.occupancy_map ORDER BY log_offset
 
 -- name: with_key
 -- All rows with the key that the checkpoint has for them; one row of nulls if there is no map.
-SELECT to_jsonb(c) ->> 'maps', m.log_offset, m.floor, m.map_id, m.source, m.resolution, m.origin_x,
+SELECT c.maps, m.log_offset, m.floor, m.map_id, m.source, m.resolution, m.origin_x,
        m.origin_y, m.origin_yaw, m.width, m.height, m.png, m.digest
 FROM mapfold.checkpoint c LEFT JOIN mapfold.occupancy_map m ON true
 WHERE c.sink = 'graph' ORDER BY m.log_offset

@@ -2,7 +2,7 @@
 -- Object's Place, and the Place of its keyframe. Graph ids follow from the observation's number (det_pk),
 -- so every step but the search is a look-up of an indexed id. `{questions}` is a VALUES list of (crop,
 -- vector) bind parameters. `origin` is log id, and fingerprint of settings and of what the observations
--- depend on (through JSON, as a table of an older version has no column for it).
+-- depend on.
 -- Other words in braces are the parts of these names below.
 
 -- name: cosines
@@ -21,8 +21,8 @@
  ) END
  FROM (
     SELECT edge, greatest(1, CASE WHEN number > %(sampled)s THEN edge / %(sampled)s ELSE 1 END) AS stride,
-           (SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-            FROM mapfold.checkpoint c WHERE sink = 'vectors') || ' ' || edge AS key
+           (SELECT log_id || ' ' || observed
+            FROM mapfold.checkpoint WHERE sink = 'vectors') || ' ' || edge AS key
     FROM (
         SELECT number, CASE WHEN number > %(sampled)s
             THEN 1::bigint << (length(ltrim(number::bit(64)::text, '0')) - 1) ELSE number END AS edge
@@ -38,23 +38,22 @@
 
 -- name: maps
 -- Key of the occupancy maps, which is null if there are none, in an array; null when the key is the one
--- already known (through JSON, as a table of an older version has no column for it).
-(SELECT CASE WHEN to_jsonb(c) ->> 'maps' IS DISTINCT FROM %(known_maps)s::text
-    THEN json_build_array(to_jsonb(c) ->> 'maps') END
- FROM mapfold.checkpoint c WHERE sink = 'graph')
+-- already known.
+(SELECT CASE WHEN maps IS DISTINCT FROM %(known_maps)s::text THEN json_build_array(maps) END
+ FROM mapfold.checkpoint WHERE sink = 'graph')
 
 -- name: of_vectors
 -- What is to know of the vectors as a whole, in one of the rows.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({cosines}, (
-    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-    FROM mapfold.checkpoint c WHERE sink = 'vectors')) END
+    SELECT log_id || ' ' || observed
+    FROM mapfold.checkpoint WHERE sink = 'vectors')) END
 
 -- name: of_graph
 -- The same of the graph, and in the same row the properties of the Objects and Places in `followed`, by id.
 -- `concat`, as AGE 1.5 casts only scalars to text.
 CASE WHEN row_number() OVER () = 1 THEN json_build_array({settings}, (
-    SELECT log_id || ' ' || coalesce(to_jsonb(c) ->> 'observed', fingerprint)
-    FROM mapfold.checkpoint c WHERE sink = 'graph'), {maps},
+    SELECT log_id || ' ' || observed
+    FROM mapfold.checkpoint WHERE sink = 'graph'), {maps},
     (SELECT json_object_agg(id::text, concat(properties)) FROM {object}
      WHERE id = ANY(ARRAY(SELECT thing FROM observes))),
     (SELECT json_object_agg(id::text, concat(properties)) FROM {place}

@@ -68,10 +68,8 @@ FROM unnest(%s::bigint[], %s::text[], %s::text[], %s::bigint[], %s::text[], %s::
          camera, embedding_model, embedding, ingested_at)
 
 -- name: state
--- NULL when there is no such table, else its comment, the declared dimension, and whether it has the
--- column of cameras: that of an older version has none.
-SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod, EXISTS (
-    SELECT 1 FROM pg_attribute WHERE attrelid = c.oid AND attname = 'camera' AND NOT attisdropped)
+-- NULL when there is no such table, else its comment and the declared dimension.
+SELECT coalesce(obj_description(c.oid, 'pg_class'), ''), a.atttypmod
 FROM pg_class c LEFT JOIN pg_attribute a ON a.attrelid = c.oid AND a.attname = 'embedding'
 WHERE c.oid = to_regclass(%(table)s)
 
