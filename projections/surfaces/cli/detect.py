@@ -3,8 +3,9 @@
 import threading
 from collections.abc import Iterable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -36,201 +37,157 @@ from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
-_PICTURES: Final = "Pictures and poses"
-_MODELS: Final = "Models"
-_KEYFRAMES: Final = "Keyframes"
+_pictures = partial(typer.Option, rich_help_panel="Pictures and poses")
+_models = partial(typer.Option, rich_help_panel="Models")
+_keyframes = partial(typer.Option, rich_help_panel="Keyframes")
 
 
 def detect(
     *,
     images: Annotated[
         str | None,
-        typer.Option(
-            metavar="DIR|VIDEO",
-            help="Folder of JPEG and PNG pictures, or a video.",
-            rich_help_panel=_PICTURES,
-        ),
+        _pictures(metavar="DIR|VIDEO", help="Folder of JPEG and PNG pictures, or a video."),
     ] = None,
     zenoh_image: Annotated[
         str | None,
-        typer.Option(
+        _pictures(
             metavar="KEY",
             help="Zenoh key of pictures: JPEG, PNG, or CDR of CompressedImage or Image.",
-            rich_help_panel=_PICTURES,
         ),
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(
+        _pictures(
             metavar="FILE",
             help="Poses by stamp: TUM, CSV with a header stamp,x,y,yaw, or JSON lines.",
-            rich_help_panel=_PICTURES,
         ),
     ] = None,
     zenoh_pose: Annotated[
         str | None,
-        typer.Option(
+        _pictures(
             metavar="KEY",
             help="Zenoh key of poses: JSON, or CDR of PoseStamped, PoseWithCovarianceStamped or"
             " Odometry.",
-            rich_help_panel=_PICTURES,
         ),
     ] = None,
     fps: Annotated[
         float | None,
-        typer.Option(
-            metavar="N",
-            help="Pictures a second, if neither file names nor the video give times.",
-            rich_help_panel=_PICTURES,
+        _pictures(
+            metavar="N", help="Pictures a second, if neither file names nor the video give times."
         ),
     ] = None,
     start: Annotated[
         str,
-        typer.Option(
+        _pictures(
             metavar="TIME",
             help="When the first picture was taken, with --fps or for a video: seconds since 1970,"
             " or ISO.",
-            rich_help_panel=_PICTURES,
         ),
     ] = "0",
     queue: Annotated[
         int,
-        typer.Option(
+        _pictures(
             metavar="N",
             min=1,
             max=1000,
             help="How many pictures from Zenoh may wait; newer ones replace the oldest.",
-            rich_help_panel=_PICTURES,
         ),
     ] = QUEUE,
-    detector: Annotated[
-        Path | None,
-        typer.Option(metavar="MODEL.onnx", help="Object detector.", rich_help_panel=_MODELS),
-    ] = None,
+    detector: Annotated[Path | None, _models(metavar="MODEL.onnx", help="Object detector.")] = None,
     encoder: Annotated[
         Path | None,
-        typer.Option(
-            metavar="MODEL.onnx",
-            help="Encoder of crops; MODEL.json beside it describes its input.",
-            rich_help_panel=_MODELS,
+        _models(
+            metavar="MODEL.onnx", help="Encoder of crops; MODEL.json beside it describes its input."
         ),
     ] = None,
     head: Annotated[
         str,
-        typer.Option(
+        _models(
             metavar="NAME",
             help=f"Format of the detector's output: {', '.join(HEADS)}; yolov8 is for v9, v11 and"
             " v12 too.",
-            rich_help_panel=_MODELS,
         ),
     ] = "yolov8",
     labels: Annotated[
         str | None,
-        typer.Option(
+        _models(
             metavar="FILE",
             help="The detector's classes, one a line, or coco [default: those in the model].",
-            rich_help_panel=_MODELS,
         ),
     ] = None,
     size: Annotated[
         int,
-        typer.Option(
+        _models(
             metavar="PIXELS",
             min=32,
             max=4096,
             help="Side of the detector's input, if the model does not fix it.",
-            rich_help_panel=_MODELS,
         ),
     ] = vision_models.SIZE,
-    device: Annotated[
-        str,
-        typer.Option(metavar="cpu|cuda", help="What the models run on.", rich_help_panel=_MODELS),
-    ] = "cpu",
+    device: Annotated[str, _models(metavar="cpu|cuda", help="What the models run on.")] = "cpu",
     threads: Annotated[
         int | None,
-        typer.Option(
+        _models(
             metavar="N",
             min=1,
             max=1024,
             help="Threads of each model [default: the number of cores].",
-            rich_help_panel=_MODELS,
         ),
     ] = None,
     confidence: Annotated[
-        float,
-        typer.Option(
-            metavar="P",
-            min=0.0,
-            max=1.0,
-            help="Least confidence of a detection.",
-            rich_help_panel=_MODELS,
-        ),
+        float, _models(metavar="P", min=0.0, max=1.0, help="Least confidence of a detection.")
     ] = vision_models.CONFIDENCE,
     overlap: Annotated[
         float,
-        typer.Option(
+        _models(
             metavar="P",
             min=0.0,
             max=1.0,
             help="Two boxes of a class that overlap by more (intersection over union) are one.",
-            rich_help_panel=_MODELS,
         ),
     ] = vision_models.OVERLAP,
     max_detections: Annotated[
-        int,
-        typer.Option(
-            metavar="N",
-            min=1,
-            max=1000,
-            help="Most detections in a picture.",
-            rich_help_panel=_MODELS,
-        ),
+        int, _models(metavar="N", min=1, max=1000, help="Most detections in a picture.")
     ] = vision_models.MOST,
     moved: Annotated[
         float,
-        typer.Option(
+        _keyframes(
             metavar="METRES",
             min=0.0,
             help="Distance from the last keyframe from which a picture is a new keyframe.",
-            rich_help_panel=_KEYFRAMES,
         ),
     ] = MOVED_M,
     turned: Annotated[
         float,
-        typer.Option(
+        _keyframes(
             metavar="DEGREES",
             min=0.0,
             help="Turn since the last keyframe from which a picture is a new keyframe.",
-            rich_help_panel=_KEYFRAMES,
         ),
     ] = TURNED_DEG,
     after: Annotated[
         float | None,
-        typer.Option(
+        _keyframes(
             metavar="SECONDS",
             min=0.0,
             help="Time since the last keyframe from which a picture is a new keyframe; 0: every"
             f" picture is one. [default: {AFTER_S:g}; without poses 0]",
-            rich_help_panel=_KEYFRAMES,
             show_default=False,
         ),
     ] = None,
     hfov: Annotated[
         float | None,
-        typer.Option(
+        _keyframes(
             metavar="DEGREES",
             min=1.0,
             max=170.0,
             help="Horizontal field of view of the camera, stated in the envelopes.",
-            rich_help_panel=_KEYFRAMES,
         ),
     ] = None,
     run_id: Annotated[
         str | None,
-        typer.Option(
-            metavar="ID",
-            help="Name of the run, one for each start [default: host and time].",
-            rich_help_panel=_KEYFRAMES,
+        _keyframes(
+            metavar="ID", help="Name of the run, one for each start [default: host and time]."
         ),
     ] = None,
     key: PublishKeyOption = "tb/detections",
