@@ -20,6 +20,7 @@ from projections.store.history_recorder import map_after
 
 from .edit_command import recorded_text
 from .folded_log import CachedLog, OpenLog, settings_from
+from .option import option
 from .options import JsonOption, ZenohClient, check_picture, user_at_host
 from .terminal import display, emit, finish, say
 
@@ -36,15 +37,14 @@ class _Frames(CachedLog):
     """The runs to move, and into which frame."""
 
     run: Annotated[
-        str | None,
-        typer.Option("--run", metavar="RUN", help="The run to move [default: the other one]."),
+        str | None, option("RUN", "The run to move [default: the other one].", "--run")
     ] = None
     to: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "RUN|LOG",
+            "The run, or the other log, whose frame it gets [default: the log's first run].",
             "--to",
-            metavar="RUN|LOG",
-            help="The run, or the other log, whose frame it gets [default: the log's first run].",
         ),
     ] = None
 
@@ -110,13 +110,10 @@ def align(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            "--picture", metavar="FILE", help="Draw both maps over each other: .png, .svg, .pdf."
-        ),
+        option("FILE", "Draw both maps over each other: .png, .svg, .pdf.", "--picture"),
     ] = None,
     issued_by: Annotated[
-        str | None,
-        typer.Option(metavar="USER@HOST", help="Who gives the command [default: your user@host]."),
+        str | None, option("USER@HOST", "Who gives the command [default: your user@host].")
     ] = None,
     zenoh: ZenohClient,
     json_: JsonOption = False,

@@ -19,6 +19,8 @@ from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
+from .option import option
+
 _PANEL: Final = "Bags of ROS 2"
 _MOST_UNUSED: Final = 10
 _MOST_RUN_ID: Final = 100
@@ -29,10 +31,8 @@ MAX_GAP_S: Final = 3_600.0
 
 def ros_option(panel: str, name: str, metavar: str, text: str) -> typer.models.OptionInfo:
     """An option about messages of ROS, listed under ``panel``; `import` and `record` have them."""
-    option: typer.models.OptionInfo = typer.Option(
-        name, metavar=metavar, help=text, rich_help_panel=panel
-    )
-    return option
+    made: typer.models.OptionInfo = option(metavar, text, name, rich_help_panel=panel)
+    return made
 
 
 def labels_option(panel: str) -> typer.models.OptionInfo:

@@ -30,6 +30,7 @@ from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.wire import MAX_DOMAIN, BridgeWire, RmwWire, Wire, topic_of
 
 from . import bag_text
+from .option import option
 from .terminal import say
 
 TF_POSE: Final = "tf"
@@ -55,12 +56,12 @@ Ros2Option = Annotated[
 ]
 DomainOption = Annotated[
     int | None,
-    typer.Option(
+    option(
+        "N",
+        "The domain of the nodes, with --ros2. [default: ROS_DOMAIN_ID, else 0]",
         "--domain",
-        metavar="N",
         min=0,
         max=MAX_DOMAIN,
-        help="The domain of the nodes, with --ros2. [default: ROS_DOMAIN_ID, else 0]",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -139,8 +140,7 @@ class BridgeChoice:
         ),
     ] = None
     map_frame: Annotated[
-        str | None,
-        _option("--map-frame", "FRAME", f"The frame of the map. [default: {MAP_FRAME}]"),
+        str | None, _option("--map-frame", "FRAME", f"The frame of the map. [default: {MAP_FRAME}]")
     ] = None
     base_frame: Annotated[
         str | None,

@@ -23,6 +23,7 @@ from projections.map.own_events import read_corrections
 
 from .edit_command import keep_effect, recorded_text
 from .folded_log import LogSettings
+from .option import option
 from .options import JsonOption, ZenohClient, user_at_host
 from .terminal import Bar, display, emit, say
 
@@ -62,17 +63,11 @@ def calibrate_command(
     json_: JsonOption = False,
     source: LogSettings,
     reason: Annotated[
-        str,
-        typer.Option(
-            metavar="TEXT", help="With --write: why [default: what the calibration rests on]."
-        ),
+        str, option("TEXT", "With --write: why [default: what the calibration rests on].")
     ] = "",
     issued_by: Annotated[
         str | None,
-        typer.Option(
-            metavar="USER@HOST",
-            help="With --write: who gives the command [default: your user@host].",
-        ),
+        option("USER@HOST", "With --write: who gives the command [default: your user@host]."),
     ] = None,
     client: ZenohClient,
 ) -> None:
@@ -106,14 +101,7 @@ def calibrate_command(
     with Bar() as bar:
         calibrator = _Calibrator(bar.show_fold)
         try:
-            made = record_command(
-                log,
-                calibrator,
-                stamp,
-                chosen,
-                client.session,
-                say,
-            )
+            made = record_command(log, calibrator, stamp, chosen, client.session, say)
         except _NothingNew:
             made = None
     found = calibrator.calibrations[-1]

@@ -33,169 +33,149 @@ from eventsrc.record.transport.session import Session, ZenohOptions, open_sessio
 from . import detect_checks
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
 from .new_log import NewLogOptions
+from .option import option
 from .options import JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
-_pictures = partial(typer.Option, rich_help_panel="Pictures and poses")
-_models = partial(typer.Option, rich_help_panel="Models")
-_keyframes = partial(typer.Option, rich_help_panel="Keyframes")
+_pictures = partial(option, rich_help_panel="Pictures and poses")
+_models = partial(option, rich_help_panel="Models")
+_keyframes = partial(option, rich_help_panel="Keyframes")
 
 
 def detect(
     *,
     images: Annotated[
-        str | None,
-        _pictures(metavar="DIR|VIDEO", help="Folder of JPEG and PNG pictures, or a video."),
+        str | None, _pictures("DIR|VIDEO", "Folder of JPEG and PNG pictures, or a video.")
     ] = None,
     zenoh_image: Annotated[
         str | None,
-        _pictures(
-            metavar="KEY",
-            help="Zenoh key of pictures: JPEG, PNG, or CDR of CompressedImage or Image.",
-        ),
+        _pictures("KEY", "Zenoh key of pictures: JPEG, PNG, or CDR of CompressedImage or Image."),
     ] = None,
     poses: Annotated[
         Path | None,
-        _pictures(
-            metavar="FILE",
-            help="Poses by stamp: TUM, CSV with a header stamp,x,y,yaw, or JSON lines.",
-        ),
+        _pictures("FILE", "Poses by stamp: TUM, CSV with a header stamp,x,y,yaw, or JSON lines."),
     ] = None,
     zenoh_pose: Annotated[
         str | None,
         _pictures(
-            metavar="KEY",
-            help="Zenoh key of poses: JSON, or CDR of PoseStamped, PoseWithCovarianceStamped or"
+            "KEY",
+            "Zenoh key of poses: JSON, or CDR of PoseStamped, PoseWithCovarianceStamped or"
             " Odometry.",
         ),
     ] = None,
     fps: Annotated[
         float | None,
-        _pictures(
-            metavar="N", help="Pictures a second, if neither file names nor the video give times."
-        ),
+        _pictures("N", "Pictures a second, if neither file names nor the video give times."),
     ] = None,
     start: Annotated[
         str,
         _pictures(
-            metavar="TIME",
-            help="When the first picture was taken, with --fps or for a video: seconds since 1970,"
+            "TIME",
+            "When the first picture was taken, with --fps or for a video: seconds since 1970,"
             " or ISO.",
         ),
     ] = "0",
     queue: Annotated[
         int,
         _pictures(
-            metavar="N",
+            "N",
+            "How many pictures from Zenoh may wait; newer ones replace the oldest.",
             min=1,
             max=1000,
-            help="How many pictures from Zenoh may wait; newer ones replace the oldest.",
         ),
     ] = QUEUE,
-    detector: Annotated[Path | None, _models(metavar="MODEL.onnx", help="Object detector.")] = None,
+    detector: Annotated[Path | None, _models("MODEL.onnx", "Object detector.")] = None,
     encoder: Annotated[
         Path | None,
-        _models(
-            metavar="MODEL.onnx", help="Encoder of crops; MODEL.json beside it describes its input."
-        ),
+        _models("MODEL.onnx", "Encoder of crops; MODEL.json beside it describes its input."),
     ] = None,
     head: Annotated[
         str,
         _models(
-            metavar="NAME",
-            help=f"Format of the detector's output: {', '.join(HEADS)}; yolov8 is for v9, v11 and"
+            "NAME",
+            f"Format of the detector's output: {', '.join(HEADS)}; yolov8 is for v9, v11 and"
             " v12 too.",
         ),
     ] = "yolov8",
     labels: Annotated[
         str | None,
         _models(
-            metavar="FILE",
-            help="The detector's classes, one a line, or coco [default: those in the model].",
+            "FILE", "The detector's classes, one a line, or coco [default: those in the model]."
         ),
     ] = None,
     size: Annotated[
         int,
         _models(
-            metavar="PIXELS",
+            "PIXELS",
+            "Side of the detector's input, if the model does not fix it.",
             min=32,
             max=4096,
-            help="Side of the detector's input, if the model does not fix it.",
         ),
     ] = vision_models.SIZE,
-    device: Annotated[str, _models(metavar="cpu|cuda", help="What the models run on.")] = "cpu",
+    device: Annotated[str, _models("cpu|cuda", "What the models run on.")] = "cpu",
     threads: Annotated[
         int | None,
-        _models(
-            metavar="N",
-            min=1,
-            max=1024,
-            help="Threads of each model [default: the number of cores].",
-        ),
+        _models("N", "Threads of each model [default: the number of cores].", min=1, max=1024),
     ] = None,
     confidence: Annotated[
-        float, _models(metavar="P", min=0.0, max=1.0, help="Least confidence of a detection.")
+        float, _models("P", "Least confidence of a detection.", min=0.0, max=1.0)
     ] = vision_models.CONFIDENCE,
     overlap: Annotated[
         float,
         _models(
-            metavar="P",
+            "P",
+            "Two boxes of a class that overlap by more (intersection over union) are one.",
             min=0.0,
             max=1.0,
-            help="Two boxes of a class that overlap by more (intersection over union) are one.",
         ),
     ] = vision_models.OVERLAP,
     max_detections: Annotated[
-        int, _models(metavar="N", min=1, max=1000, help="Most detections in a picture.")
+        int, _models("N", "Most detections in a picture.", min=1, max=1000)
     ] = vision_models.MOST,
     moved: Annotated[
         float,
         _keyframes(
-            metavar="METRES",
+            "METRES",
+            "Distance from the last keyframe from which a picture is a new keyframe.",
             min=0.0,
-            help="Distance from the last keyframe from which a picture is a new keyframe.",
         ),
     ] = MOVED_M,
     turned: Annotated[
         float,
         _keyframes(
-            metavar="DEGREES",
+            "DEGREES",
+            "Turn since the last keyframe from which a picture is a new keyframe.",
             min=0.0,
-            help="Turn since the last keyframe from which a picture is a new keyframe.",
         ),
     ] = TURNED_DEG,
     after: Annotated[
         float | None,
         _keyframes(
-            metavar="SECONDS",
-            min=0.0,
-            help="Time since the last keyframe from which a picture is a new keyframe; 0: every"
+            "SECONDS",
+            "Time since the last keyframe from which a picture is a new keyframe; 0: every"
             f" picture is one. [default: {AFTER_S:g}; without poses 0]",
+            min=0.0,
             show_default=False,
         ),
     ] = None,
     hfov: Annotated[
         float | None,
         _keyframes(
-            metavar="DEGREES",
+            "DEGREES",
+            "Horizontal field of view of the camera, stated in the envelopes.",
             min=1.0,
             max=170.0,
-            help="Horizontal field of view of the camera, stated in the envelopes.",
         ),
     ] = None,
     run_id: Annotated[
         str | None,
-        _keyframes(
-            metavar="ID", help="Name of the run, one for each start [default: host and time]."
-        ),
+        _keyframes("ID", "Name of the run, one for each start [default: host and time]."),
     ] = None,
     key: PublishKeyOption = "tb/detections",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write JSON lines for `import` into a new file; publish nothing."
-        ),
+        option("FILE", "Write JSON lines for `import` into a new file; publish nothing."),
     ] = None,
     new_log: NewLogOptions,
     keep_crops: Annotated[
@@ -206,21 +186,17 @@ def detect(
     ] = False,
     spool: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File of envelopes that no recorder has acknowledged; the next start sends them"
+        option(
+            "FILE",
+            "File of envelopes that no recorder has acknowledged; the next start sends them"
             " again [default: detect-spool.sqlite in $MAPFOLD_HOME, else in .mapfold].",
         ),
     ] = None,
     wait: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS", min=0.0, help="How long to wait for acknowledgements at the end."
-        ),
+        float, option("SECONDS", "How long to wait for acknowledgements at the end.", min=0.0)
     ] = 30.0,
     metrics: Annotated[
-        str | None,
-        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+        str | None, option("PORT", "Serve Prometheus metrics; PORT or HOST:PORT.")
     ] = None,
     json_: JsonOption = False,
     peer: ZenohPeer,

@@ -24,6 +24,7 @@ from projections.surfaces.text_encoders import with_text_encoder
 
 from .edit_command import EditOptions, NewCommand
 from .folded_log import AssignedSettings, LogArgument, LogSettings, settings_from
+from .option import option
 from .options import JsonOption
 from .terminal import display, emit, say
 
@@ -35,8 +36,7 @@ OtherPlaceArgument = Annotated[
     str, typer.Argument(metavar="PLACE", help="Another one, the same way.")
 ]
 ObjectArgument = Annotated[
-    str,
-    typer.Argument(metavar="OBJECT", help="An object's first six characters, class or det_id."),
+    str, typer.Argument(metavar="OBJECT", help="An object's first six characters, class or det_id.")
 ]
 OtherObjectArgument = Annotated[
     str, typer.Argument(metavar="OBJECT", help="Another one, the same way.")
@@ -160,12 +160,8 @@ def _forget_keyframes(
     options.record(lambda current, stamp: make.forget_keyframes(current, stamp, run, span))
 
 
-_FromOption = Annotated[
-    int | None, typer.Option("--from", metavar="K", help="From this keyframe of the run.")
-]
-_ToOption = Annotated[
-    int | None, typer.Option("--to", metavar="K", help="To this keyframe, included.")
-]
+_FromOption = Annotated[int | None, option("K", "From this keyframe of the run.", "--from")]
+_ToOption = Annotated[int | None, option("K", "To this keyframe, included.", "--to")]
 
 
 @edit.command("correct-poses")
@@ -176,20 +172,17 @@ def _correct_poses(
         Path | None,
         typer.Argument(metavar="FILE", help="A trajectory: TUM, CSV with a header, JSON lines."),
     ] = None,
-    dx: Annotated[float | None, typer.Option("--dx", metavar="METRES", help="Shift in x.")] = None,
-    dy: Annotated[float | None, typer.Option("--dy", metavar="METRES", help="Shift in y.")] = None,
+    dx: Annotated[float | None, option("METRES", "Shift in x.", "--dx")] = None,
+    dy: Annotated[float | None, option("METRES", "Shift in y.", "--dy")] = None,
     dyaw: Annotated[
-        float | None, typer.Option("--dyaw", metavar="RADIANS", help="Turn about the map's origin.")
+        float | None, option("RADIANS", "Turn about the map's origin.", "--dyaw")
     ] = None,
     first: _FromOption = None,
     last: _ToOption = None,
     slack: Annotated[
         float,
-        typer.Option(
-            "--slack",
-            metavar="SECONDS",
-            min=0.0,
-            help="How far a keyframe may lie outside the stamps of FILE.",
+        option(
+            "SECONDS", "How far a keyframe may lie outside the stamps of FILE.", "--slack", min=0.0
         ),
     ] = DEFAULT_SLACK_S,
     ignore_missing: Annotated[
@@ -234,10 +227,10 @@ def _relabel(
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "FILE",
+            "Names by label: JSON, YAML, or a name in each line, the first that of 0.",
             "--labels",
-            metavar="FILE",
-            help="Names by label: JSON, YAML, or a name in each line, the first that of 0.",
         ),
     ] = None,
     options: EditOptions,

@@ -27,6 +27,7 @@ from projections.fold.settings import Settings
 from projections.history.diff_rendering import difference_text
 
 from .folded_log import FoldSettings, settings_from
+from .option import option
 from .options import JsonOption, ZenohClient, user_at_host
 from .terminal import display, emit, say
 
@@ -38,17 +39,13 @@ class _Stamped:
     """Who gives a command and why, and what is printed."""
 
     context: typer.Context
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="Why; part of the log.")] = ""
+    reason: Annotated[str, option("TEXT", "Why; part of the log.")] = ""
     issued_by: Annotated[
-        str | None,
-        typer.Option(metavar="USER@HOST", help="Who gives the command [default: your user@host]."),
+        str | None, option("USER@HOST", "Who gives the command [default: your user@host].")
     ] = None
     command_id: Annotated[
         str | None,
-        typer.Option(
-            metavar="ID",
-            help="The command's id; given twice, it is recorded once [default: a new one].",
-        ),
+        option("ID", "The command's id; given twice, it is recorded once [default: a new one]."),
     ] = None
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would change and record nothing.")

@@ -16,6 +16,7 @@ from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 
 from .folded_log import FoldSettings, W
+from .option import option
 from .options import CameraOptions, JsonOption, check_picture
 from .relocalize import method_from
 from .terminal import display, emit, say
@@ -78,31 +79,19 @@ _LABEL = 30
 
 def evaluate(
     *,
-    map_logs: Annotated[
-        list[Path],
-        typer.Option("--map", metavar="LOG", help="Log of a map; may be repeated."),
-    ],
+    map_logs: Annotated[list[Path], option("LOG", "Log of a map; may be repeated.", "--map")],
     query_logs: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--query", metavar="LOG", help="Log whose keyframes are the questions; may be repeated."
-        ),
+        option("LOG", "Log whose keyframes are the questions; may be repeated.", "--query"),
     ] = None,
     truth_files: Annotated[
-        list[Path] | None,
-        typer.Option("--truth", metavar="FILE", help="Ground truth of runs; may be repeated."),
+        list[Path] | None, option("FILE", "Ground truth of runs; may be repeated.", "--truth")
     ] = None,
-    until: Annotated[
-        str, typer.Option("--at", metavar="W", help=f"Fold the map's log only to here: {W}.")
-    ] = "end",
+    until: Annotated[str, option("W", f"Fold the map's log only to here: {W}.", "--at")] = "end",
     method: Annotated[
-        str,
-        typer.Option("--method", metavar="joint|plain", help="As for `mapfold relocalize`."),
+        str, option("joint|plain", "As for `mapfold relocalize`.", "--method")
     ] = "joint",
-    seed: Annotated[
-        int,
-        typer.Option("--seed", metavar="N", help="Seed of the choice of crops."),
-    ] = DEFAULT_SEED,
+    seed: Annotated[int, option("N", "Seed of the choice of crops.", "--seed")] = DEFAULT_SEED,
     camera: CameraOptions,
     self_: Annotated[
         bool,
@@ -110,22 +99,18 @@ def evaluate(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            "--picture",
-            metavar="FILE",
-            help="Draw the questions of three crops, and the error of each.",
-        ),
+        option("FILE", "Draw the questions of three crops, and the error of each.", "--picture"),
     ] = None,
     chosen: FoldSettings,
     workers: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "N",
+            "Processes that ask beside this one. Default: as many as there are further"
+            f" processors, at most {DEFAULT_WORKERS}.",
             "--workers",
-            metavar="N",
             min=0,
             max=MAX_WORKERS,
-            help="Processes that ask beside this one. Default: as many as there are further"
-            f" processors, at most {DEFAULT_WORKERS}.",
         ),
     ] = None,
     json_: JsonOption = False,

@@ -21,6 +21,7 @@ from projections.map.scenes import RecordedFold
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldToOption, KnownAtOption, LogSettings
+from .option import option
 from .signals import stop_on_signals
 from .terminal import Bar, say
 
@@ -32,21 +33,14 @@ def export(
     *,
     at: FoldToOption = "end",
     graphml: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Places and Objects as a graph: Gephi, yEd, networkx."),
+        Path | None, option("FILE", "Places and Objects as a graph: Gephi, yEd, networkx.")
     ] = None,
-    dot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The same for Graphviz: neato -Tsvg FILE.")
-    ] = None,
+    dot: Annotated[Path | None, option("FILE", "The same for Graphviz: neato -Tsvg FILE.")] = None,
     geojson: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Places, Objects, ways and paths: QGIS; see --origin."),
+        Path | None, option("FILE", "Places, Objects, ways and paths: QGIS; see --origin.")
     ] = None,
     csv: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Four tables: places, objects, keyframes and adjacency .csv."
-        ),
+        Path | None, option("DIR", "Four tables: places, objects, keyframes and adjacency .csv.")
     ] = None,
     csv_raw: Annotated[
         bool,
@@ -56,45 +50,37 @@ def export(
         ),
     ] = False,
     nav2: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="A waypoint for each Place, as Nav2's RViz panel loads."),
+        Path | None, option("FILE", "A waypoint for each Place, as Nav2's RViz panel loads.")
     ] = None,
     foxglove: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.mcap", help="How the map came about, event by event (extra [foxglove])."
-        ),
+        option("FILE.mcap", "How the map came about, event by event (extra [foxglove])."),
     ] = None,
     rerun: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.rrd", help="The same for the Rerun viewer (extra [rerun])."),
+        Path | None, option("FILE.rrd", "The same for the Rerun viewer (extra [rerun]).")
     ] = None,
     every: Annotated[
         int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            help="A scene every N events, for --foxglove and --rerun [default: as many as make at"
+        option(
+            "N",
+            "A scene every N events, for --foxglove and --rerun [default: as many as make at"
             " most 500 scenes].",
+            min=1,
         ),
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(
-            metavar="LAT,LON[,YAW]",
-            help="Where the map frame's origin is on Earth (WGS 84), and its x axis in degrees"
+        option(
+            "LAT,LON[,YAW]",
+            "Where the map frame's origin is on Earth (WGS 84), and its x axis in degrees"
             " counter-clockwise from east, for --geojson [default: coordinates are metres].",
         ),
     ] = None,
     all_: Annotated[
-        bool,
-        typer.Option("--all", help="Objects seen once, too, in --foxglove and --rerun."),
+        bool, typer.Option("--all", help="Objects seen once, too, in --foxglove and --rerun.")
     ] = False,
     floor: Annotated[
-        str | None,
-        typer.Option(
-            "--floor", metavar="NAME", help="This floor only; - is the floor without a name."
-        ),
+        str | None, option("NAME", "This floor only; - is the floor without a name.", "--floor")
     ] = None,
     known_at: KnownAtOption = None,
     source: LogSettings,
@@ -198,15 +184,10 @@ def _degrees(text: str) -> tuple[float, ...]:
 
 def foxglove(
     *,
-    host: Annotated[str, typer.Option(metavar="ADDRESS", help="Listen here.")] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
-    ] = 8765,
+    host: Annotated[str, option("ADDRESS", "Listen here.")] = "127.0.0.1",
+    port: Annotated[int, option("N", "0 takes a free one.", min=0, max=65_535)] = 8765,
     layout: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write a layout there first, for Foxglove to import from file."
-        ),
+        Path | None, option("FILE", "Write a layout there first, for Foxglove to import from file.")
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Show objects seen once, too.")] = False,
     known_at: KnownAtOption = None,

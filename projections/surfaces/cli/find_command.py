@@ -22,6 +22,7 @@ from projections.store.history_recorder import map_after
 from projections.surfaces.text_encoders import words_of
 
 from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
+from .option import option
 from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument
 from .terminal import display, emit, say
 
@@ -36,18 +37,15 @@ class GoalForm(StrEnum):
 
 GoalOption = Annotated[
     GoalForm | None,
-    typer.Option(
-        "--goal",
-        metavar="json|yaml|ros2",
-        help="Print instead the pose from which a robot sees it: as JSON, a PoseStamped in YAML, or"
+    option(
+        "json|yaml|ros2",
+        "Print instead the pose from which a robot sees it: as JSON, a PoseStamped in YAML, or"
         " a ros2 command that sends it.",
+        "--goal",
     ),
 ]
 ClearanceOption = Annotated[
-    float,
-    typer.Option(
-        "--clearance", metavar="METRES", min=0.0, help="Least distance of goals from walls."
-    ),
+    float, option("METRES", "Least distance of goals from walls.", "--clearance", min=0.0)
 ]
 
 
@@ -140,21 +138,17 @@ def find_things(
         ),
     ] = None,
     in_: Annotated[
-        str | None,
-        typer.Option("--in", metavar="PLACE", help="Only what is in this place, such as kitchen."),
+        str | None, option("PLACE", "Only what is in this place, such as kitchen.", "--in")
     ] = None,
     near: Annotated[
-        str | None,
-        typer.Option(
-            "--near", metavar="X,Y|THING", help="Nearest first, to a point in metres or a thing."
-        ),
+        str | None, option("X,Y|THING", "Nearest first, to a point in metres or a thing.", "--near")
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "X,Y|THING",
+            "Nearest first by the way from there, over ground that robots drove on.",
             "--from",
-            metavar="X,Y|THING",
-            help="Nearest first by the way from there, over ground that robots drove on.",
         ),
     ] = None,
     missing: Annotated[
@@ -165,27 +159,25 @@ def find_things(
     ] = False,
     moved: Annotated[bool, typer.Option("--moved", help="Only what has moved.")] = False,
     seen_since: Annotated[
-        str | None,
-        typer.Option("--seen-since", metavar="TIME", help="Only what was seen at TIME or later."),
+        str | None, option("TIME", "Only what was seen at TIME or later.", "--seen-since")
     ] = None,
     not_seen_since: Annotated[
-        str | None,
-        typer.Option("--not-seen-since", metavar="TIME", help="Only what was last seen earlier."),
+        str | None, option("TIME", "Only what was last seen earlier.", "--not-seen-since")
     ] = None,
-    top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Most answers.")] = 10,
+    top: Annotated[int, option("N", "Most answers.", "--top", min=1)] = 10,
     every: Annotated[bool, typer.Option("--all", help="Also what was seen once.")] = False,
     text_encoder: Annotated[
         Path | None,
-        typer.Option(
-            metavar="MODEL.onnx",
-            help="Compare WHAT with embeddings by this text tower instead of the log's own.",
+        option(
+            "MODEL.onnx",
+            "Compare WHAT with embeddings by this text tower instead of the log's own.",
         ),
     ] = None,
     crops: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Write the best crop that the log keeps of each answer there, and name its file.",
+        option(
+            "FOLDER",
+            "Write the best crop that the log keeps of each answer there, and name its file.",
         ),
     ] = None,
     goal: GoalOption = None,

@@ -20,6 +20,7 @@ from projections.adapters.fleet.sites import Site
 from . import fleet_options
 from .event_text import iso_time
 from .folded_log import FoldSettings, settings_from
+from .option import option
 from .options import CameraOptions, JsonOption, QuestionArgument, question_from
 from .terminal import display, emit, finish, say
 
@@ -91,14 +92,7 @@ def replay(
     entries: dict[int, dict[str, Any]] = {}
     with stores.opened(sites) as databases:
         requests = [
-            ReplayRequest(
-                site,
-                databases[site.name],
-                chosen,
-                again,
-                replace,
-                not no_hnsw,
-            )
+            ReplayRequest(site, databases[site.name], chosen, again, replace, not no_hnsw)
             for site in sites
         ]
         if engine == "local":  # else each site would wait for it
@@ -242,9 +236,7 @@ def relocalize(
     *,
     place: fleet_options.SitesArgument,
     query: QuestionArgument,
-    top: Annotated[
-        int, typer.Option("--top", metavar="N", min=1, max=100, help="Places of each site.")
-    ] = 3,
+    top: Annotated[int, option("N", "Places of each site.", "--top", min=1, max=100)] = 3,
     camera: CameraOptions,
     jobs: fleet_options.QuestionJobsOption = None,
     stores: fleet_options.FleetDatabases,

@@ -18,6 +18,7 @@ from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import Site, find_sites
 from projections.postgres.connection import Targets
 
+from .option import option
 from .terminal import Bar, people, say
 
 
@@ -45,34 +46,34 @@ SitesArgument = Annotated[
 ]
 TemplateOption = Annotated[
     str | None,
-    typer.Option(
-        "--db",
-        metavar="TEMPLATE",
-        help="A database for each site, as postgresql://host/{site} [env MAPFOLD_DB; default:"
+    option(
+        "TEMPLATE",
+        "A database for each site, as postgresql://host/{site} [env MAPFOLD_DB; default:"
         " databases of the embedded server, named as the sites].",
+        "--db",
     ),
 ]
 VectorTemplateOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "TEMPLATE",
+        "A database of each site's embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
         "--vector-db",
-        metavar="TEMPLATE",
-        help="A database of each site's embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
     ),
 ]
 EngineOption = Annotated[
     str,
-    typer.Option(
+    option(
+        "ENGINE",
+        "local: processes on this machine; dask://HOST:PORT: the workers of that scheduler.",
         "--engine",
-        metavar="ENGINE",
-        help="local: processes on this machine; dask://HOST:PORT: the workers of that scheduler.",
     ),
 ]
 
 
 def _jobs_option(default: str) -> Any:
     help_ = f"Sites at once [default: {default}]."
-    return typer.Option("--jobs", metavar="N", min=1, max=1024, help=help_)
+    return option("N", help_, "--jobs", min=1, max=1024)
 
 
 JobsOption = Annotated[int | None, _jobs_option("the number of cores")]

@@ -24,6 +24,7 @@ from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings, preset_assignments, read_settings
 from projections.map.own_events import read_corrections
 
+from .option import option
 from .terminal import say
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
@@ -39,13 +40,13 @@ def point(reader: LogReader, text: str) -> Offset:
     return resolve(reader, text, note=say)
 
 
-FoldToOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Fold to here: {W}.")]
+FoldToOption = Annotated[str, option("W", f"Fold to here: {W}.", "--at")]
 KnownAtOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "V",
+        "Apply only the commands recorded before here [default: the end of the map].",
         "--known-at",
-        metavar="V",
-        help="Apply only the commands recorded before here [default: the end of the map].",
     ),
 ]
 
@@ -65,37 +66,37 @@ def complete_preset() -> list[str]:
 
 PresetOption = Annotated[
     str | None,
-    typer.Option(
-        "--preset",
-        metavar="|".join(PRESETS),
-        autocompletion=complete_preset,
-        help="Named settings: classic, places by DBSCAN; rooms, places that are rooms; full, rooms"
+    option(
+        "|".join(PRESETS),
+        "Named settings: classic, places by DBSCAN; rooms, places that are rooms; full, rooms"
         " and objects by evidence. --set goes on top.",
+        "--preset",
+        autocompletion=complete_preset,
     ),
 ]
 SpaceOption = Annotated[
     str | None,
-    typer.Option(
-        "--space",
-        metavar="NAME",
-        help="The embedding space of the map, by its model's name [default: that of the log's first"
+    option(
+        "NAME",
+        "The embedding space of the map, by its model's name [default: that of the log's first"
         " vector]; see `mapfold reembed`.",
+        "--space",
     ),
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "NAME=VALUE",
+        "Change a setting of the fold, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
         "--set",
-        metavar="NAME=VALUE",
-        help="Change a setting of the fold, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
     ),
 ]
 SettingsOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "FILE",
+        "JSON object of settings instead of those that the log names; --set goes on top.",
         "--settings",
-        metavar="FILE",
-        help="JSON object of settings instead of those that the log names; --set goes on top.",
     ),
 ]
 NoCacheOption = Annotated[

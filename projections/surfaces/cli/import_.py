@@ -23,6 +23,7 @@ from eventsrc.record.transport.config import check_key
 from .bag_text import BagChoice, bag_lines
 from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions, say_camera
+from .option import option
 from .options import JsonOption
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -45,30 +46,22 @@ def import_(
             "logs; - is stdin.",
         ),
     ] = None,
-    key: Annotated[
-        str, typer.Option(metavar="KEY", help="Key for messages without one.")
-    ] = run.DEFAULT_KEY,
+    key: Annotated[str, option("KEY", "Key for messages without one.")] = run.DEFAULT_KEY,
     map_: Annotated[
         Path | None,
-        typer.Option(
-            "--map",
-            metavar="FILE",
-            help="The map.yaml of a map server, appended before the files; its walls apply from"
+        option(
+            "FILE",
+            "The map.yaml of a map server, appended before the files; its walls apply from"
             " there on.",
+            "--map",
         ),
     ] = None,
     floor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="The floor of the map of --map, as in the envelopes' `floor`."
-        ),
+        str | None, option("NAME", "The floor of the map of --map, as in the envelopes' `floor`.")
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="GLOB",
-            help="Only topics (keys) that match this, such as 'tb/*'; may be repeated.",
-        ),
+        option("GLOB", "Only topics (keys) that match this, such as 'tb/*'; may be repeated."),
     ] = None,
     new_log: NewLogOptions,
     choice: BagChoice,

@@ -31,6 +31,7 @@ from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 from .event_text import event_document, event_line, iso_time
 from .folded_log import LogArgument
 from .new_log import say_camera
+from .option import option
 from .options import JsonOption
 from .terminal import Bar, display, emit, emit_lines, finish, say
 
@@ -165,11 +166,9 @@ def _span(first_ns: int, last_ns: int) -> str:
 @log_commands.command()
 def cat(
     log: LogArgument,
-    from_: Annotated[str, typer.Option("--from", metavar="W", help="Start of the range.")] = "0",
-    to: Annotated[str, typer.Option("--to", metavar="W", help="End of the range.")] = "end",
-    key: Annotated[
-        list[str] | None, typer.Option(metavar="K", help="Only this key; may be repeated.")
-    ] = None,
+    from_: Annotated[str, option("W", "Start of the range.", "--from")] = "0",
+    to: Annotated[str, option("W", "End of the range.", "--to")] = "end",
+    key: Annotated[list[str] | None, option("K", "Only this key; may be repeated.")] = None,
     skip_damage: Annotated[
         bool, typer.Option("--skip-damage", help="Report unreadable offsets and continue (exit 3).")
     ] = False,

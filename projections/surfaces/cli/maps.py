@@ -11,17 +11,13 @@ from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
 from projections.map.confirmed import objects_text
 from projections.map.digest import map_digest
-from projections.map.state_output import (
-    places_advice,
-    space_advice,
-    state_document,
-    state_text,
-)
+from projections.map.state_output import places_advice, space_advice, state_document, state_text
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache
 
 from .folded_log import CachedLog, FoldToOption, KnownAtOption, LogSettings, classes_advice
+from .option import option
 from .options import JsonOption, check_picture
 from .terminal import display, emit, say
 
@@ -36,8 +32,7 @@ def state(
     ] = False,
     digest: Annotated[bool, typer.Option("--digest", help="Print only the digest.")] = False,
     no_digest: Annotated[
-        bool,
-        typer.Option("--no-digest", help="Leave out the digest, which reads the whole map."),
+        bool, typer.Option("--no-digest", help="Leave out the digest, which reads the whole map.")
     ] = False,
     source: CachedLog,
 ) -> None:
@@ -77,24 +72,17 @@ def state(
 def draw(
     *,
     at: FoldToOption = "end",
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="The picture: .png, .svg or .pdf.")
-    ] = Path("map.png"),
+    out: Annotated[Path, option("FILE", "The picture: .png, .svg or .pdf.")] = Path("map.png"),
     house: Annotated[
-        int | None,
-        typer.Option(
-            metavar="SEED", help="Draw the plan of this simulated house under the map.", min=0
-        ),
+        int | None, option("SEED", "Draw the plan of this simulated house under the map.", min=0)
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Draw objects seen once, too.")] = False,
     min_observations: Annotated[
-        int, typer.Option(metavar="N", help="Leave out objects with fewer observations.", min=1)
+        int, option("N", "Leave out objects with fewer observations.", min=1)
     ] = 1,
     floor: Annotated[
         str | None,
-        typer.Option(
-            "--floor", metavar="NAME", help="Draw this floor only; - is the floor without a name."
-        ),
+        option("NAME", "Draw this floor only; - is the floor without a name.", "--floor"),
     ] = None,
     merges: Annotated[
         bool, typer.Option("--merges", help="Mark the keyframes that merged places.")

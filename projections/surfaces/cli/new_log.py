@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
-
 from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError
 from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.commands import UseSettings, encode_command
@@ -30,6 +28,7 @@ from projections.map.own_events import read_commands
 from projections.map.state_output import camera_advice
 
 from .folded_log import NamedSettings, complete_preset
+from .option import option
 from .options import user_at_host
 from .terminal import say
 
@@ -45,22 +44,22 @@ class NewLogOptions:
 
     preset: Annotated[
         str | None,
-        typer.Option(
-            "--preset",
-            metavar="|".join(PRESETS),
-            autocompletion=complete_preset,
-            help="What a new log begins with, and every fold of it uses: classic, places by"
+        option(
+            "|".join(PRESETS),
+            "What a new log begins with, and every fold of it uses: classic, places by"
             " DBSCAN; rooms, places that are rooms; full, rooms and objects by evidence. [default:"
             f" {ROS_PRESET} for input of ROS, else classic]",
+            "--preset",
+            autocompletion=complete_preset,
             rich_help_panel=_PANEL,
         ),
     ] = None
     set_: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME=VALUE",
+            "A setting on top, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
             "--set",
-            metavar="NAME=VALUE",
-            help="A setting on top, as eps_m=1.0 or camera.hfov_deg=90; may be repeated.",
             rich_help_panel=_PANEL,
         ),
     ] = None

@@ -19,6 +19,8 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
 from projections.fold.map_errors import QuestionError
 
+from .option import option
+
 if TYPE_CHECKING:
     from eventsrc.record.transport.session import Session
     from projections.fold.settings import CameraConstants
@@ -30,18 +32,18 @@ JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 
 DbOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "URL",
+        "PostgreSQL with Apache AGE for the graph [env MAPFOLD_DB; default: embedded server].",
         "--db",
-        metavar="URL",
-        help="PostgreSQL with Apache AGE for the graph [env MAPFOLD_DB; default: embedded server].",
     ),
 ]
 VectorDbOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "URL",
+        "PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
         "--vector-db",
-        metavar="URL",
-        help="PostgreSQL with pgvector for the embeddings [env MAPFOLD_VECTOR_DB; default: --db].",
     ),
 ]
 LogOrDbArgument = Annotated[
@@ -49,15 +51,10 @@ LogOrDbArgument = Annotated[
 ]
 LiveDbOption = Annotated[
     str | None,
-    typer.Option(
-        "--db",
-        metavar="URL",
-        help="Ask this database's live map, not a log; '' is the embedded server.",
-    ),
+    option("URL", "Ask this database's live map, not a log; '' is the embedded server.", "--db"),
 ]
 VectorsOption = Annotated[
-    str | None,
-    typer.Option("--vector-db", metavar="URL", help="The database of the vectors [default: --db]."),
+    str | None, option("URL", "The database of the vectors [default: --db].", "--vector-db")
 ]
 
 
@@ -81,44 +78,42 @@ _ZENOH_PANEL = "Zenoh"
 
 ConnectOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "ENDPOINT",
+        f"Router or peer to connect to; may be repeated. [default: {DEFAULT_ENDPOINT}]",
         "--connect",
-        metavar="ENDPOINT",
-        help=f"Router or peer to connect to; may be repeated. [default: {DEFAULT_ENDPOINT}]",
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
 ConnectBesideListenOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--connect",
-        metavar="ENDPOINT",
-        help="Router or peer to connect to; may be repeated."
+    option(
+        "ENDPOINT",
+        "Router or peer to connect to; may be repeated."
         f" [default: {DEFAULT_ENDPOINT}; none with --listen]",
+        "--connect",
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
 ListenOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "ENDPOINT",
+        "Let others connect to this process there; may be repeated. Port 0 takes a free one.",
         "--listen",
-        metavar="ENDPOINT",
-        help="Let others connect to this process there; may be repeated. Port 0 takes a free one.",
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
 ConfigOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
+        "FILE",
+        "Zenoh configuration (JSON5) for the rest: TLS, access control, scouting.",
         "--zenoh-config",
-        metavar="FILE",
-        help="Zenoh configuration (JSON5) for the rest: TLS, access control, scouting.",
         rich_help_panel=_ZENOH_PANEL,
     ),
 ]
-PublishKeyOption = Annotated[
-    str, typer.Option("--key", metavar="KEY", help="Zenoh key to publish under.")
-]
+PublishKeyOption = Annotated[str, option("KEY", "Zenoh key to publish under.", "--key")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,20 +192,19 @@ def question_from(query: str) -> "Question":
 
 _HfovOption = Annotated[
     float | None,
-    typer.Option(
+    option(
+        "DEGREES",
+        "Horizontal field of view of the robot's camera [default: that of the map's pictures].",
         "--hfov",
-        metavar="DEGREES",
-        help="Horizontal field of view of the robot's camera [default: that of the map's"
-        " pictures].",
         show_default=False,
     ),
 ]
 _ImageOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "WxH",
+        "Size of the camera's pictures in pixels [default: that of the map's pictures].",
         "--image",
-        metavar="WxH",
-        help="Size of the camera's pictures in pixels [default: that of the map's pictures].",
         show_default=False,
     ),
 ]

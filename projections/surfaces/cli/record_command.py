@@ -28,6 +28,7 @@ from . import bridge_options
 from .bag_text import crop_cutter, stream_lines
 from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions, say_camera
+from .option import option
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
@@ -46,39 +47,33 @@ def record(
     peer: ZenohPeer,
     key: Annotated[
         list[str] | None,
-        typer.Option(
-            "--key",
-            metavar="KEY",
-            help="Key expression to record; wildcards * and ** work; may be repeated. "
+        option(
+            "KEY",
+            "Key expression to record; wildcards * and ** work; may be repeated. "
             f"[default: {DEFAULT_KEYS[0]}]",
+            "--key",
         ),
     ] = None,
     crops: Annotated[
         list[str] | None,
-        typer.Option(
-            "--crops",
-            metavar="KEY",
-            help="Key expression PREFIX/* of the JPEGs of detections, which `mapfold detect"
+        option(
+            "KEY",
+            "Key expression PREFIX/* of the JPEGs of detections, which `mapfold detect"
             " --keep-crops` publishes; may be repeated; '' keeps none. "
             f"[default: {DEFAULT_CROPS[0]}]",
+            "--crops",
         ),
     ] = None,
     fsync: Annotated[
-        str,
-        typer.Option(metavar="POLICY", help="always, <N>ms or never: when events reach the disk."),
+        str, option("POLICY", "always, <N>ms or never: when events reach the disk.")
     ] = "50ms",
     queue: Annotated[
-        int, typer.Option(metavar="N", min=1, help="How many messages may wait for the disk.")
+        int, option("N", "How many messages may wait for the disk.", min=1)
     ] = DEFAULT_QUEUE_SIZE,
     max_payload: Annotated[
-        int,
-        typer.Option(
-            min=1, max=MAX_PAYLOAD_BYTES, metavar="BYTES", help="Larger messages are rejected."
-        ),
+        int, option("BYTES", "Larger messages are rejected.", min=1, max=MAX_PAYLOAD_BYTES)
     ] = DEFAULT_MAX_PAYLOAD_BYTES,
-    max_events: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Stop after so many messages.")
-    ] = None,
+    max_events: Annotated[int | None, option("N", "Stop after so many messages.", min=1)] = None,
     gaps: Annotated[
         bool,
         typer.Option(
@@ -87,8 +82,7 @@ def record(
         ),
     ] = True,
     metrics: Annotated[
-        str | None,
-        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+        str | None, option("PORT", "Serve Prometheus metrics; PORT or HOST:PORT.")
     ] = None,
     accept_edits: Annotated[
         bool,
@@ -117,8 +111,7 @@ def record(
     new_log.check()
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
-        peer.zenoh,
-        max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload),
+        peer.zenoh, max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload)
     )
     keys = tuple(key or (() if is_ros else DEFAULT_KEYS))
     check_keys(keys)
@@ -236,10 +229,7 @@ def _metrics(address: tuple[str, int] | None, recorder: Recorder, log: Path) -> 
 def router(
     listen: ListenOption = None,
     connect: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--connect", metavar="ENDPOINT", help="Router to connect to; may be repeated."
-        ),
+        list[str] | None, option("ENDPOINT", "Router to connect to; may be repeated.", "--connect")
     ] = None,
     zenoh_config: ConfigOption = None,
 ) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from eventsrc.adapters.detector.onnx_model import Device, OnnxModel, model_sha256
 from eventsrc.adapters.detector.picture import PictureError, Pixels
@@ -19,6 +18,7 @@ from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
 from .detect_checks import device_of
 from .folded_log import LogArgument
+from .option import option
 from .options import JsonOption, user_at_host
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say
@@ -57,33 +57,26 @@ def reembed_log(
     log: LogArgument,
     encoder: Annotated[
         Path,
-        typer.Option(
-            metavar="MODEL.onnx",
-            help="Encoder of crops; MODEL.json beside it names its space and describes its input,"
+        option(
+            "MODEL.onnx",
+            "Encoder of crops; MODEL.json beside it names its space and describes its input,"
             " as for `mapfold detect`.",
         ),
     ],
     batch: Annotated[
-        int,
-        typer.Option(metavar="N", min=1, max=MAX_REEMBEDDED, help="Vectors in one event."),
+        int, option("N", "Vectors in one event.", min=1, max=MAX_REEMBEDDED)
     ] = DEFAULT_BATCH,
     crops: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "TOPIC",
+            f"Where the log keeps crops; may be repeated. [default: {CROPS_TOPIC}]",
             "--crops",
-            metavar="TOPIC",
-            help=f"Where the log keeps crops; may be repeated. [default: {CROPS_TOPIC}]",
         ),
     ] = None,
-    device: Annotated[str, typer.Option(metavar="cpu|cuda", help="What the model runs on.")] = (
-        "cpu"
-    ),
-    threads: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Threads of the model.")
-    ] = None,
-    reason: Annotated[
-        str, typer.Option(metavar="TEXT", help="Why, for those who read the log later.")
-    ] = "",
+    device: Annotated[str, option("cpu|cuda", "What the model runs on.")] = ("cpu"),
+    threads: Annotated[int | None, option("N", "Threads of the model.", min=1)] = None,
+    reason: Annotated[str, option("TEXT", "Why, for those who read the log later.")] = "",
     json_: JsonOption = False,
 ) -> None:
     """Add vectors of another encoder to a log, made from the crops that it keeps.

@@ -40,6 +40,7 @@ from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults
+from .option import option
 from .options import CameraOptions, Databases, JsonOption, OptionalQuestion, question_from
 from .terminal import display, emit, emit_lines, say
 
@@ -57,29 +58,25 @@ def relocalize(
     ] = False,
     classes: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "CLASS",
+            "Ask where a thing of this class is near, instead of QUERY; may be repeated.",
             "--class",
-            metavar="CLASS",
-            help="Ask where a thing of this class is near, instead of QUERY; may be repeated.",
         ),
     ] = None,
-    top: Annotated[
-        int, typer.Option("--top", metavar="N", min=1, max=100, help="Places to list.")
-    ] = 3,
+    top: Annotated[int, option("N", "Places to list.", "--top", min=1, max=100)] = 3,
     as_of: Annotated[
-        str | None,
-        typer.Option("--as-of", metavar="W", help=f"Ask the map as it was: {W} of --log."),
+        str | None, option("W", f"Ask the map as it was: {W} of --log.", "--as-of")
     ] = None,
     log: Annotated[
-        Path | None,
-        typer.Option("--log", metavar="LOG", help="Ask this log, folded, instead of the live map."),
+        Path | None, option("LOG", "Ask this log, folded, instead of the live map.", "--log")
     ] = None,
     method: Annotated[
         str,
-        typer.Option(
+        option(
+            "joint|plain",
+            "joint: by poses, from all crops together; plain: similarities summed per Place.",
             "--method",
-            metavar="joint|plain",
-            help="joint: by poses, from all crops together; plain: similarities summed per Place.",
         ),
     ] = "joint",
     camera_options: CameraOptions,

@@ -34,6 +34,7 @@ from projections.postgres.labels import SinkName
 from projections.postgres.origin import command_line
 
 from .folded_log import LogSettings, W
+from .option import option
 from .options import Databases, JsonOption
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say, say_metrics
@@ -112,18 +113,17 @@ class Sinks(StrEnum):
 
 
 OnlyOption = Annotated[
-    Sinks | None,
-    typer.Option("--only", metavar="graph|vectors", help="Only the graph or the vectors."),
+    Sinks | None, option("graph|vectors", "Only the graph or the vectors.", "--only")
 ]
 WorkersOption = Annotated[
     int | None,
-    typer.Option(
+    option(
+        "N",
+        "Processes that read and parse a large LOG ahead of this one. Default: as many as"
+        f" there are further processors, at most {DEFAULT_WORKERS}.",
         "--workers",
-        metavar="N",
         min=0,
         max=MAX_WORKERS,
-        help="Processes that read and parse a large LOG ahead of this one. Default: as many as"
-        f" there are further processors, at most {DEFAULT_WORKERS}.",
     ),
 ]
 
@@ -135,7 +135,7 @@ def only_of(only: Sinks | None) -> SinkName | None:
 
 def replay(
     *,
-    until: Annotated[str, typer.Option("--until", metavar="W", help=f"Fold to here: {W}.")] = "end",
+    until: Annotated[str, option("W", f"Fold to here: {W}.", "--until")] = "end",
     only: OnlyOption = None,
     databases: Databases,
     source: LogSettings,
@@ -185,10 +185,7 @@ def _print_rebuilt(
         )
     if report.hnsw is not None:
         say(f"vector search: {report.hnsw.reason}")
-    for line in (
-        left_out(log, settings, report, logged),
-        places_advice(counts, settings),
-    ):
+    for line in (left_out(log, settings, report, logged), places_advice(counts, settings)):
         if line is not None:
             say(line)
 
@@ -200,8 +197,7 @@ def tail_command(
     databases: Databases,
     source: LogSettings,
     metrics: Annotated[
-        str | None,
-        typer.Option(metavar="PORT", help="Serve Prometheus metrics; PORT or HOST:PORT."),
+        str | None, option("PORT", "Serve Prometheus metrics; PORT or HOST:PORT.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

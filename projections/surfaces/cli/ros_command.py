@@ -6,8 +6,6 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Final
 
-import typer
-
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
 from eventsrc.ros.library import MessageTypes
@@ -16,6 +14,7 @@ from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 
 from .bridge_options import DomainOption, domain_of
 from .folded_log import FoldSettings, NoCacheOption
+from .option import option
 from .options import LiveDbOption, LogOrDbArgument, VectorsOption, ZenohClient
 from .signals import stop_on_signals
 from .terminal import say
@@ -36,12 +35,8 @@ def ros(
     db: LiveDbOption = None,
     vector_db: VectorsOption = None,
     domain: DomainOption = None,
-    namespace: Annotated[
-        str, typer.Option("--namespace", metavar="NS", help="The node's namespace, as /bot1.")
-    ] = "",
-    name: Annotated[str, typer.Option("--name", metavar="NAME", help="The node's name.")] = (
-        "mapfold"
-    ),
+    namespace: Annotated[str, option("NS", "The node's namespace, as /bot1.", "--namespace")] = "",
+    name: Annotated[str, option("NAME", "The node's name.", "--name")] = ("mapfold"),
     settings: FoldSettings,
     no_cache: NoCacheOption = False,
     client: ZenohClient,

@@ -24,6 +24,7 @@ from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
 from projections.surfaces.serve.asked import ServedLog
 
 from .folded_log import FoldSettings, NoCacheOption
+from .option import option
 from .options import (
     CameraOptions,
     Databases,
@@ -53,36 +54,32 @@ class HttpOptions:
 
     token_file: Annotated[
         Path | None,
-        typer.Option(
-            "--token-file",
-            metavar="FILE",
-            help="Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
+        option(
+            "FILE",
+            "Token that HTTP requests must send [env MAPFOLD_TOKEN]; required unless"
             " --http is on loopback.",
+            "--token-file",
         ),
     ] = None
     tls_cert: Annotated[
-        Path | None,
-        typer.Option("--tls-cert", metavar="FILE", help="PEM certificate: serve HTTPS."),
+        Path | None, option("FILE", "PEM certificate: serve HTTPS.", "--tls-cert")
     ] = None
-    tls_key: Annotated[
-        Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM key of --tls-cert.")
-    ] = None
+    tls_key: Annotated[Path | None, option("FILE", "PEM key of --tls-cert.", "--tls-key")] = None
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME",
+            "Name by which HTTP clients call this service, beside its addresses; may be repeated.",
             "--allow-host",
-            metavar="NAME",
-            help="Name by which HTTP clients call this service, beside its addresses; may be"
-            " repeated.",
         ),
     ] = None
     cors: Annotated[
         list[str] | None,
-        typer.Option(
-            "--cors",
-            metavar="ORIGIN",
-            help="Site whose pages may ask from a browser, such as https://map.example; may be"
+        option(
+            "ORIGIN",
+            "Site whose pages may ask from a browser, such as https://map.example; may be"
             " repeated.",
+            "--cors",
         ),
     ] = None
 
@@ -181,37 +178,26 @@ def serve(
     *,
     http: Annotated[
         str | None,
-        typer.Option(
-            "--http",
-            metavar="HOST:PORT",
-            help="Answer over HTTP, too, at this address (extra [serve]).",
-        ),
+        option("HOST:PORT", "Answer over HTTP, too, at this address (extra [serve]).", "--http"),
     ] = None,
     options: HttpOptions,
     zenoh: Annotated[bool, typer.Option(help="Answer over Zenoh.")] = True,
     peer: ZenohPeer,
     workers: Annotated[
-        int,
-        typer.Option("--workers", metavar="N", min=1, max=64, help="Questions answered at a time."),
+        int, option("N", "Questions answered at a time.", "--workers", min=1, max=64)
     ] = 4,
     rate: Annotated[
-        float,
-        typer.Option(
-            "--rate", metavar="N", min=0.1, help="Questions a second on average; more are refused."
-        ),
+        float, option("N", "Questions a second on average; more are refused.", "--rate", min=0.1)
     ] = 500.0,
     max_bytes: Annotated[
-        int,
-        typer.Option(
-            "--max-bytes", metavar="BYTES", min=1000, help="Longer questions are refused."
-        ),
+        int, option("BYTES", "Longer questions are refused.", "--max-bytes", min=1000)
     ] = DEFAULT_MAX_BYTES,
     log: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "LOG",
+            "The log that the databases were made from; HTTP's /changes and /crops need it.",
             "--log",
-            metavar="LOG",
-            help="The log that the databases were made from; HTTP's /changes and /crops need it.",
         ),
     ] = None,
     camera: CameraOptions,
@@ -227,8 +213,7 @@ def serve(
         raise MisuseError("nothing to serve on; give --http HOST:PORT, or leave out --no-zenoh")
     asked_by = camera.camera
     session_options = dataclasses.replace(
-        peer.zenoh,
-        max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes),
+        peer.zenoh, max_message_bytes=max(_LARGEST_BYTES, 4 * max_bytes)
     )
     with ExitStack() as stack:
         endpoint = None if http is None else stack.enter_context(HttpEndpoint.bound(http, options))
@@ -243,12 +228,7 @@ def serve(
             with suppress(ProjectionMissing, DatabaseUnavailable):  # each question says it
                 beside.refuse_other(pools.view())
         answerer = Answerer(
-            pools,
-            per_second=rate,
-            max_bytes=max_bytes,
-            camera=asked_by,
-            log=beside,
-            note=say,
+            pools, per_second=rate, max_bytes=max_bytes, camera=asked_by, log=beside, note=say
         )
         session = None
         if zenoh:
@@ -296,11 +276,7 @@ def mcp(
     vector_db: VectorsOption = None,
     http: Annotated[
         str | None,
-        typer.Option(
-            "--http",
-            metavar="HOST:PORT",
-            help="Serve over HTTP at /mcp instead of stdin and stdout.",
-        ),
+        option("HOST:PORT", "Serve over HTTP at /mcp instead of stdin and stdout.", "--http"),
     ] = None,
     options: HttpOptions,
     allow_edits: Annotated[

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import typer
-
 from eventsrc.adapters.sim import DEFAULT_SEED, SimulatedRun, simulate_run
 from eventsrc.adapters.sim.simulation import publish_run, write_run
 from eventsrc.base.errors import MisuseError
@@ -13,6 +11,7 @@ from eventsrc.record.transport.config import check_key
 from eventsrc.record.transport.session import ZenohOptions, open_session
 
 from .new_log import NewLogOptions
+from .option import option
 from .options import Databases, JsonOption, PublishKeyOption, ZenohPeer
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
@@ -22,27 +21,18 @@ _MAX_NAME: Final = 100
 
 def simulate(
     *,
-    seed: Annotated[int, typer.Option(metavar="N", help="Which house.", min=0)] = DEFAULT_SEED,
+    seed: Annotated[int, option("N", "Which house.", min=0)] = DEFAULT_SEED,
     run: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="Which run: a explores, b, c … are other sessions and tours."
-        ),
+        str, option("NAME", "Which run: a explores, b, c … are other sessions and tours.")
     ] = "a",
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."
-        ),
+        option("FILE", "Write FILE.jsonl or .jsonl.gz (and its truth); publish nothing."),
     ] = None,
     key: PublishKeyOption = "tb/detections",
-    speed: Annotated[
-        float, typer.Option(metavar="X", help="Times real time; 0: without waiting.", min=0.0)
-    ] = 10.0,
+    speed: Annotated[float, option("X", "Times real time; 0: without waiting.", min=0.0)] = 10.0,
     new_log: NewLogOptions,
-    wait: Annotated[
-        float, typer.Option(metavar="SECONDS", help="How long to wait for a subscriber.", min=0.0)
-    ] = 30.0,
+    wait: Annotated[float, option("SECONDS", "How long to wait for a subscriber.", min=0.0)] = 30.0,
     json_: JsonOption = False,
     peer: ZenohPeer,
 ) -> None:
@@ -98,15 +88,11 @@ def _summary(document: dict[str, Any]) -> str:
 
 def demo(
     *,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the log, the databases and map.png.")
-    ] = Path("logs/demo"),
-    seed: Annotated[
-        int, typer.Option(metavar="N", help="Which simulated house.", min=0)
-    ] = DEFAULT_SEED,
-    speed: Annotated[
-        float, typer.Option(metavar="X", help="Times real time.", min=1.0, max=1000.0)
-    ] = 30.0,
+    out: Annotated[Path, option("DIR", "Folder for the log, the databases and map.png.")] = Path(
+        "logs/demo"
+    ),
+    seed: Annotated[int, option("N", "Which simulated house.", min=0)] = DEFAULT_SEED,
+    speed: Annotated[float, option("X", "Times real time.", min=1.0, max=1000.0)] = 30.0,
     databases: Databases,
     json_: JsonOption = False,
 ) -> None:

@@ -33,6 +33,7 @@ from projections.history.rendering import (
 from projections.store.history_records import Merge
 
 from .folded_log import CachedLog, KnownAtOption, W, known_point, point
+from .option import option
 from .options import JsonOption, check_picture
 from .terminal import Bar, display, emit, say
 
@@ -42,7 +43,7 @@ MOST_LINES = 5
 AllOption = Annotated[
     bool, typer.Option("--all", help=f"List all changes, not only {MOST_LINES} of a kind.")
 ]
-AtOption = Annotated[str, typer.Option("--at", metavar="W", help=f"Use the map as of here: {W}.")]
+AtOption = Annotated[str, option("W", f"Use the map as of here: {W}.", "--at")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,21 +76,14 @@ def merges(
     *,
     at: AtOption = "end",
     show: Annotated[
-        int | None,
-        typer.Option(
-            "--show", metavar="N", help="Merge number N alone, with links, objects and edges."
-        ),
+        int | None, option("N", "Merge number N alone, with links, objects and edges.", "--show")
     ] = None,
     draw: Annotated[
-        int | None,
-        typer.Option("--draw", metavar="N", help="Draw merge number N, before and after."),
+        int | None, option("N", "Draw merge number N, before and after.", "--draw")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="The picture of --draw: .png, .svg or .pdf [default: merge.png].",
-        ),
+        option("FILE", "The picture of --draw: .png, .svg or .pdf [default: merge.png]."),
     ] = None,
     refused: Annotated[
         bool,
@@ -180,15 +174,14 @@ def why(
         ),
     ] = None,
     other: Annotated[
-        str | None,
-        typer.Argument(metavar="RUN:KF", help="The second keyframe, as with --same."),
+        str | None, typer.Argument(metavar="RUN:KF", help="The second keyframe, as with --same.")
     ] = None,
     same: Annotated[
         tuple[str, str] | None,
-        typer.Option(
+        option(
+            "RUN:KF RUN:KF",
+            "Since when, and by which merges, two keyframes are in one place.",
             "--same",
-            metavar="RUN:KF RUN:KF",
-            help="Since when, and by which merges, two keyframes are in one place.",
         ),
     ] = None,
     at: AtOption = "end",
@@ -225,11 +218,11 @@ def diff(
     second: Annotated[str, typer.Argument(metavar="W2", help="To here, given as W1.")] = "end",
     known_at: Annotated[
         str | None,
-        typer.Option(
-            "--known-at",
-            metavar="V",
-            help="Apply only the commands recorded before here, to both maps [default: to each map"
+        option(
+            "V",
+            "Apply only the commands recorded before here, to both maps [default: to each map"
             " those before its end].",
+            "--known-at",
         ),
     ] = None,
     json_: JsonOption = False,
@@ -256,22 +249,21 @@ def changes(
     *,
     since: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "W|DAY|RUN",
+            "From here, a day or a run from its start [default: the start of the last run].",
             "--since",
-            metavar="W|DAY|RUN",
-            help="From here, a day or a run from its start [default: the start of the last run].",
         ),
     ] = None,
     until: Annotated[
-        str,
-        typer.Option("--until", metavar="W|DAY|RUN", help="To here, a day or a run to its end."),
+        str, option("W|DAY|RUN", "To here, a day or a run to its end.", "--until")
     ] = "end",
     known_at: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "V",
+            "Apply only the commands recorded before here [default: those before --until].",
             "--known-at",
-            metavar="V",
-            help="Apply only the commands recorded before here [default: those before --until].",
         ),
     ] = None,
     json_: JsonOption = False,
@@ -299,10 +291,8 @@ def changes(
 def bisect(
     *,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
-    start: Annotated[
-        str, typer.Option("--from", metavar="W", help=f"Search from here: {W}.")
-    ] = "0",
-    end: Annotated[str, typer.Option("--to", metavar="W", help="Search to here.")] = "end",
+    start: Annotated[str, option("W", f"Search from here: {W}.", "--from")] = "0",
+    end: Annotated[str, option("W", "Search to here.", "--to")] = "end",
     scan: Annotated[
         bool,
         typer.Option("--scan", help="List every turn to true and to false, not only the first."),

@@ -14,6 +14,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 
 from .folded_log import CachedLog, FoldSettings, W, point
+from .option import option
 from .options import VectorsOption, ZenohClient
 from .signals import stop_on_signals
 from .terminal import say
@@ -33,24 +34,18 @@ _KINDS: Final = ("place", "object", "keyframe", "merge")
 def ui(
     *,
     host: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS", help="Address to listen on; other machines need the printed token."
-        ),
+        str, option("ADDRESS", "Address to listen on; other machines need the printed token.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65_535, help="0 takes a free one.")
-    ] = 0,
+    port: Annotated[int, option("N", "0 takes a free one.", min=0, max=65_535)] = 0,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     at: Annotated[
-        str | None,
-        typer.Option(metavar="W", help=f"Print the link to this moment, as known then: {W}."),
+        str | None, option("W", f"Print the link to this moment, as known then: {W}.")
     ] = None,
     select: Annotated[
         str | None,
-        typer.Option(
-            metavar="THING",
-            help="Print the link to the history of this: place:ID, object:ID, keyframe:RUN/ID or"
+        option(
+            "THING",
+            "Print the link to the history of this: place:ID, object:ID, keyframe:RUN/ID or"
             " merge:OFFSET.",
         ),
     ] = None,
@@ -58,21 +53,17 @@ def ui(
         bool, typer.Option("--allow-edits", help="Let the page record corrections in the log.")
     ] = False,
     truth: Annotated[
-        list[Path] | None,
-        typer.Option("--truth", metavar="FILE", help="Score other settings against this truth."),
+        list[Path] | None, option("FILE", "Score other settings against this truth.", "--truth")
     ] = None,
     allow_host: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME",
+            "Name by which browsers call this machine, beside its addresses; may be repeated.",
             "--allow-host",
-            metavar="NAME",
-            help="Name by which browsers call this machine, beside its addresses; may be repeated.",
         ),
     ] = None,
-    db: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Show how far behind this database is."),
-    ] = None,
+    db: Annotated[str | None, option("URL", "Show how far behind this database is.")] = None,
     vector_db: VectorsOption = None,
     client: ZenohClient,
     source: CachedLog,

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, shorten_by
 from eventsrc.log import LogReader
@@ -25,6 +23,7 @@ from projections.localize.evaluate.truth import read_truth
 from projections.map.own_events import read_commands
 
 from . import folded_log
+from .option import option
 from .options import JsonOption, check_picture
 from .terminal import Bar, display, emit, say
 from .time_travel import MOST_LINES, AllOption, AtOption
@@ -36,64 +35,49 @@ def whatif(
     named: folded_log.NamedSettings,
     set_: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME=VALUE",
+            "Change a setting; all --set make one alternative, and hold for all of a --grid.",
             "--set",
-            metavar="NAME=VALUE",
-            help="Change a setting; all --set make one alternative, and hold for all of a --grid.",
         ),
     ] = None,
     try_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--try",
-            metavar="'NAME=VALUE …'",
-            help="One alternative; may be repeated.",
-        ),
+        list[str] | None, option("'NAME=VALUE …'", "One alternative; may be repeated.", "--try")
     ] = None,
     grid: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME=VALUE,…",
+            "An alternative for every combination of these values and those of other --grid.",
             "--grid",
-            metavar="NAME=VALUE,…",
-            help="An alternative for every combination of these values and those of other --grid.",
         ),
     ] = None,
     base: Annotated[
         str,
-        typer.Option(
-            metavar="'NAME=VALUE …'",
-            help="Settings of the base map, on top of --settings or the log's.",
-        ),
+        option("'NAME=VALUE …'", "Settings of the base map, on top of --settings or the log's."),
     ] = "",
     without: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "COMMAND_ID",
+            "One alternative: the map without this command; may be repeated.",
             "--without",
-            metavar="COMMAND_ID",
-            help="One alternative: the map without this command; may be repeated.",
         ),
     ] = None,
     at: AtOption = "end",
     known_at: folded_log.KnownAtOption = None,
     truth: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--truth", metavar="FILE", help="Score places and objects against this ground truth."
-        ),
+        option("FILE", "Score places and objects against this ground truth.", "--truth"),
     ] = None,
     json_: JsonOption = False,
     all_: AllOption = False,
     picture: Annotated[
-        Path | None,
-        typer.Option(
-            "--picture", metavar="FILE", help="Draw the maps side by side (.png, .svg, .pdf)."
-        ),
+        Path | None, option("FILE", "Draw the maps side by side (.png, .svg, .pdf).", "--picture")
     ] = None,
     processes: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=1, help="Fold in this many processes [default: the number of cores]."
-        ),
+        option("N", "Fold in this many processes [default: the number of cores].", min=1),
     ] = None,
     settings_file: folded_log.SettingsOption = None,
 ) -> None:
