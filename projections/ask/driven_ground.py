@@ -97,10 +97,9 @@ class GoalPose:
 
 
 class DrivenGround:
-    """The driven ground of a map. ``nodes`` are its keyframes, one a square."""
+    """The driven ground of a map, without the map. ``nodes`` are its keyframes, one a square."""
 
     def __init__(self, view: MapView) -> None:
-        self._view = view
         self._grids: dict[_Floor, OccupancyGrid] = {
             floor: free_floor(given.map).grid for floor, given in view.maps_in_force().items()
         }
@@ -167,20 +166,27 @@ class DrivenGround:
             nodes.append(before[nodes[-1]])
         return nodes[::-1]
 
-    def way_m(self, found: ObjectRecord, lengths: Mapping[int, float]) -> float | None:
+    def way_m(
+        self, found: ObjectRecord, seen_by: Iterable[KeyframeRecord], lengths: Mapping[int, float]
+    ) -> float | None:
         """The length of the shortest way to an Object: driven to where it was seen from, then
         straight; None where none of that is reached."""
         ways = [
             lengths[node] + math.dist(self.spots[node], found.spot)
-            for keyframe in self._view.sightings(found)
+            for keyframe in seen_by
             if (node := self.node_of(keyframe)) is not None and node in lengths
         ]
         return min(ways, default=None)
 
-    def goal(self, found: ObjectRecord, clearance_m: float = CLEARANCE_M) -> GoalPose:
-        """The goal of an Object. Raises MisuseError where there is none."""
+    def goal(
+        self,
+        found: ObjectRecord,
+        seen_by: Iterable[KeyframeRecord],
+        clearance_m: float = CLEARANCE_M,
+    ) -> GoalPose:
+        """The goal of an Object, which some keyframes saw. Raises MisuseError for none."""
         since = found.relocations[-1].offset if found.relocations else 0
-        seen = [k for k in self._view.sightings(found) if k.pose is not None and k.offset >= since]
+        seen = [k for k in seen_by if k.pose is not None and k.offset >= since]
         last = max((k.run for k in seen), default=None)
         distances = sorted(math.dist(_spot(keyframe), found.spot) for keyframe in seen)
         usual = distances[len(distances) // 2] if distances else _BEST_M

@@ -20,7 +20,7 @@ from eventsrc.base.text import advised, visible
 from eventsrc.log.seek import time_of
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.exact import UM_PER_M
-from projections.map.naming import MOST_NEAR, Rule, Thing, matches, thing_called, things_of
+from projections.map.naming import MOST_NEAR, Rule, Thing, Things, matches, thing_called, things_of
 from projections.map.phrases import iso_time
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
@@ -225,13 +225,14 @@ class _Meant(NamedTuple):
     remark: str | None = None
 
 
-def _meant(view: MapView, what: str | None, things: list[Thing], words: Words | None) -> _Meant:
+def _meant(view: MapView, what: str | None, things: Things, words: Words | None) -> _Meant:
     """What is asked for."""
     standing = list(view.objects.values())
     if what is None:
         return _Meant("everything", standing, {each.class_name for each in standing})
     shown = what if len(what) <= _MAX_SHOWN else f"{what[:_MAX_SHOWN]}…"  # no name is as long
-    rule, called = matches(shown, (thing for thing in things if thing.kind == "object"))
+    likely = things.likely(shown)
+    rule, called = matches(shown, (thing for thing in likely if thing.kind == "object"))
     if rule in (Rule.ID, Rule.SHORT):
         one = thing_called(shown, called, ["object"])
         found = view.all_objects[view.object_survivors.find(ObjectOrdinal(one.ordinal))]
@@ -239,7 +240,7 @@ def _meant(view: MapView, what: str | None, things: list[Thing], words: Words | 
     match, classes = classes_meant(shown, {each.class_name for each in standing})
     of_class = [each for each in standing if each.class_name in classes]
     is_class = bool(classes) and match != "spelling"
-    places = matches(shown, (thing for thing in things if thing.kind == "place"))[1]
+    places = matches(shown, (thing for thing in likely if thing.kind == "place"))[1]
     remark = None if is_class else _NO_TEXT_ENCODER
     if words is not None and (is_class or not places):
         try:
@@ -284,7 +285,7 @@ def point_of(text: str) -> tuple[float, float] | None:
     return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
 
-def spot_of(near: str, things: list[Thing]) -> tuple[float, float]:
+def spot_of(near: str, things: Things) -> tuple[float, float]:
     """The point that a text means, in metres: ``X,Y``, or an Object or a Place. Raises MisuseError,
     also NoSuchThing and SeveralThings."""
     point = point_of(near)
@@ -308,14 +309,15 @@ class _Ways:
     """Ways over driven ground from a spot."""
 
     def __init__(self, view: MapView, start: tuple[float, float]) -> None:
-        self._ground = DrivenGround(view)
+        self._view, self._ground = view, view.once(DrivenGround)
         node = self._ground.nearest(start)
         self._more = math.dist(self._ground.spots[node], start)
         self._lengths = self._ground.lengths_from(node)[0]
 
     def to(self, each: ObjectRecord) -> float | None:
         """The length of the way to an Object, in metres; None where there is none."""
-        way = self._ground.way_m(each, self._lengths)
+        seen_by = self._view.sightings(each)
+        way = self._ground.way_m(each, seen_by, self._lengths)
         return None if way is None else self._more + way
 
 

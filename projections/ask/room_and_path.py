@@ -129,7 +129,7 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
     """The shortest way over driven ground from one thing to another. Each is a point ``X,Y``, an
     Object or a Place, by any of its names: a Place is the pose in it next to its centre, an Object
     its goal. Raises MisuseError, also NoSuchThing and SeveralThings."""
-    ground = DrivenGround(view)
+    ground = view.once(DrivenGround)
     first, _ = _end_of(view, ground, start, clearance_m)
     last, goal = _end_of(view, ground, end, clearance_m)
     nodes = ground.nodes_between(first, last)
@@ -165,7 +165,8 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
 
 def goal_of(view: MapView, object_id: str, clearance_m: float = CLEARANCE_M) -> GoalPose:
     """The pose from which to see an Object; see `DrivenGround.goal`."""
-    return DrivenGround(view).goal(_object(view, object_id), clearance_m)
+    found = _object(view, object_id)
+    return view.once(DrivenGround).goal(found, view.sightings(found), clearance_m)
 
 
 def _end_of(
@@ -176,10 +177,12 @@ def _end_of(
     if point is not None:
         return ground.nearest(point), None
     things = things_of(view)
-    sure = [each for each in things if each.kind == "place" or _is_confirmed(view, each)]
+    likely = things.likely(text)
+    sure = [each for each in likely if each.kind == "place" or _is_confirmed(view, each)]
     thing = thing_called(text, sure if matches(text, sure)[1] else things, ["place", "object"])
     if thing.kind == "object":
-        goal = ground.goal(_object(view, thing.id), clearance_m)
+        found = _object(view, thing.id)
+        goal = ground.goal(found, view.sightings(found), clearance_m)
         return ground.nearest((goal.x, goal.y)), goal
     place = view.survivors.find(PlaceOrdinal(thing.ordinal))
     record = view.all_places[place]

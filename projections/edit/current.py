@@ -101,13 +101,8 @@ class MapToEdit:
         return {o.det_id: o for o in self.view.observations}
 
     @cached_property
-    def things(self) -> list[Thing]:
-        """The places and objects of the map, by what they may be called."""
-        return things_of(self.view)
-
-    @cached_property
     def _short_ids(self) -> ShortIds:
-        return ShortIds.of(self.things)
+        return ShortIds.of(things_of(self.view))
 
     def shortened(self, text: str) -> str:
         """A text with short ids, once the map is folded."""
@@ -144,7 +139,7 @@ class MapToEdit:
         if keyframe is None or keyframe not in self.keyframes:
             try:
                 return self.founder(
-                    PlaceOrdinal(thing_called(text, self.things, ("place",)).ordinal)
+                    PlaceOrdinal(thing_called(text, things_of(self.view), ("place",)).ordinal)
                 )
             except NoSuchThing:
                 if not is_keyframe:
@@ -188,7 +183,7 @@ class MapToEdit:
 
     def _object_called(self, text: str) -> Thing:
         try:
-            return thing_called(text, self.things, ("object",))
+            return thing_called(text, things_of(self.view), ("object",))
         except NoSuchThing:
             if text.startswith("obj-") or not self.observations:
                 raise

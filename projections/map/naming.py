@@ -17,10 +17,12 @@ comes later, only if it means none of these.
 
 import difflib
 import re
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from itertools import pairwise
 from typing import Final, Literal
 
@@ -168,9 +170,51 @@ def matches(text: str, things: Iterable[Thing]) -> tuple[Rule | None, list[Thing
     return best[0], found[best]
 
 
-def thing_called(text: str, things: Sequence[Thing], kinds: Sequence[Kind]) -> Thing:
+class Things(Iterable[Thing]):
+    """Things, of which `likely` finds those that a text may mean without going through all."""
+
+    def __init__(self, things: Iterable[Thing]) -> None:
+        self._all = tuple(things)
+
+    def __iter__(self) -> Iterator[Thing]:
+        return iter(self._all)
+
+    def likely(self, text: str) -> list[Thing]:
+        """All things that the rules of `matches` may find, in their order."""
+        folded, found = text.casefold(), set[int]()
+        for key in {text, folded, NAMES.get(folded)}:
+            found.update(self._called.get(key, ()))
+        digits = _DIGITS.fullmatch(text)
+        if digits is not None:
+            start = f"obj-{digits[1]}"
+            at = bisect_left(self._ids, (start, 0))
+            while at < len(self._ids) and self._ids[at][0].startswith(start):
+                found.add(self._ids[at][1])
+                at += 1
+        return [self._all[number] for number in sorted(found)]
+
+    @cached_property
+    def _ids(self) -> list[tuple[str, int]]:
+        return sorted((thing.id, number) for number, thing in enumerate(self._all))
+
+    @cached_property
+    def _called(self) -> dict[str | None, list[int]]:
+        """The things by what each may be called, but for beginnings of ids."""
+        found: dict[str | None, list[int]] = {}
+        for number, thing in enumerate(self._all):
+            words = (each for each in (thing.name, thing.word) if each is not None)
+            keys = {thing.id, *(word.casefold() for word in words)}
+            if thing.kind == "place":
+                keys.add(_place_number(thing.id) or thing.id)
+            for key in keys:
+                found.setdefault(key, []).append(number)
+        return found
+
+
+def thing_called(text: str, things: Iterable[Thing], kinds: Sequence[Kind]) -> Thing:
     """The one thing of these kinds that a text means. Raises NoSuchThing and SeveralThings."""
-    found = matches(text, (thing for thing in things if thing.kind in kinds))[1]
+    likely = things.likely(text) if isinstance(things, Things) else things
+    found = matches(text, (thing for thing in likely if thing.kind in kinds))[1]
     if len(found) == 1:
         return found[0]
     if found:
@@ -178,7 +222,7 @@ def thing_called(text: str, things: Sequence[Thing], kinds: Sequence[Kind]) -> T
     raise no_such_thing(text, things, kinds)
 
 
-def no_such_thing(text: str, things: Sequence[Thing], kinds: Sequence[Kind]) -> NoSuchThing:
+def no_such_thing(text: str, things: Iterable[Thing], kinds: Sequence[Kind]) -> NoSuchThing:
     """The error for a text that means none of these things."""
     if len(kinds) > 1 and text.startswith("obj-"):
         kinds = ["object"]
@@ -192,8 +236,12 @@ def no_such_thing(text: str, things: Sequence[Thing], kinds: Sequence[Kind]) -> 
     return NoSuchThing(" or ".join(kinds), text, ids, dict.fromkeys(also), advice)
 
 
-def things_of(view: MapView) -> list[Thing]:
+def things_of(view: MapView) -> Things:
     """The Places and Objects of a map, also those that were merged into others, Places first."""
+    return view.once(_things_of)
+
+
+def _things_of(view: MapView) -> Things:
     found = []
     for place in view.all_places:
         stands = place.ordinal in view.places
@@ -227,7 +275,7 @@ def things_of(view: MapView) -> list[Thing]:
                 fate=None if stands else _merged(survivor.object_id),
             )
         )
-    return found
+    return Things(found)
 
 
 def _merged(into: str | None) -> str:
@@ -249,7 +297,7 @@ class ShortIds:
         self._numbered = {part: whole for whole, part in self._shown.items()}
 
     @classmethod
-    def of(cls, things: Sequence[Thing]) -> "ShortIds":
+    def of(cls, things: Iterable[Thing]) -> "ShortIds":
         """Those of some things."""
         return cls(
             [thing.id for thing in things if thing.kind == "place"],

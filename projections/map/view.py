@@ -8,7 +8,7 @@ survivor `KeyframeRecord.place` looks up: it costs little however many keyframes
 from bisect import insort
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from projections.fold.settings import Settings
 from . import records
 from .confirmed import confirm
 
+_T = TypeVar("_T")
 _BY_CORRECTION: tuple[SkipKind, ...] = ("forgotten", "dropped")
 
 
@@ -67,13 +68,23 @@ class MapView:
         self.contents = records.PlaceContents()
         self.maps: dict[str | None, deltas.MapGiven] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
+        self._made: dict[Callable[..., Any], Any] = {}
+
+    def once(self, make: Callable[["MapView"], _T]) -> _T:
+        """What ``make`` makes of this map, kept until a delta changes it; it must not hold it."""
+        if make not in self._made:
+            self._made[make] = make(self)
+        found: _T = self._made[make]
+        return found
 
     def apply(self, delta: Delta) -> None:
         """Apply one delta."""
+        self._made = {}
         self._APPLIERS[type(delta)](self, delta)
 
     def apply_event(self, offset: Offset, changes: Iterable[Delta]) -> None:
         """Apply all deltas of the event at ``offset`` and advance past it."""
+        self._made = {}
         appliers = self._APPLIERS
         for delta in changes:
             appliers[type(delta)](self, delta)
@@ -147,27 +158,16 @@ class MapView:
     def _run_seen(self, delta: deltas.RunSeen) -> None:
         if delta.run == len(self.runs):
             self.runs.append(records.RunRecord(delta.run, delta.run_id, delta.started_at))
-        else:
-            self.runs[delta.run].started_at = delta.started_at
+        self.runs[delta.run].started_at = delta.started_at
 
     def _keyframe_added(self, delta: deltas.KeyframeAdded) -> None:
         if delta.keyframe < len(self.keyframes):
             return
         self.runs[delta.run].keyframe_count += 1
-        self.keyframes.append(
-            records.KeyframeRecord(
-                delta.keyframe,
-                delta.offset,
-                delta.run,
-                delta.run_id,
-                delta.keyframe_id,
-                delta.timestamp,
-                delta.pose,
-                self.survivors,
-                floor=delta.floor,
-                camera=delta.camera,
-            )
-        )
+        known = delta.keyframe, delta.offset, delta.run, delta.run_id, delta.keyframe_id
+        seen = delta.timestamp, delta.pose, self.survivors
+        record = records.KeyframeRecord
+        self.keyframes.append(record(*known, *seen, floor=delta.floor, camera=delta.camera))
         if delta.floor is not None:
             self.floors.setdefault(delta.floor, len(self.floors))
 

@@ -14,6 +14,7 @@ from projections.map.naming import (
     SeveralThings,
     ShortIds,
     Thing,
+    Things,
     matches,
     thing_called,
 )
@@ -93,6 +94,11 @@ def test_a_text_means_what_the_rules_say(
         thing_called(text, things, of)
     assert repr(text) in str(caught.value)
     assert all(thing.id in str(caught.value) for thing in expected)
+
+
+@given(maps, texts)
+def test_likely_things_are_all_that_a_text_may_mean(things: list[Thing], text: str) -> None:
+    assert matches(text, Things(things).likely(text)) == matches(text, things)
 
 
 @given(maps)

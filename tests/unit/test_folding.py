@@ -12,6 +12,7 @@ from projections.fold.map_errors import FoldError
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_event, fold_events
+from projections.map.view import MapView
 from tests.support.envelopes import detection, envelope, payload
 
 
@@ -52,6 +53,22 @@ def test_an_envelope_that_does_not_validate_stops_the_fold_at_its_offset(ahead: 
     rest = list(fold_events(events[4:], semantic_map, ahead=ahead))
     assert [f.offset for f in rest] == [4, 5, 6, 7]
     assert semantic_map.folded_ids.offsets.tolist() == [0, 1, 2, 4, 5, 7]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_was_made_of_a_map_is_made_again_once_the_map_has_changed(whole: bool) -> None:
+    def keyframes(of: MapView) -> list[int]:
+        return [each.keyframe_id for each in of.keyframes]
+
+    view = MapView(Settings())
+    for folded in fold_events(_events(3)[:3], SemanticMap(Settings())):
+        if whole:
+            view.apply_event(folded.offset, folded.deltas)
+        else:
+            for delta in folded.deltas:
+                view.apply(delta)
+        assert view.once(keyframes) == keyframes(view)
+        assert view.once(keyframes) is view.once(keyframes)
 
 
 def test_one_event_is_not_read_before_it_is_asked_for() -> None:

@@ -13,6 +13,7 @@ import pytest
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import LogReader
+from projections.ask.find import Wanted, find
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
@@ -38,6 +39,14 @@ def folded() -> object:
         return fold_log(reader, Settings())[1]
 
 
+def asked() -> object:
+    """A map that keeps what questions made of it."""
+    with LogReader(SAMPLE) as reader:
+        view = fold_log(reader, Settings())[1]
+    find(view, Wanted(near="p0", start="0,0", every=True))
+    return view
+
+
 def folding() -> object:
     with LogReader(SAMPLE) as reader:
         return fold_log(reader, Settings())[0]
@@ -52,6 +61,7 @@ def no_map(offset: Offset) -> OccupancyMap:
     "make",
     [
         folded,
+        asked,
         folding,
         lambda: LiveFold(Settings()).view,
         GraphSink,
@@ -59,7 +69,16 @@ def no_map(offset: Offset) -> OccupancyMap:
         VectorSink,
         lambda: History(Settings(), NO_CORRECTIONS, Tables(), no_map),
     ],
-    ids=["view", "map", "live view", "graph sink", "tracker", "vector sink", "history"],
+    ids=[
+        "view",
+        "asked view",
+        "map",
+        "live view",
+        "graph sink",
+        "tracker",
+        "vector sink",
+        "history",
+    ],
 )
 def test_it_is_in_no_reference_cycle(make: Callable[[], object]) -> None:
     thing = make()

@@ -168,6 +168,7 @@ class ServedLog:
     def __init__(self, log: Path, note: Callable[[str], None] = lambda _: None) -> None:
         self._lock, self._settings = threading.Lock(), Settings()
         self._timeline = LogTimeline(log, lambda _: self._settings, note=note, histories=1)
+        self._past: tuple[object, MapView] | None = None
         self._crops = KeptCrops(self._timeline.reader)
 
     def close(self) -> None:
@@ -204,7 +205,10 @@ class ServedLog:
             known_at = end
             if query.known_at is not None:
                 known_at = self._timeline.moment(query.known_at, is_end=True)
-            return query.question()(self._timeline.at(end, known_at=known_at))
+            at = end, known_at, self._settings
+            if self._past is None or self._past[0] != at:  # what it knows of its things is kept
+                self._past = at, self._timeline.at(end, known_at=known_at)
+            return query.question()(self._past[1])
 
     def changes(self, served: LiveView, asked: ChangesQuery) -> dict[str, Any]:
         """A page of what changed. Raises NotInMapError."""
