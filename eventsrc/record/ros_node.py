@@ -145,6 +145,10 @@ class RosPublisher:
         self._kept = whole, attached  # before it is sent: who subscribes now gets one of the two
         self._sender.put(payload, attached)
 
+    def wait_for_subscriber(self, timeout_s: float) -> bool:
+        """Wait until somebody subscribes; False when there was nobody in time."""
+        return self._sender.wait_for_subscriber(timeout_s)
+
     def _reply(self, key: str, query: Query) -> None:
         if self._kept is None:
             query.close()

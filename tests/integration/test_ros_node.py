@@ -1,6 +1,9 @@
 """`mapfold ros`: the node's tokens, and what late and early subscribers get of the map, by Zenoh's
 own advanced subscriber, which is that of rmw_zenoh."""
 
+import contextlib
+import json
+import math
 import queue
 import signal
 from collections.abc import Callable, Iterator
@@ -15,12 +18,20 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from eventsrc.record.ros_node import TRIGGER, TRIGGER_HASH, TRIGGERED, RosNode
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.wire import RmwWire, end_of_key
-from projections.adapters.ros.messages import DETECTIONS, GRID, MARKERS, MapMessages
+from projections.adapters.ros.messages import (
+    DETECTIONS,
+    GRID,
+    MARKERS,
+    POSE,
+    POSE_WITH_COVARIANCE,
+    MapMessages,
+)
 from projections.adapters.ros.shown_map import ShownMap
 from projections.surfaces.python.map import fold
 from tests.support import rmw
 from tests.support.commands import Commands
 from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.lost_robot import check_initial_pose, look_around
 from tests.support.ros_messages import TYPES
 
 Sessions = Callable[[], Session]
@@ -156,3 +167,63 @@ def test_options_of_the_command(tmp_path: Path) -> None:
         (["L", "--vector-db", "x"], "--vector-db is for --db"),
     ):
         assert said in run("ros", *wrong, code=2).err
+
+
+@pytest.mark.seconds
+def test_a_lost_robot_that_looks_around_is_told_where_it_is(
+    endpoint: str, connected: Sessions, start_code: Callable[..., Program]
+) -> None:
+    end = end_of_key(POSE_WITH_COVARIANCE, rmw.type_hash(POSE_WITH_COVARIANCE))
+    told: queue.Queue[Any] = queue.Queue()
+    session = connected()
+    session.subscribe(
+        f"3/initialpose/{end}", lambda m: told.put(TYPES.decode(m.payload, POSE_WITH_COVARIANCE))
+    )
+    session.confirm()
+    program = start_code(
+        MAPFOLD, "ros", str(Path(SAMPLE).resolve()), "--connect", endpoint, "--domain", "3",
+        "--no-cache",
+    )  # fmt: skip
+    program.wait_for("map of 447 events")
+    trigger = f"3/mapfold/localize/{end_of_key(TRIGGER, TRIGGER_HASH)}"
+    asked = rmw.attachment(1, bytes(16))
+    (reply,) = session.raw.get(trigger, payload=b"\0\1\0\0\0", attachment=asked)
+    assert reply.ok is not None
+    assert b"turn the robot" in reply.ok.payload.to_bytes()
+    program.wait_for("waiting for a publisher of vision_msgs/msg/Detection2DArray")
+    poses: list[Any] = []
+
+    def is_told() -> bool:
+        with contextlib.suppress(queue.Empty):
+            poses.append(told.get(timeout=0.1))
+        return bool(poses)
+
+    with rmw.node(endpoint, 3) as robot:
+        sent = look_around(robot, is_told)
+    check_initial_pose(poses[0], sent)
+    program.wait_for("/initialpose: (")
+    assert program.end(signal.SIGINT) == 0
+
+
+def test_a_goal_is_sent(tmp_path: Path, endpoint: str, connected: Sessions) -> None:
+    run = Commands.in_folder(tmp_path)
+    goal = "find", str(Path(SAMPLE).resolve()), "toilet", "--goal", "json", "--no-cache"
+    at = "--connect", endpoint, "--domain", "3", "--namespace", "/bot1"
+    assert "give --goal" in run("find", goal[1], "--send", code=2).err
+    assert "go with --send" in run(*goal, "--domain", "3", code=2).err
+    told: queue.Queue[Any] = queue.Queue()
+    session = connected()
+    key = f"3/bot1/goal_pose/{end_of_key(POSE, rmw.type_hash(POSE))}"
+    with session.raw.declare_subscriber(
+        key, lambda sample: told.put(TYPES.decode(sample.payload.to_bytes(), POSE))
+    ):
+        session.confirm()
+        sent = run(*goal, "--send", *at)
+        assert "sent to /bot1/goal_pose" in sent.err
+        message = told.get(timeout=DEADLINE_S)
+    printed = json.loads(sent.out)
+    position = message.pose.position
+    assert message.header.frame_id == "map"
+    assert (position.x, position.y) == (printed["x"], printed["y"])
+    yaw = 2 * math.atan2(message.pose.orientation.z, message.pose.orientation.w)
+    assert math.isclose(yaw, printed["yaw"], abs_tol=1e-9)

@@ -1,18 +1,32 @@
 """zenoh-ros2-sdk, a node over rmw_zenoh by somebody else, as the robot in another process: its
 keys, tokens, type hashes and attachments, recorded and found by `record --ros2`."""
 
+import contextlib
 import json
+import queue
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from eventsrc.envelope.system_events import LOSS_KEY
+from projections.adapters.ros.messages import (
+    DETECTIONS,
+    GRID,
+    MARKERS,
+    POSE_WITH_COVARIANCE,
+    MapMessages,
+)
+from projections.surfaces.python.map import fold
+from tests.support import rmw
 from tests.support.fixtures_log import read_log
-from tests.support.fixtures_zenoh import MAPFOLD, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.logs import SAMPLE
+from tests.support.lost_robot import check_initial_pose, look_around
 from tests.support.rmw import type_hash
 from tests.support.ros2dds import KINDS, drive
 from tests.support.ros2dds_recordings import check_derived, envelopes, verbatim
@@ -103,6 +117,87 @@ def test_ten_thousand_messages_of_its_node_are_recorded_or_counted_as_lost(
     check_derived(log)
     if congestion == "block":
         assert (lost, len(verbatim(events)), len(envelopes(events))) == (0, len(sent), KEYFRAMES)
+
+
+LISTENER = """
+import json
+import sys
+from zenoh_ros2_sdk import ROS2Subscriber
+from tests.support.rmw import type_hash
+from tests.support.ros_messages import TYPES
+from projections.adapters.ros.messages import MARKERS, POSE_WITH_COVARIANCE
+
+port = int(sys.argv[1])
+
+def told(kind, message):
+    text = TYPES.encode(message, kind).hex()
+    print(json.dumps({"kind": kind, "cdr": text}), flush=True)
+
+subscribers = [
+    ROS2Subscriber(
+        topic=topic, msg_type=kind, msg_definition=TYPES.definition(kind), domain_id=7,
+        type_hash=type_hash(kind), router_port=port,
+        callback=lambda message, kind=kind: told(kind, message),
+    )
+    for topic, kind in (("/mapfold/markers", MARKERS), ("/initialpose", POSE_WITH_COVARIANCE))
+]
+session = subscribers[0].session_mgr.session
+for _ in session.get("mapfold/confirm/listener"):
+    pass
+print("ready", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_it_lists_our_topics_and_decodes_our_markers_and_the_initial_pose(
+    endpoint: str, start_code: Callable[..., Program]
+) -> None:
+    port = endpoint.rpartition(":")[2]
+    told: queue.Queue[dict[str, str]] = queue.Queue()
+    with subprocess.Popen(
+        [sys.executable, "-c", LISTENER, port],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as listener:
+        try:
+            assert listener.stdout is not None
+            assert listener.stdout.readline() == "ready\n"
+            lines = listener.stdout
+            threading.Thread(target=lambda: [told.put(json.loads(line)) for line in lines]).start()
+            program = start_code(
+                MAPFOLD, "ros", str(SAMPLE), "--connect", endpoint, "--domain", "7", "--auto",
+                "--no-cache",
+            )  # fmt: skip
+            markers = told.get(timeout=DEADLINE_S)
+            poses: list[dict[str, str]] = []
+
+            def is_told() -> bool:
+                with contextlib.suppress(queue.Empty):
+                    poses.append(told.get(timeout=0.1))
+                return bool(poses)
+
+            with rmw.node(endpoint, 7) as robot:
+                sent = look_around(robot, is_told)
+            listed = subprocess.run(
+                [sys.executable, "-m", "zenoh_ros2_sdk.topic_cli", "--router", f"127.0.0.1:{port}",
+                 "--domain-id", "7", "list", "-t"],
+                capture_output=True, text=True, check=True,
+            ).stdout  # fmt: skip
+            assert program.end(signal.SIGINT) == 0
+        finally:
+            listener.kill()
+    view = fold(SAMPLE).view
+    whole = TYPES.decode(bytes.fromhex(markers["cdr"]), MARKERS)
+    assert {(m.ns, m.id) for m in whole.markers} == MapMessages(TYPES).markers(view).keys()
+    check_initial_pose(TYPES.decode(bytes.fromhex(poses[0]["cdr"]), POSE_WITH_COVARIANCE), sent)
+    for topic, kind in (
+        ("/mapfold/markers", MARKERS),
+        ("/mapfold/objects", DETECTIONS),
+        ("/mapfold/walls", GRID),
+        ("/initialpose", POSE_WITH_COVARIANCE),
+    ):
+        assert f"{topic} [{kind}]" in listed
 
 
 def test_its_type_hash_is_that_of_rosbags() -> None:

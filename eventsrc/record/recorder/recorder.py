@@ -23,14 +23,12 @@ from eventsrc.record.transport.session import (
 
 from .bridged import Bridge
 from .edits import EditRequest, Edits, edit_key
+from .listener import fetch_kept, subscribe_to
 from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
 from .writer_thread import RecorderReport, WriterThread
 
 DEFAULT_KEYS: Final = ("tb/detections",)
 DEFAULT_CROPS: Final = (f"{CROPS_TOPIC}/*",)
-_CACHE_TIMEOUT_S: Final = 2.0
-_MAX_CACHED: Final = 1_000
-"""Limit for the messages fetched from a bridge's cache of one topic."""
 
 
 class Recorder:
@@ -99,37 +97,14 @@ class Recorder:
         session.confirm()
 
     def _subscribe_bridge(self, session: Session, bridge: Bridge) -> None:
-        """Subscribe to the tokens of publishers, then to their messages, and get those that they
-        keep for late subscribers."""
-        wire = bridge.wire
-        for topic in bridge.topics:
-            for selector in wire.token_selectors(topic):
-                self._subscriptions.append(session.subscribe_tokens(selector, bridge.note_token))
-        for key in bridge.keys:
-            self._subscriptions += [
-                session.subscribe(
-                    key,
-                    self._receive_bridged,
-                    in_order=True,
-                    read_attachment=wire.read_attachment,
-                ),
-                session.subscribe_heartbeats(key, self._queue.put_heartbeat),
-            ]
+        """Subscribe to the messages of a bridge, and get those kept for late subscribers."""
+        self._subscriptions += subscribe_to(session, bridge, self._receive_bridged)
+        self._subscriptions += [
+            session.subscribe_heartbeats(key, self._queue.put_heartbeat) for key in bridge.keys
+        ]
         session.confirm()
         bridge.take_new_latched()
-        self._fetch(bridge, bridge.latched_topics)
-
-    def _fetch(self, bridge: Bridge, topics: Sequence[str]) -> None:
-        """Get the messages of topics that their publishers keep for late subscribers."""
-        wire = bridge.wire
-        for selector in (each for topic in topics for each in wire.cache_selectors(topic)):
-            for message in self._session.cached(
-                selector,
-                timeout_s=_CACHE_TIMEOUT_S,
-                most=_MAX_CACHED,
-                read_attachment=wire.read_attachment,
-            ):
-                self._receive_bridged(message)
+        fetch_kept(session, bridge, bridge.latched_topics, self._receive_bridged)
 
     def run(
         self,
@@ -166,7 +141,7 @@ class Recorder:
         bridge = self._bridge
         while not stop.wait(every_s if watch is not None or bridge is not None else None):
             if bridge is not None and (late := bridge.take_new_latched()):
-                self._fetch(bridge, late)
+                fetch_kept(self._session, bridge, late, self._receive_bridged)
             if watch is not None:
                 watch(self.report())
 

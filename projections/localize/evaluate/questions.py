@@ -8,7 +8,6 @@ between them by the poses that it reported.
 """
 
 import hashlib
-import math
 import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,12 +22,13 @@ from eventsrc.log import LogReader
 from eventsrc.log.reader import OnGap
 from projections.fold.corrections import Corrections
 from projections.fold.edited_events import Reembedded, relabelled
-from projections.fold.exact import metres_to_um, quantise, to_float32
+from projections.fold.exact import metres_to_um
 from projections.fold.floors import floor_name
 from projections.fold.settings import CameraSettings, Settings
 from projections.fold.sights import camera_of
 from projections.localize import relocalize
 from projections.localize.relocalize import QuestionCrop, QuestionView
+from projections.localize.relocalize.lost_robot import crop_of, moved_between, pose_of
 from projections.map.own_events import read_corrections, vectors_of
 
 from .truth import Key, Truth
@@ -214,42 +214,16 @@ def _question(
     views = []
     before = drawn[0][0]
     for keyframe, indices in drawn:
-        crops = tuple(_crop(keyframe, index) for index in indices)
-        views.append(QuestionView(*_moved(_pose(before), _pose(keyframe)), crops))
+        crops = tuple(crop_of(keyframe, index) for index in indices)
+        views.append(QuestionView(*moved_between(pose_of(before), pose_of(keyframe)), crops))
         before = keyframe
     key, stated = _key(before), before.envelope.camera
     camera = None if stated is None else camera_of(stated, CameraSettings())
     return ScoredQuestion(
         key,
         relocalize.Question(tuple(views), camera),
-        *_pose(before),
+        *pose_of(before),
         truth.room(key),
         tuple(truth.instance(_key(k), index) for k, indices in drawn for index in indices),
         floor_of(before, floor_height_m),
-    )
-
-
-def _pose(keyframe: Accepted) -> tuple[float, float, float]:
-    envelope = keyframe.envelope
-    return envelope.map_x or 0.0, envelope.map_y or 0.0, envelope.map_yaw or 0.0
-
-
-def _moved(
-    before: tuple[float, float, float], after: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """Metres ahead and to the left, and radians to the left, in the frame of the first pose."""
-    dx, dy, yaw = after[0] - before[0], after[1] - before[1], before[2]
-    turned = math.remainder(after[2] - yaw, math.tau)
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return cos * dx + sin * dy, cos * dy - sin * dx, turned
-
-
-def _crop(keyframe: Accepted, index: int) -> QuestionCrop:
-    detection, vector = keyframe.envelope.detections[index], keyframe.vectors[index]
-    return QuestionCrop(
-        None if vector is None else to_float32(quantise(vector)),
-        detection.bbox,
-        detection.class_name,
-        keyframe.det_ids[index],
-        detection.embedding_model,
     )

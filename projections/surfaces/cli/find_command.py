@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -12,7 +11,7 @@ import typer
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised, counted, shorten_by, table, visible
 from projections.ask.best_views import write_best
-from projections.ask.driven_ground import CLEARANCE_M, GoalPose
+from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
 from projections.ask.words import ObjectVectors, Words
@@ -22,31 +21,10 @@ from projections.store.history_recorder import map_after
 from projections.surfaces.text_encoders import words_of
 
 from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
+from .goals import ClearanceOption, GoalOption, GoalSender, print_goal
 from .option import option
 from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument
 from .terminal import display, emit, say
-
-
-class GoalForm(StrEnum):
-    """How a goal is printed."""
-
-    JSON = "json"
-    YAML = "yaml"
-    ROS2 = "ros2"
-
-
-GoalOption = Annotated[
-    GoalForm | None,
-    option(
-        "json|yaml|ros2",
-        "Print instead the pose from which a robot sees it: as JSON, a PoseStamped in YAML, or"
-        " a ros2 command that sends it.",
-        "--goal",
-    ),
-]
-ClearanceOption = Annotated[
-    float, option("METRES", "Least distance of goals from walls.", "--clearance", min=0.0)
-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +160,7 @@ def find_things(
     ] = None,
     goal: GoalOption = None,
     clearance: ClearanceOption = CLEARANCE_M,
+    sender: GoalSender,
     json_: JsonOption = False,
 ) -> None:
     """Find things: where they are, how often and when they were seen.
@@ -189,6 +168,7 @@ def find_things(
     WHAT forgives letter case, plurals and near spellings; a place is given by its id, name or type.
     """
     (what,) = asked.words(what)
+    sender.check(goal)
     if crops is not None and asked.db is not None:
         raise MisuseError("--crops needs the LOG: the databases keep no crops")
     wanted = Wanted(
@@ -209,7 +189,9 @@ def find_things(
     if goal is not None:
         if not found.answers:
             raise MapfoldError("nothing found, so there is no goal")
-        _print_goal(goal_of(view, found.answers[0].object_id, clearance), goal)
+        pose = goal_of(view, found.answers[0].object_id, clearance)
+        print_goal(pose, goal)
+        sender.send(pose)
         return
     if json_:
         document = found.document()
@@ -266,7 +248,7 @@ def show_path(
     if goal is not None:
         if found.goal is None:
             raise MisuseError(f"--goal faces a thing, and {visible(end)} is none; give an object")
-        _print_goal(found.goal, goal)
+        print_goal(found.goal, goal)
     elif json_:
         emit(found.document())
     else:
@@ -274,13 +256,6 @@ def show_path(
 
 
 _MOST_IN_ROOM: Final = 10
-
-
-def _print_goal(found: GoalPose, form: GoalForm) -> None:
-    if form is GoalForm.JSON:
-        emit(found.document())
-    else:
-        display(found.pose_stamped() if form is GoalForm.YAML else found.topic_pub())
 
 
 def _room_text(found: Room, most: int | None) -> str:

@@ -5,13 +5,15 @@ scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profil
     --ask | --align]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
+scripts/bench_truth --lost [--quick] …
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
     [--jobs N] …
 
 With --no-embeddings the detectors are bare ones; in the table of Objects page is then as if all
 looked alike: the class and the radius decide.
 
-With --localise another table: where the robot is, asked of the map of run a.
+With --localise another table: where the robot is, asked of the map of run a. With --lost: robots
+that wake somewhere and turn once, and when they are told where they are.
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """
@@ -39,6 +41,7 @@ from .calibrating import calibrated_settings, calibration_table
 from .folding import fold_timed
 from .localising import MAPS, LocaliseRow, localise, stranger_of
 from .localising_table import localise_table
+from .losing import LostRow, lost_row, lost_table
 from .moving import score_moved
 from .place_types import TypesRow, types_row, types_table
 from .places import RULES, PlacesRow, places_row, places_table
@@ -79,6 +82,16 @@ def main() -> None:
             _write(options.json, bags)
             return
         cases = _cases(generator, chosen, options, limit)
+        if options.lost:
+            lost = [
+                lost_row(generator, case, stranger_of(generator, options.half, _world(case)), limit)
+                for case in cases
+                if _world(case) in world_names(generator)
+            ]
+            print(f"{options.half} half: turns of 20 keyframes")
+            print(lost_table(lost))
+            _write(options.json, lost)
+            return
         if options.align:
             aligned = align_rows(list(cases), options.seed)
             print(f"{options.half} half, {options.moved:g} of the movable things moved")
@@ -141,7 +154,7 @@ def _world(case: Case) -> str:
 
 def _write(
     path: Path | None,
-    rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow | AlignRow],
+    rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow | AlignRow | LostRow],
 ) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
@@ -230,6 +243,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--align", action="store_true", help="runs in frames of their own find each other, instead"
     )
+    parser.add_argument("--lost", action="store_true", help="robots that turn on the spot, instead")
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument(
         "--no-camera", action="store_true", help="with --localise: maps estimate the field of view"
