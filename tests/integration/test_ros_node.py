@@ -18,7 +18,7 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from eventsrc.record.ros_node import TRIGGER, TRIGGER_HASH, TRIGGERED, RosNode
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.wire import RmwWire, end_of_key
-from projections.adapters.ros.messages import (
+from projections.adapters.ros.map_messages import (
     DETECTIONS,
     GRID,
     MARKERS,

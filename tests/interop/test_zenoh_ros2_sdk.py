@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.envelope.system_events import LOSS_KEY
-from projections.adapters.ros.messages import (
+from projections.adapters.ros.map_messages import (
     DETECTIONS,
     GRID,
     MARKERS,
@@ -125,7 +125,7 @@ import sys
 from zenoh_ros2_sdk import ROS2Subscriber
 from tests.support.rmw import type_hash
 from tests.support.ros_messages import TYPES
-from projections.adapters.ros.messages import MARKERS, POSE_WITH_COVARIANCE
+from projections.adapters.ros.map_messages import MARKERS, POSE_WITH_COVARIANCE
 
 port = int(sys.argv[1])
 

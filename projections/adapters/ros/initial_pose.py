@@ -17,9 +17,9 @@ from eventsrc.record.recorder.listener import Heard, Listener
 from eventsrc.record.ros_node import RosNode
 from projections.fold.map_errors import DatabaseError, QuestionError
 from projections.localize.relocalize import Answer, Question
-from projections.localize.relocalize.lost_robot import LostRobot, SurePose
+from projections.localize.relocalize.waking_robot import SurePose, WakingRobot
 
-from .messages import POSE_WITH_COVARIANCE, MapMessages
+from .map_messages import POSE_WITH_COVARIANCE, MapMessages
 
 TOPIC: Final = "/initialpose"
 _WAIT_S: Final = 0.25
@@ -68,7 +68,7 @@ class InitialPose:
         if found is None:
             return
         with found as listener:
-            robot, seen = LostRobot(), 0
+            robot, seen = WakingRobot(), 0
             while not stop.is_set() and seen < _MOST_KEYFRAMES:
                 for heard in listener.take(_WAIT_S):
                     seen += 1
@@ -80,7 +80,7 @@ class InitialPose:
             if seen:
                 self._note(f"after {seen} keyframes it is not sure where the robot is; gave up")
 
-    def _judge(self, robot: LostRobot, heard: Heard) -> SurePose | None:
+    def _judge(self, robot: WakingRobot, heard: Heard) -> SurePose | None:
         question = robot.see(heard.keyframe)
         if question is None:
             return None

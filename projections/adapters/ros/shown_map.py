@@ -8,7 +8,7 @@ from eventsrc.record.ros_node import RosNode, RosPublisher
 from projections.fold.deltas import MapGiven
 from projections.map.view import MapView
 
-from .messages import DETECTIONS, GRID, MARKERS, MapMessages, MarkerKey
+from .map_messages import DETECTIONS, GRID, MARKERS, MapMessages, MarkerKey
 
 
 class ShownMap:

@@ -81,7 +81,7 @@ class GoalSender(ZenohClient):
         from eventsrc.record.ros_node import RosNode
         from eventsrc.ros.library import MessageTypes
         from eventsrc.ros.wire import topic_of
-        from projections.adapters.ros.messages import POSE, MapMessages
+        from projections.adapters.ros.map_messages import POSE, MapMessages
 
         number, types = domain_of(self.domain), MessageTypes()
         under = topic_of(self.namespace, "goal_pose", "--namespace").removesuffix(_TOPIC)

@@ -15,7 +15,7 @@ from typing import Any
 from eventsrc.base.text import table
 from eventsrc.envelope.ingest import Accepted, ingest_all
 from projections.localize.relocalize import ExactIndex, rank
-from projections.localize.relocalize.lost_robot import MOST_KEYFRAMES, LostRobot
+from projections.localize.relocalize.waking_robot import MOST_KEYFRAMES, WakingRobot
 
 from .localising import first_run, make_map
 from .worlds import Case
@@ -118,7 +118,7 @@ def turns(
 
 def _told(turn: Turn, index: ExactIndex, case: Case) -> tuple[int, float, float] | None:
     """After how many keyframes a pose is told, and its errors in metres and radians."""
-    robot = LostRobot()
+    robot = WakingRobot()
     for number, (keyframe, (x, y, yaw)) in enumerate(turn, start=1):
         question = robot.see(keyframe)
         if question is None:

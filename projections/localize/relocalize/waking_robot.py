@@ -55,7 +55,7 @@ class SurePose:
 
 
 @dataclass
-class LostRobot:
+class WakingRobot:
     """The keyframes of a robot since it began to look around."""
 
     _seen: list[Accepted] = field(default_factory=list)

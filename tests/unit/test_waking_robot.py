@@ -11,8 +11,8 @@ import pytest
 from eventsrc.envelope.ingest import Accepted, ingest
 from projections.localize.relocalize import Answer, PoseHypothesis
 from projections.localize.relocalize.layout import Hypotheses
-from projections.localize.relocalize.lost_robot import MOST_KEYFRAMES, LostRobot, SurePose
 from projections.localize.relocalize.question import MAX_VIEWS
+from projections.localize.relocalize.waking_robot import MOST_KEYFRAMES, SurePose, WakingRobot
 
 
 def keyframe(number: int, x: float, yaw: float, seen: int = 1, **more: Any) -> Accepted:
@@ -37,7 +37,7 @@ def answer(x: float, yaw: float, spread_m: float = 0.05, **more: Any) -> Answer:
 
 def told(second: Answer) -> SurePose | None:
     """A robot that drives 1 m ahead and turns by 0.5, facing the map's y axis."""
-    robot = LostRobot()
+    robot = WakingRobot()
     assert robot.see(keyframe(0, 0.0, 0.0)) is not None
     assert robot.judge(answer(5.0, 0.0)) is None  # nothing agrees with it yet
     assert robot.see(keyframe(1, 1.0, 0.5)) is not None
@@ -78,7 +78,7 @@ def test_answers_that_disagree_or_are_wide_are_not_told() -> None:
 
 
 def test_questions_have_the_latest_keyframe_and_views_spread_over_the_others() -> None:
-    robot, question = LostRobot(), None
+    robot, question = WakingRobot(), None
     for number in range(MOST_KEYFRAMES + 5):
         question = robot.see(keyframe(number, 0.1 * number, 0.0, seen=9))
     assert question is not None
