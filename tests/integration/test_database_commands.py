@@ -59,11 +59,10 @@ def server(commands: Commands) -> EmbeddedServer:
 
 
 def test_replay_tail_status_and_check(own_server: Commands, log: Path) -> None:
-    assert own_server("status", log, code=3).out.count("missing") == 2
-    replayed = own_server("replay", log, "--until", "run-a:29", "--json").json
-    assert replayed["events"] == 30
-    assert not server(own_server).running
     with server(own_server):  # so that not each command starts it
+        assert own_server("status", log, code=3).out.count("missing") == 2
+        replayed = own_server("replay", log, "--until", "run-a:29", "--json").json
+        assert replayed["events"] == 30
         status = own_server("status", log, "--json", code=3).json
         assert status["sinks"]["graph"]["condition"] == "behind"
         assert status["sinks"]["graph"]["lag"] == 10
@@ -78,6 +77,7 @@ def test_replay_tail_status_and_check(own_server: Commands, log: Path) -> None:
             own_server("state", log, "--digest").out.strip()
             == own_server("replay", log, "--json").json["digest"]
         )
+    assert not server(own_server).running
 
 
 def test_check_and_repair(own_server: Commands, log: Path) -> None:

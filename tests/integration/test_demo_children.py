@@ -52,17 +52,9 @@ def test_a_recorder_ends_cleanly_when_its_starter_is_killed(
     assert said.read_text().splitlines()[-1].startswith(f"{log}: 0 recorded")
 
 
-def test_leaving_the_block_ends_them_too(tmp_path: Path) -> None:
-    said = tmp_path / "said"
-    with Children() as children:
-        children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
-        children.wait_for_output("router", "tcp/127.0.0.1")
-        ((process, _),) = children._all.values()
-    assert process.returncode == 0
-
-
 def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
-    """One that waits for messages that never come, and one stopped before it started."""
+    """One that waits for messages that never come, and one stopped before it started; both end
+    with the block."""
     said = tmp_path / "said"
     with Children() as children:
         children.start("router", ("router", "--listen", "tcp/127.0.0.1:0"), said)
@@ -70,13 +62,15 @@ def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
         with pytest.raises(MapfoldError, match=r"no progress for 0\.3 s by mapfold router; see"):
             children.wait(lambda: False, stalled_s=0.3)
         children.start("record", ("record", str(tmp_path / "log")), tmp_path / "other")
-        *_, (process, _) = children._all.values()
+        (router, _), (process, _) = children._all.values()
         process.send_signal(signal.SIGSTOP)
         try:
             with pytest.raises(MapfoldError, match=r"0\.3 s by mapfold router and record; see"):
                 children.wait_for_output("record", "recording", stalled_s=0.3)
         finally:
             process.send_signal(signal.SIGCONT)
+    assert router.returncode == 0
+    assert process.returncode is not None
 
 
 def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:

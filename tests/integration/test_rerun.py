@@ -205,7 +205,10 @@ def test_an_empty_log_and_one_of_odd_poses_are_recorded(tmp_path: Path) -> None:
     [
         (("--rerun", "m.rrd", "--floor", "a"), "--rerun shows all floors"),
         (("--rerun", "file/m.rrd"), "file/m.rrd: cannot be written: "),
-        (("--rerun", "folder"), "folder: cannot be written: Is a directory"),
+        pytest.param(
+            *(("--rerun", "folder"), "folder: cannot be written: Is a directory"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_what_cannot_be_recorded_is_said(

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.thorough import mostly_slow
+
 SAMPLE = Path(__file__).parents[2] / "logs" / "sample"
 
 LOADED = """
@@ -35,11 +37,13 @@ def loaded(folder: Path, *words: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("words", "unwanted", "most"),
-    [
-        ("merges sample", (*ALWAYS, *WRITERS), 152),
-        ("state sample", (*ALWAYS, *WRITERS), 140),
-        ("log info sample", ALWAYS, 130),
-    ],
+    mostly_slow(
+        [
+            ("merges sample", (*ALWAYS, *WRITERS), 152),
+            ("state sample", (*ALWAYS, *WRITERS), 140),
+            ("log info sample", ALWAYS, 130),
+        ]
+    ),
 )
 def test_a_command_loads_only_what_it_calls(
     tmp_path: Path, words: str, unwanted: tuple[str, ...], most: int
