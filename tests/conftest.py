@@ -1,20 +1,26 @@
 """Fixtures every test may use; those of one subsystem live in ``tests/support/fixtures_*.py``."""
 
 import gc
+import os
 import signal
 from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from hypothesis.internal.conjecture import providers
 
 from eventsrc.base.text import shorten_by
+from tests.support import prefork
 from tests.support.commands import Commands
-from tests.support.thorough import examples
+from tests.support.thorough import THOROUGH, examples
 
 # How long an example takes says how busy the machine is; benchmarks measure speed.
 settings.register_profile("mapfold", deadline=None, max_examples=examples(100))
 settings.load_profile("mapfold")
+if not THOROUGH:
+    # Each worker would parse all modules that it has loaded, for two seconds, to try their numbers.
+    providers._get_local_constants = lambda: providers._local_constants
 
 # Tests that a shell or `nohup` starts in the background ignore these signals, and so does every
 # program that they start; many tests send them to such programs.
@@ -46,6 +52,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     only = config.option.markexpr
     ignored = (only == "unit" and other) or (only == "not slow" and collection_path == INTEROP)
     return True if ignored else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Start the process that forks commands for all workers: each would take two seconds to."""
+    workers = getattr(config.option, "numprocesses", None)
+    is_worker = "PYTEST_XDIST_WORKER" in os.environ
+    if workers and not (is_worker or THOROUGH or config.option.markexpr == "unit"):
+        os.environ[prefork.SHARED] = prefork.start_server()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -28,6 +28,9 @@ ROOT = Path(__file__).parents[2]
 
 MAPFOLD = "projections.surfaces.cli:main"
 
+SHARED = "MAPFOLD_TEST_PREFORK"
+"""The environment variable with the socket of the process that forks for all workers."""
+
 # Does in ten milliseconds what the program does; for scripts that call `mapfold`.
 _STAND_IN = """#!{python} -IS
 import _socket, array, json, os, signal, sys
@@ -201,7 +204,12 @@ def _must_be_new(env: Mapping[str, str]) -> bool:
 
 @functools.cache
 def _server() -> str:
-    """Where the process that forks listens; it is started at the first use."""
+    """Where the process that forks listens: that of all workers, else one of its own."""
+    return os.environ.get(SHARED) or start_server()
+
+
+def start_server() -> str:
+    """Start the process that forks, which ends with this one; returns where it listens."""
     folder = Path(tempfile.mkdtemp(prefix="mapfold-test-prefork-"))
     path = str(folder / "server")
     program = folder / "mapfold"
