@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
-from projections.adapters.fleet.engines import RETRIES
+from projections.adapters.fleet.engines import RETRIES, ClusterError, DaskCluster
 from projections.adapters.fleet.site_tasks import ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
 from projections.postgres.connection import Targets

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from projections.adapters.fleet import dask_cluster
-from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
+from projections.adapters.fleet import engines
+from projections.adapters.fleet.engines import ClusterError, DaskCluster
 from tests.support.event_loops import run_apart
 
 FRAME = (17).to_bytes(8, "little") + (1).to_bytes(8, "little") + (1).to_bytes(8, "little")
@@ -77,13 +77,13 @@ def test_no_logger_of_dask_writes_to_stderr() -> None:
 def test_a_server_that_says_nothing_is_an_error_after_a_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(dask_cluster, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(engines, "_ANSWER_S", 0.5)
     with answering(b"") as address, pytest.raises(ClusterError, match=r"no answer within 0\.5 s"):
         DaskCluster(address)
 
 
 def test_a_port_that_nobody_listens_at_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_cluster, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(engines, "_CONNECT_S", 0.5)
     with socket.socket() as bound:  # and not listening, so that no other program takes the port
         bound.bind(("127.0.0.1", 0))
         with pytest.raises(ClusterError, match=r"no scheduler answers there: Timed out trying to"):

@@ -13,7 +13,7 @@ from eventsrc.base.errors import LogError, MisuseError
 from eventsrc.base.machine import usable_processors
 from eventsrc.base.text import counted
 from eventsrc.log import LogReader
-from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Task
+from projections.adapters.fleet.engines import DaskCluster, Ended, Engine, LocalPool, Task
 from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import Site, find_sites
 from projections.postgres.connection import Targets
@@ -32,8 +32,6 @@ def open_engine(engine: str, jobs: int | None, tasks: int) -> Engine:
         raise MisuseError(f"--engine {engine}: there are local and dask://HOST:PORT")
     if jobs is not None:
         raise MisuseError("--jobs is for --engine local; a cluster runs as many as it has workers")
-    from projections.adapters.fleet.dask_cluster import DaskCluster  # its package is an extra
-
     return DaskCluster(address)
 
 

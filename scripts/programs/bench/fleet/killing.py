@@ -10,8 +10,7 @@ from pathlib import Path
 
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.append import append_payload
-from projections.adapters.fleet.dask_cluster import DaskCluster
-from projections.adapters.fleet.engines import Ended, LocalPool
+from projections.adapters.fleet.engines import DaskCluster, Ended, LocalPool
 from projections.adapters.fleet.site_tasks import ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
 from projections.fold.settings import Settings

@@ -13,8 +13,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from projections.adapters.fleet.dask_cluster import ClusterError, DaskCluster
-from projections.adapters.fleet.engines import Ended, Engine, LocalPool, Progress
+from projections.adapters.fleet.engines import (
+    ClusterError,
+    DaskCluster,
+    Ended,
+    Engine,
+    LocalPool,
+    Progress,
+)
 from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.site_tasks import ReplayRequest, SiteReplay, replay_site
 from projections.adapters.fleet.sites import Site
