@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from eventsrc.base.user_files import written_whole
-from eventsrc.envelope.model import DetId
+from eventsrc.envelope.model import DetId, Offset
 from eventsrc.log import LogReader
 from eventsrc.record.kept_crops import KeptCrops
 from projections.map.records import ObjectRecord, ObservationRecord
@@ -70,3 +70,27 @@ def write_best(view: MapView, object_ids: Iterable[str], log: Path, folder: Path
                 with written_whole(Path(files[object_id])) as file:
                     file.write(best.jpeg)
     return files
+
+
+class WrittenView(NamedTuple):
+    """The file of a crop, the detection that it is of, and the offset of its keyframe's event."""
+
+    file: str
+    det_id: DetId
+    offset: Offset
+
+
+def write_views(view: MapView, object_id: str, log: Path, folder: Path) -> list[WrittenView]:
+    """Write the crops that the log keeps of the `_MOST_TRIED` best views of an Object."""
+    found = next(each for each in view.all_objects if each.object_id == object_id)
+    offsets = {
+        seen.det_id: view.keyframes[seen.keyframe].offset for seen in views_in_order(view, found)
+    }
+    written = list[WrittenView]()
+    with LogReader(log) as reader:
+        for each in best_views(view, found, KeptCrops(reader), _MOST_TRIED):
+            path = folder / f"{object_id}-{len(written) + 1}.jpg"
+            with written_whole(path) as file:
+                file.write(each.jpeg)
+            written.append(WrittenView(str(path), each.det_id, offsets[each.det_id]))
+    return written

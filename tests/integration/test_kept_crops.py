@@ -1,6 +1,7 @@
 """Crops of detections that are kept from the pictures of a bag or of a bridge from ROS."""
 
 import json
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -11,6 +12,7 @@ from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
+from starlette.datastructures import QueryParams
 
 from eventsrc.adapters.detector.keyframes import crops_of_message
 from eventsrc.adapters.detector.vision import decode, encode_jpeg
@@ -21,6 +23,7 @@ from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.transport.session import Session
 from projections.ask.best_views import views_in_order
 from projections.fold.map_errors import QuestionError
+from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
@@ -29,6 +32,8 @@ from projections.surfaces.cli.bridge_options import BridgeChoice, recording_of
 from projections.surfaces.python import fold
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.asked import ServedLog
+from projections.surfaces.ui.log_map import LogMap, Opened
+from projections.surfaces.ui.pictures import pictures_answer
 from tests.support import ros2dds
 from tests.support import ros_messages as ros
 from tests.support.commands import Commands
@@ -237,6 +242,41 @@ def test_find_and_python_give_the_best_view(tmp_path: Path) -> None:
     said = mapfold(*words)
     assert all(answer["crop"] in said.out for answer in found)
     assert "--crops needs the LOG" in mapfold("find", "--db", "", "--crops", "crops", code=2).err
+
+
+def test_the_page_and_why_show_the_crops_that_are_the_evidence(tmp_path: Path) -> None:
+    bag, log = write_bag(tmp_path / "drive", compressed_pictures()), tmp_path / "log"
+    imported(log, bag, cut=crops_of_message)
+    kept, view = stored(log), fold(log, preset="full").view
+    full = Settings(**dict(text.split("=") for text in PRESETS["full"]))
+    one = max(view.objects.values(), key=lambda each: each.obs_count)
+    best = [each.det_id for each in views_in_order(view, one)]
+
+    def shown(what: str) -> list[dict[str, Any]]:
+        with LogMap(Opened(log, lambda _: full)) as opened:
+            opened.refresh()
+            found = pictures_answer(opened, QueryParams({"what": what}))["pictures"]
+        assert [b64decode(each["jpeg"]) for each in found] == [kept[e["det_id"]] for e in found]
+        return list(found)
+
+    assert [each["det_id"] for each in shown(f"object:{one.object_id}")] == best[:8]
+    first = view.keyframes[view.observations[one.observations[0]].keyframe]
+    of_it = shown(f"keyframe:{first.run_id}/{first.keyframe_id}")
+    seen = [view.observations[number] for number in first.observations]
+    assert [(e["det_id"], e["bbox"]) for e in of_it] == [(e.det_id, list(e.bbox)) for e in seen]
+    for hostile in ("object:../../etc", "place:p0", "keyframe:x", "object:", ""):
+        with pytest.raises((MisuseError, QuestionError)):
+            shown(hostile)
+
+    words = ("why", "log", one.object_id, "--preset", "full", "--crops", "crops")
+    mapfold = Commands.in_folder(tmp_path)
+    found = mapfold(*words, "--json").json["crops"]
+    assert [each["det_id"] for each in found] == best[:16]
+    assert all((tmp_path / e["file"]).read_bytes() == kept[e["det_id"]] for e in found)
+    said = mapfold(*words).out
+    assert all(f"{each['file']}: {each['det_id']}, offset" in said for each in found)
+    refused = mapfold("why", "log", "p0", "--crops", "crops", code=2).err
+    assert "--crops writes those of an object" in refused
 
 
 def stored(log: Path) -> dict[str, bytes]:

@@ -123,6 +123,7 @@ HOSTILE: list[tuple[str, dict[str, Any], str]] = [
     ("where_am_i", {"crops": []}, "crops"),
     ("where_am_i", {"crops": [{"class": "chair", "bbox": "boo"}]}, "bbox"),
     ("where_am_i", {"crops": [{"embedding": "AAAA"}]}, "embedding"),
+    ("where_am_i", {"crops": [{"class": "chair"}], "camera": {"hfov_deg": 900}}, "camera"),
     ("state", {"parts": ["secrets"]}, "parts"),
     ("state", {"first": -1}, "first"),
     ("name_a_place", {"place": "p0", "name": "x", "reason": "y"}, "name_a_place"),
@@ -177,6 +178,10 @@ def test_a_robot_that_sees_things_is_found(server: Any) -> None:
     found = tool(server, "where_am_i", crops=[{"class": "chair"}, {"class": "table"}])
     assert found["answer"]["places"][0]["place_id"] == "a_p0"
     assert found["offsets"]
+    camera = {"hfov_deg": 60.0, "width_px": 640.0, "height_px": 480.0}
+    boxed = [{"class": "chair", "bbox": [10.0, 200.0, 90.0, 300.0]}]
+    poses = [tool(server, "where_am_i", crops=boxed, camera=c)["answer"] for c in (None, camera)]
+    assert poses[1]["pose"] != poses[0]["pose"]
     nearest = tool(server, "nearest", near="6.0,1.5", top=1)["answer"]["answers"]
     assert [each["class_name"] for each in nearest] == ["tv"]
     state = tool(server, "state", parts=["objects"], limit=1, first=1)["answer"]

@@ -8,15 +8,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from playwright.sync_api import expect
 
+from eventsrc.adapters.detector.vision import encode_jpeg
 from eventsrc.envelope.commands import Anchor, NamePlace, encode_command
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogWriter
+from eventsrc.record.append import append_payload
+from projections.surfaces.python import fold
 from tests.support.commands import Commands, cpu_seconds
-from tests.support.envelopes import detection, envelope
+from tests.support.envelopes import detection, envelope, payload
 from tests.support.logs import append_raw, write_log
+from tests.support.models import KEY, add_crop
 from tests.support.shared_data import ROOT, shared_run
 from tests.support.ui_page import UiServer, showing
 from tests.ui.conftest import ALL, SAMPLE, WIDE, Visit
@@ -103,6 +108,28 @@ def test_hostile_names_are_text_everywhere(hostile: UiServer, visit: Visit, pict
     assert page.evaluate("() => document.querySelectorAll('img, body script').length") == 0
     wide = page.evaluate("() => document.documentElement.scrollWidth > window.innerWidth")
     assert not wide
+
+
+def test_crops_are_shown_with_what_they_are_of(
+    mapfold: Commands, visit: Visit, tmp_path: Path
+) -> None:
+    """An object's by run with links to their keyframes, a keyframe's where its boxes are."""
+    picture = encode_jpeg(np.full((30, 20, 3), 90, np.uint8))
+    with LogWriter(tmp_path / "log", fsync=NEVER) as writer:
+        for number in range(4):
+            seen = detection(HOSTILE[1], det_id=f"d{number}", vector=[1.0, 0.0])
+            add_crop(writer, f"d{number}", picture)
+            made = envelope(number, x=0.1 * number, detections=[seen])
+            append_payload(writer, KEY, payload(made), logged_ns=number + 1)
+    (thing,) = fold(tmp_path / "log").view.objects.values()
+    with showing(mapfold, tmp_path / "log") as server:
+        page = visit(server, f"#select=object:{thing.object_id}&panel=why")
+        crops = page.locator(".crops img")
+        expect(crops).to_have_count(4)
+        assert crops.first.evaluate("image => image.decode().then(() => image.naturalWidth)") == 20
+        assert (crops.first.get_attribute("alt") or "").startswith("<img src=x")
+        page.locator(".crops li button, .crops li a").first.click()
+        expect(page.locator(".crops.frame img")).to_have_count(1)
 
 
 def test_a_log_without_events_says_so(mapfold: Commands, visit: Visit, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, counted, shorten_by, visible
 from eventsrc.envelope.model import Offset
+from projections.ask.best_views import write_views
 from projections.ask.what_changed import changes_text
 from projections.history import Explanation, Expression, ExpressionError, KnownHistory, LogTimeline
 from projections.history.condition_functions import functions_help
@@ -184,6 +185,14 @@ def why(
             "--same",
         ),
     ] = None,
+    crops: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Write the crops of an object that the log keeps there, the best view first, and"
+            " name their files.",
+        ),
+    ] = None,
     at: AtOption = "end",
     known_at: KnownAtOption = None,
     json_: JsonOption = False,
@@ -198,10 +207,20 @@ def why(
     pair = (thing, other) if thing is not None and other is not None else same
     with past.known(at, known_at) as (known, end):
         found = _explanation(known, thing, pair, end)
+        if crops is not None and found.kind != "object":
+            raise MisuseError("--crops writes those of an object")
+        written = (
+            [] if crops is None else write_views(known.at(end), found.subject, past.log, crops)
+        )
     if json_:
-        emit(found.document())
-    else:
-        display(explanation_text(found))
+        shown = [each._asdict() for each in written]
+        emit(found.document() | ({} if crops is None else {"crops": shown}))
+        return
+    display(explanation_text(found))
+    for each in written:
+        display(f"  {each.file}: {visible(each.det_id)}, offset {each.offset:,}\n")
+    if crops is not None and not written:
+        say(f"{past.log} keeps no crop of it; an import with --keep-crops keeps them")
 
 
 def _explanation(

@@ -257,13 +257,20 @@ class _Tools:
                 ' "embedding_dim", "embedding_model", "bbox" of each.',
             ),
         ],
+        camera: Annotated[
+            dict[str, Any] | None,
+            Field(
+                description='What took the boxes: {"hfov_deg", "width_px", "height_px"}, and'
+                ' "yaw_rad" to the left where it does not look ahead.'
+            ),
+        ] = None,
         top: Annotated[int, Field(ge=1, le=100)] = 3,
         at: _At = "end",
         known_at: _KnownAt = None,
     ) -> dict[str, Any]:
         """The likeliest places and the pose of a robot that sees some things, with a confidence;
         `unknown` is true where the map may not have them."""
-        question = read_question(crops)
+        question = read_question({"crops": crops, "camera": camera})
         cited = self._maps.map(at, known_at)
         similar = self._maps.candidates(question.crops, *cited.moment(at, known_at))
         found = rank(question, similar, top=top)

@@ -17,6 +17,7 @@ from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised
+from eventsrc.envelope.model import Offset
 from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M
@@ -189,7 +190,7 @@ class ServedLog:
         """The JPEG of a detection, by its det_id, or of an Object's best view, by its id. Raises
         NotInMapError."""
         with self._reading(served):
-            found = self._crops.jpeg(name)
+            found = self._crops.jpeg(name, self._offset_of(name))
             if found is None and name.startswith("obj-"):
                 found = self._best_view(self._timeline.at(served.next_offset), name)
         if found is None:
@@ -239,6 +240,14 @@ class ServedLog:
             raise NotInMapError(str(error)) from None
         finally:
             self._lock.release()
+
+    def _offset_of(self, det_id: str) -> Offset | None:
+        """The offset of a detection by the kept history, so that no index of crops is needed."""
+        tables = self._timeline.history.tables
+        names = tables.texts("observation", "det_id", 0, tables.count("observation"))
+        if det_id not in names:
+            return None
+        return Offset(int(tables.integers("observation", "offset")[names.index(det_id)]))
 
     def _best_view(self, view: MapView, object_id: str) -> bytes | None:
         meant = thing_called(object_id, things_of(view), ["object"])

@@ -40,6 +40,7 @@ from .live_watch import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
 from .map_answers import digest_answer, history_answer, walls_answer
+from .pictures import pictures_answer
 from .question_threads import GoOn, UiService
 from .requests import assignments_of, encoded, refusal
 from .search import find_answer, keyframe_answer, search_answer
@@ -199,6 +200,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     answers(
         "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W
     )
+
+    answers("pictures", "Crops of an object or a keyframe", pictures_answer, "what", *_AT_W)
 
     async def apart(
         request: Request, work: Callable[[Offset, GoOn], bytes], *, folds: bool = True

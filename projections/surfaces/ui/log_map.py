@@ -21,6 +21,7 @@ from eventsrc.log import Event, LogReader, Unreadable
 from eventsrc.log.format import list_growing
 from eventsrc.log.reader import OnGap
 from eventsrc.log.seek import resolve
+from eventsrc.record.kept_crops import KeptCrops
 from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
@@ -170,6 +171,7 @@ class LogMap:
         )
         self.log_events = LogEvents()
         self.log_id = self.reader.log_id
+        self.crops = KeptCrops(self.reader)
         self.packed: tuple[object, bytes] | None = None
         """The last whole history as an answer, and what it is of."""
         self._files, self._size = _files(opened.log)

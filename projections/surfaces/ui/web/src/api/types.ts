@@ -94,3 +94,16 @@ export interface MapFacts {
   types: PlaceType[];
   regions: { place_id: string; region: Geometry; area_m2: number }[];
 }
+
+/** The crop of a detection, a JPEG in base64; `picture` is the size of the whole picture, where that is known. */
+export interface Crop {
+  det_id: string;
+  class_name: string;
+  confidence: number;
+  bbox: [number, number, number, number];
+  picture: [number, number] | null;
+  run_id: string;
+  keyframe_id: number;
+  offset: number;
+  jpeg: string;
+}

@@ -15,6 +15,7 @@ import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 import { type MergeStory, BridgeView, bridgeOf } from "./BridgeView";
 import { Overview } from "./Overview";
+import { Pictures } from "./Pictures";
 import { Answer, CommandLine, Lines, Steps, ThingLink } from "./AnswerParts";
 
 interface WhyAnswer {
@@ -65,6 +66,7 @@ function Story({ thing, history }: { thing: store.Thing; history: History }) {
           <>
             <p class="summary">{answer.summary}</p>
             {answer.merges?.map((merge) => <BridgeView key={merge.number} merge={merge} history={history} />)}
+            <Pictures thing={thing} at={at} state={history.state} />
             {answer.kind === "merge" ? <Lines lines={answer.lines} /> : <Steps steps={answer.steps} />}
             <CommandLine command={answer.command} />
           </>
