@@ -84,6 +84,24 @@ def test_a_moment_a_floor_and_settings(mapfold: Commands, log: Path) -> None:
     assert places("--set", "min_samples=9") == []
 
 
+def test_the_scene_graph_has_each_object_in_a_pose_of_its_place(
+    mapfold: Commands, log: Path
+) -> None:
+    run = "export", log, "--preset", "full", "--set", "min_samples=3", "--dsg"
+    mapfold(*run, "m.dsg")
+    graph = json.loads((mapfold.folder / "m.dsg").read_text())
+    nodes = {node["id"]: node for node in graph["nodes"]}
+    named = {node["attributes"]["type"] for node in nodes.values()}
+    assert named == {f"{kind}NodeAttributes" for kind in ("Room", "Place", "Object")}
+    layers = [(nodes[e["source"]]["layer"], nodes[e["target"]]["layer"]) for e in graph["edges"]]
+    objects = [node for node in nodes.values() if node["layer"] == 2]
+    assert layers.count((3, 2)) == len(objects) > 0
+    assert layers.count((4, 3)) == sum(node["layer"] == 3 for node in nodes.values())
+    first = written(mapfold.folder)["m.dsg"]
+    mapfold(*run, "m.dsg")
+    assert written(mapfold.folder)["m.dsg"] == first
+
+
 def test_an_origin_places_the_map_on_earth(mapfold: Commands, log: Path) -> None:
     mapfold("export", log, "--geojson", "m.json", "--origin", "52.52,13.405,90")
     features = json.loads((mapfold.folder / "m.json").read_text())["features"]

@@ -17,6 +17,7 @@ from eventsrc.ros.library import MessageTypes
 from projections.adapters.palette import place_colour
 from projections.adapters.scene import ShownObject, ShownPlace, objects_of, places_of, ways_of
 from projections.fold.deltas import PlaceOrdinal
+from projections.map.records import body_fields
 from projections.map.view import MapView
 
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
@@ -74,7 +75,11 @@ class MapMessages:
             if shown.missing:
                 continue
             found = shown.record
-            pose = self._pose(*found.spot, _height(view, shown.floor))
+            body = body_fields(view.body_of(found))
+            floor = _height(view, shown.floor)
+            pose = self._pose(*found.spot, floor + body.get("z", 0.0))
+            length, width, high = body.get("size", (_OBJECT_M,) * 3)
+            size = self._vector(length, width, high)
             score = found.obs_count / (found.obs_count + found.misses)
             hypothesis = make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
@@ -83,7 +88,7 @@ class MapMessages:
                 ),
                 pose=self._pose_with(pose, _covariance_of(shown)),
             )
-            box = make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._vector(_OBJECT_M))
+            box = make("vision_msgs/msg/BoundingBox3D", center=pose, size=size)
             detections.append(
                 make(
                     "vision_msgs/msg/Detection3D",
@@ -196,7 +201,7 @@ class MapMessages:
             type=kind,
             action=action,
             pose=self._pose(0.0, 0.0, 0.0) if pose is None else pose,
-            scale=self._vector(size),
+            scale=self._vector(size, size, size),
             color=self._types.make(
                 "std_msgs/msg/ColorRGBA", **dict(zip("rgb", colour, strict=True)), a=1.0
             ),
@@ -224,8 +229,8 @@ class MapMessages:
             "builtin_interfaces/msg/Time", sec=stamp_ns // _NS, nanosec=stamp_ns % _NS
         )
 
-    def _vector(self, size: float) -> Any:
-        return self._types.make("geometry_msgs/msg/Vector3", x=size, y=size, z=size)
+    def _vector(self, x: float, y: float, z: float) -> Any:
+        return self._types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def _pose(self, x: float, y: float, z: float, yaw: float = 0.0) -> Any:
         make = self._types.make

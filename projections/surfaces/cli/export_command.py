@@ -52,6 +52,9 @@ def export(
     nav2: Annotated[
         Path | None, option("FILE", "A waypoint for each Place, as Nav2's RViz panel loads.")
     ] = None,
+    dsg: Annotated[
+        Path | None, option("FILE", "Rooms, poses and Objects as spark_dsg's scene graph, JSON.")
+    ] = None,
     foxglove: Annotated[
         Path | None,
         option("FILE.mcap", "How the map came about, event by event (extra [foxglove])."),
@@ -87,11 +90,19 @@ def export(
 ) -> None:
     """Write the map folded to a point in the log for other programs.
 
-    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints and recordings for Foxglove and Rerun, one or
-    several at once. The same log and settings give the same bytes; for Rerun, the same data. Files
-    have all objects, with whether each is confirmed; recordings show the confirmed ones.
+    GraphML, Graphviz, GeoJSON, CSV, Nav2 waypoints, spark_dsg and recordings for Foxglove and
+    Rerun, one or several at once. The same log and settings give the same bytes; for Rerun, the
+    same data. Files have all objects, with whether each is confirmed; recordings and spark_dsg have
+    the confirmed ones.
     """
-    files = {"graphml": graphml, "dot": dot, "geojson": geojson, "csv": csv, "nav2": nav2}
+    files = {
+        "graphml": graphml,
+        "dot": dot,
+        "geojson": geojson,
+        "csv": csv,
+        "nav2": nav2,
+        "dsg": dsg,
+    }
     recordings = {"foxglove": foxglove, "rerun": rerun}
     if not any((files | recordings).values()):
         names = ", ".join(f"--{name}" for name in files | recordings)
@@ -141,6 +152,8 @@ def export(
         texts[geojson] = formats.geojson(view, where)
     if nav2 is not None:
         texts[nav2] = formats.nav2_waypoints(view)
+    if dsg is not None:
+        texts[dsg] = formats.spark_dsg(view)
     if csv is not None:
         texts |= {csv / name: text for name, text in formats.tables(view, raw=csv_raw).items()}
     write_files({path: text.encode() for path, text in texts.items()})
