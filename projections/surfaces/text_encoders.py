@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from weakref import WeakKeyDictionary
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from projections.ask.words import NotComparedError, ObjectVectors, Words
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 ELSEWHERE: Final = "MAPFOLD_TEXT_ENCODER"
 _LOCK: Final = threading.RLock()
 """Of all that is below: a tower is for one thread at a time."""
-_VECTORS: Final[WeakKeyDictionary[MapView, ObjectVectors]] = WeakKeyDictionary()
 
 
 def words_of(
@@ -81,7 +79,7 @@ class _MapWords:
         with self._comparing():
             if not words.strip():
                 raise MisuseError("there are no words")
-            tower, vectors = self._tower(), self._vectors()
+            tower, vectors = self._tower(), self._view.once(self._read)
             if not vectors.object_ids:
                 raise MisuseError("no Object of this map has an embedding")
             _check_space(tower, vectors.model, vectors.means.shape[1])
@@ -116,12 +114,6 @@ class _MapWords:
                 f" SHA-256 {tower.sha256[:16]}…, not {wanted[:16]}…"
             )
         return tower
-
-    def _vectors(self) -> ObjectVectors:
-        found = _VECTORS.get(self._view)
-        if found is None:
-            found = _VECTORS[self._view] = self._read(self._view)
-        return found
 
 
 def _opened(path: Path) -> "TextTower":

@@ -68,7 +68,7 @@ class AskedMap(FoldSettings):
 
     def compared(self, view: MapView) -> Words | None:
         """What compares words with the embeddings of the map; None where nothing does."""
-        return words_of(view) if self.db is None else words_of(view, lambda _: self._vectors())
+        return words_of(view) if self.db is None else words_of(view, self._vectors)
 
     def _view(self, *, embeddings: bool) -> MapView:
         if self.db is None:
@@ -96,7 +96,7 @@ class AskedMap(FoldSettings):
         with Databases(db=self.db or None).opened() as targets:
             return live_view(targets)
 
-    def _vectors(self) -> ObjectVectors:
+    def _vectors(self, _: MapView) -> ObjectVectors:
         """The mean vectors of the Objects in the databases."""
         from projections.postgres.queries.live_view import live_vectors
 

@@ -15,7 +15,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
-from projections.ask.words import Words
+from projections.ask.words import ObjectVectors, Words
 from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.edit.record import MakeCommand, OpenSession, record_command, recorded_document
@@ -177,7 +177,10 @@ class LiveMaps:
 
     def words(self, cited: CitedMap) -> Words | None:
         """What compares words with the embeddings of the map; None where nothing does."""
-        return words_of(cited.view, lambda _: self._pools.object_vectors())
+        return words_of(cited.view, self._vectors)
+
+    def _vectors(self, _: MapView) -> ObjectVectors:
+        return self._pools.object_vectors()
 
     def candidates(
         self, crops: Sequence[QuestionCrop], at: str, known_at: str | None
