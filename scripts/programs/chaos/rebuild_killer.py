@@ -21,7 +21,7 @@ Rows: TypeAlias = tuple[Any, Any]
 """Of the graph, and of the vectors."""
 
 OLD = 12
-STRIDE = 7 * stride(15)
+STRIDE = 7 * stride(11)
 """Odd, so that kills are spread over kinds of statements that come in groups."""
 
 
