@@ -6,6 +6,7 @@ import json
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +15,22 @@ import zenoh
 
 from eventsrc.envelope.model import FIRST_OFFSET
 from eventsrc.envelope.system_events import LOSS_KEY
-from eventsrc.log import LogWriter, follow
+from eventsrc.log import LogReader, LogWriter, follow
+from eventsrc.record.gap_history import ledger_of
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.bridged import MAX_KEYS, Bridge
 from eventsrc.record.recorder.checking import CheckedMessage
 from eventsrc.record.recorder.queue import BridgedMessage
 from eventsrc.record.ros_graph import find_topics
-from eventsrc.record.transport.session import Session
+from eventsrc.record.transport.session import Router, Session, ZenohOptions, open_session
 from eventsrc.ros.library import Undecodable
 from eventsrc.ros.wire import KeyParts, PublisherToken, RmwWire
 from projections.surfaces.cli.bridge_options import recording_of
 from tests.support import rmw
 from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log
-from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.fixtures_zenoh import DEADLINE_S, LONG_LEASE, LOOPBACK, MAPFOLD, Program
 from tests.support.ros2dds import BOXES, KINDS, TF, Sent, drive, static
 from tests.support.ros2dds_recordings import (
     check_derived,
@@ -180,6 +182,77 @@ def test_missing_numbers_are_losses_of_their_publisher(
         running.wait_until(lambda r: r.messages >= len(drive(3)) + 3)
     assert running.finish().lost == 5
     assert sorted(losses(log_path)) == [("transport_miss", 1), ("transport_miss", 4)]
+
+
+@pytest.mark.slow
+def test_ten_thousand_messages_over_restarts_are_recorded_or_counted_as_lost(
+    log_path: Path, tmp_path: Path
+) -> None:
+    """500 a second. The router is away while fifty keyframes are sent; the robot starts again; the
+    recorder starts again while the robot is silent."""
+    sent, rate = drive(2_500), threading.Event()  # never set
+    ends = {"router ends": 400, "router returns": 450, "robot": 900, "recorder": 1_700}
+    at = {what: 2 + 4 * keyframes for what, keyframes in ends.items()}
+    sent.insert(at["robot"], ("/tf_static", static()))  # as it starts again
+    at["recorder"] += 1
+    assert len(sent) == 10_003
+
+    def send(node: rmw.Node, first: int, last: int) -> None:
+        for topic, message in sent[first:last]:
+            node.send(topic, message)
+            rate.wait(1 / 500)
+
+    def wait(node: rmw.Node) -> None:
+        for topic in KINDS:
+            wait_for_recorder(node, topic)
+
+    def continued() -> Bridge:
+        with LogReader(log_path) as reader:
+            ledger = ledger_of(reader)
+        how, topics = recording_of(choice(), 0, ledger)
+        return Bridge(how, topics, TYPES, RmwWire(3))
+
+    with ExitStack() as stack:
+        router = stack.enter_context(Router(LOOPBACK))
+        (endpoint,) = router.endpoints
+        listening = ZenohOptions(connect=(endpoint,), config_file=LONG_LEASE)
+        session = stack.enter_context(open_session(listening, mode="client"))
+        with recording(session, log_path, new_recording()) as running:
+            with rmw.node(endpoint, 3) as robot:
+                robot.advertise_all()
+                wait(robot)
+                send(robot, 0, at["router ends"])
+                router.close()
+                send(robot, at["router ends"], at["router returns"])
+                again = ZenohOptions(listen=(endpoint,), config_file=LONG_LEASE)
+                stack.enter_context(Router(again))
+                wait(robot)
+                send(robot, at["router returns"], at["robot"])
+                running.wait_until(lambda r: r.messages + r.lost >= at["robot"])
+            second = stack.enter_context(rmw.node(endpoint, 3))
+            second.advertise_all()
+            wait(second)
+            send(second, at["robot"], at["recorder"])
+            running.wait_until(lambda r: r.messages + r.lost >= at["recorder"])
+        first = running.finish()
+        with recording(session, log_path, continued()) as running:
+            wait(second)
+            send(second, at["recorder"], len(sent))
+            running.wait_until(lambda r: r.messages > len(sent) - at["recorder"])
+        last = running.finish()
+    events = read_log(log_path)
+    kept = verbatim(events)
+    assert last.messages == len(sent) - at["recorder"] + 1  # and what is kept of /tf_static
+    assert len(kept) == first.messages + last.messages == len(sent) + 1 - first.lost
+    assert first.lost >= at["router returns"] - at["router ends"]
+    assert last.lost == 0
+    assert sum(count for _, count in losses(log_path)) == first.lost
+    assert {cause for cause, _ in losses(log_path)} == {"transport_miss"}
+    named = [(e.key, e.logged_ns, TYPES.decode(e.payload, KINDS[e.key])) for e in kept]
+    with LogWriter(tmp_path / "of-bag") as writer:
+        bag = write_bag(tmp_path / "bag", named)
+        import_files(writer, [str(bag)], bags=BagOptions(run_id="drive"))
+    assert digest(tmp_path / "of-bag") == digest(log_path)
 
 
 def test_latched_messages_are_recorded_once_from_nodes_that_are_there_and_from_later_ones(
