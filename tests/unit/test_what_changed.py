@@ -80,6 +80,36 @@ def test_what_was_often_overlooked_before_is_not_surely_missing() -> None:
     assert found.changes == ()
 
 
+def test_a_move_is_not_sure_until_the_old_place_was_looked_at_again() -> None:
+    """Another chair that looks the same may stand where this run has not been."""
+    elsewhere = [document for document in run("b", LATER) if document["map_x"] >= 4.0]
+    found = changed(run("a", ROOM), elsewhere)
+    assert [c.kind for c in found.changes] == ["missing", "new"]
+    assert found.unsure == 1
+
+
+def test_what_was_looked_for_along_one_line_of_sight_is_not_surely_missing() -> None:
+    """What stands before the plant now may hide it from there."""
+    from_the_left = [document for document in run("b", AWAY) if document["map_x"] <= 3.2]
+    found = changed(run("a", ROOM), from_the_left)
+    assert (found.changes, found.unsure) == ((), 1)
+
+
+def test_what_is_often_overlooked_is_not_new_after_few_looks() -> None:
+    documents, looks = run("b", LATER), 0
+    for document in documents:
+        seen = [each for each in document["detections"] if each["class"] == "bed"]
+        if seen:
+            looks += 1
+        if seen and looks % 4:
+            document["detections"].remove(seen[0])
+    kinds = [
+        [c.kind for c in changed(run("a", ROOM, passes=1), later).changes]
+        for later in (run("b", LATER), documents)
+    ]
+    assert kinds == [["moved", "missing", "new"], ["moved", "missing"]]
+
+
 def test_what_comes_back_is_back_and_not_new() -> None:
     found = changed(run("a", ROOM), run("b", AWAY), run("c", ROOM), before=2)
     assert [(c.kind, c.class_name) for c in found.changes] == [("back", "plant")]
