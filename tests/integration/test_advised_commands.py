@@ -42,6 +42,8 @@ def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
             skipped.add(id(node.value))
         if isinstance(node, ast.keyword) and node.arg in ("help", "metavar"):
             skipped |= {id(inner) for inner in ast.walk(node.value)}
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option":
+            skipped |= {id(inner) for given in node.args[:2] for inner in ast.walk(given)}
     for node in ast.walk(tree):
         is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
         if is_text and id(node) not in skipped:

@@ -164,7 +164,7 @@ class TestTexts:
         assert got.status == 400
         assert got.json["error"]["column"] == 21
         answer = server.api("conditions", text="size(")
-        assert answer["error"]["column"] == 6
+        assert answer["error"]["column"] == 5  # of the bracket that is not closed
         assert server.api("conditions", text="place_count() < 3")["error"] is None
         assert {f["name"] for f in answer["functions"]} >= {"same_place", "size", "located_in"}
 

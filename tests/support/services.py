@@ -7,6 +7,7 @@ A balancer that passes HTTP requests on to several servers in turn.
 
 import itertools
 import json
+import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -90,9 +91,14 @@ MODEL = "mapfold-simulated-512"
 
 
 def documents(count: int = KEYFRAMES) -> list[dict[str, Any]]:
-    """The first keyframes of the sample log, on a floor with a name."""
+    """The first keyframes of the sample log, on a floor with a name. What the first of them sees is
+    measured too."""
     with LogReader(sample_drive()) as reader:
         found = [json.loads(event.payload) for event in reader.read(0, count)]
+    for seen in found[0]["detections"]:
+        x, y, yaw = (found[0][f"map_{name}"] for name in ("x", "y", "yaw"))
+        at = (x + 2.0 * math.cos(yaw), y + 2.0 * math.sin(yaw))
+        seen.update(position=at, position_z=0.4, size=(0.5, 0.5, 0.8))
     return [{**document, "floor": "ground"} for document in found]
 
 
