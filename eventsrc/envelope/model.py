@@ -14,7 +14,10 @@ from decimal import Decimal
 from typing import TYPE_CHECKING, Annotated, NewType, TypeAlias
 
 import msgspec
+import numpy as np
+import pybase64
 from msgspec import Meta
+from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     Field,
@@ -63,7 +66,10 @@ def describe_error(error: ErrorDetails) -> str:
     most = error.get("ctx", {}).get("max_length", MAX_ID_LENGTH)
     if len(text) > most:
         return f"is {len(text)} characters long, more than {most}"
-    at, char = next((i, c) for i, c in enumerate(text) if unicodedata.category(c) == "Cc")
+    controls = ((i, c) for i, c in enumerate(text) if unicodedata.category(c) == "Cc")
+    if (found := next(controls, None)) is None:
+        return "is no base64"
+    at, char = found
     return f"has the control character U+{ord(char):04X} at index {at}"
 
 
@@ -75,6 +81,13 @@ SIGMA_M = Field(ge=0.001, le=1000.0)
 """Bounds of a standard error, metres."""
 MAX_DEPTH_M = 1000.0
 MAX_SIZE_M = 1000.0
+
+UNKNOWN_MM = 0
+NO_RETURN_MM = 65_535
+"""The range of a beam of which nothing is known, and of one that met nothing."""
+MAX_BEAMS = 1440
+MAX_RANGES_BASE64 = MAX_BEAMS * 2 // 3 * 4
+BASE64 = "([A-Za-z0-9+/]{4})*([A-Za-z0-9+/]{2}==|[A-Za-z0-9+/]{3}=)?"
 
 INT64 = Field(ge=-(2**63), lt=2**63)
 Int64 = Annotated[int, INT64]
@@ -213,6 +226,23 @@ class StatedCamera(_Known, frozen=True):
     yaw_rad: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
 
 
+class StatedScan(_Known, frozen=True):
+    """The range scan taken with a picture; its fields are those of `readers.EnvelopeScan`."""
+
+    angle_min: Annotated[float, Meta(ge=-7.0, le=7.0)]
+    angle_step: Annotated[float, Meta(ge=-7.0, le=7.0)]
+    ranges_mm: Annotated[str, Meta(max_length=MAX_RANGES_BASE64, pattern=f"^{BASE64}\\Z")]
+    range_max: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    x: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
+    y: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
+    yaw: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+
+    def ranges(self) -> NDArray[np.int64]:
+        """The ranges in millimetres, `UNKNOWN_MM` and `NO_RETURN_MM` among them."""
+        raw = pybase64.b64decode(self.ranges_mm)
+        return np.frombuffer(raw[: len(raw) // 2 * 2], "<u2").astype(np.int64)
+
+
 class Envelope(_Known, frozen=True):
     """One keyframe: where the robot was and what it saw; its fields are those of
     `readers.EnvelopeModel`."""
@@ -231,6 +261,7 @@ class Envelope(_Known, frozen=True):
         Annotated[tuple[float, ...], Meta(min_length=COVARIANCE_SIZE, max_length=COVARIANCE_SIZE)]
         | None
     ) = None
+    scan: StatedScan | None = None
 
     @property
     def stamp_ns(self) -> int:

@@ -22,17 +22,20 @@ from pydantic import (
     ConfigDict,
     FailFast,
     Field,
+    StringConstraints,
     TypeAdapter,
     model_validator,
 )
 
 from .model import (
     ANGLE_RAD,
+    BASE64,
     HFOV_DEG,
     INT64,
     MAX_DEPTH_M,
     MAX_DETECTIONS,
     MAX_DIMENSION,
+    MAX_RANGES_BASE64,
     MAX_SIZE_M,
     MAX_TIMESTAMP_S,
     PIXELS,
@@ -47,6 +50,7 @@ from .model import (
     Position,
     RunId,
     StatedCamera,
+    StatedScan,
     Text,
     contains_non_finite,
     covariance_fault,
@@ -116,6 +120,25 @@ class EnvelopeCamera(_Model):
     yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
 
 
+class EnvelopeScan(_Model):
+    """A range scan in the plane: angles in radians, to the left of where the sensor faces.
+
+    ``ranges_mm`` is base64 of little-endian uint16, millimetres; 0 is unknown, 65535 is a beam that
+    met nothing within ``range_max`` metres. ``x``, ``y`` and ``yaw`` are where the sensor is,
+    metres ahead of and to the left of the pose, and radians to the left of its heading.
+    """
+
+    angle_min: Annotated[float, ANGLE_RAD]
+    angle_step: Annotated[float, ANGLE_RAD]
+    ranges_mm: Annotated[
+        str, StringConstraints(max_length=MAX_RANGES_BASE64, pattern=f"^{BASE64}$")
+    ]
+    range_max: Annotated[float, Field(gt=0.0, le=1000.0)]
+    x: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
+    y: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
+    yaw: Annotated[float, ANGLE_RAD] = 0.0
+
+
 class EnvelopeModel(_Model, title="Envelope"):
     """One keyframe: where the robot was and what it saw.
 
@@ -124,7 +147,7 @@ class EnvelopeModel(_Model, title="Envelope"):
     Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
     is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
     the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
-    counts only beside a pose.
+    counts only beside a pose, and so does ``scan``.
     """
 
     run_id: Annotated[RunId, TEXT]
@@ -137,6 +160,7 @@ class EnvelopeModel(_Model, title="Envelope"):
     floor: Floor = None
     map_z: Position | None = None
     pose_covariance: PoseCovariance | None = None
+    scan: EnvelopeScan | None = None
     detections: Annotated[tuple[DetectionModel, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")
@@ -158,6 +182,8 @@ def read_checked(payload: bytes) -> Envelope:
     fields = dict(_validate_json(payload).__dict__)
     if (camera := fields["camera"]) is not None:
         fields["camera"] = StatedCamera(**camera.__dict__)
+    if (scan := fields["scan"]) is not None:
+        fields["scan"] = StatedScan(**scan.__dict__)
     fields["detections"] = tuple([Detection(**each.__dict__) for each in fields["detections"]])
     return Envelope(**fields)
 

@@ -17,6 +17,7 @@ import msgspec
 
 from eventsrc.envelope.crops import Crop
 
+from .laser import KeptScans
 from .messages import (
     CAMERA_INFO,
     DETECTION_TYPES,
@@ -206,6 +207,7 @@ class _StreamState:
         self._names = ClassNames()
         self._told: Mapping[str, str] = {}
         self._embeddings: dict[int, StampedEmbeddings] = {}
+        self._scans = KeptScans()
         self._next = stream.first_keyframe
 
     def handlers(self, *, with_transforms: bool) -> dict[str, _Handler]:
@@ -217,6 +219,7 @@ class _StreamState:
         handlers |= dict.fromkeys((stream.pose, stream.covariance), self.poses.add_pose)
         handlers |= {stream.camera: self._set_lens, stream.embeddings: self._keep_embeddings}
         handlers |= dict.fromkeys(stream.classes, self._add_names)
+        handlers[stream.scan] = self._scans.add
         if self._pictures is not None:
             handlers[stream.images] = self._pictures.add
         return {
@@ -260,6 +263,8 @@ class _StreamState:
             return False
         if stream.classes and not self._told:
             return False
+        if stream.scan is not None and not self._scans.reach(picture.detected.stamp_ns):
+            return False
         return stream.embeddings is None or picture.detected.stamp_ns in self._embeddings
 
     def envelope(self, picture: _Picture) -> Assembled:
@@ -278,6 +283,10 @@ class _StreamState:
             counts.without_pose += 1
         else:
             document |= self._pose_fields(pose)
+            scan = self._scans.at(detected.stamp_ns, pose, self.poses)
+            if scan is not None:
+                document["scan"] = scan
+                counts.with_scan += 1
         lens = self._lens
         if lens is not None and not detected.has_boxes and lens.frame != detected.frame:
             lens = None  # things in the frame of a lidar, say

@@ -269,14 +269,17 @@ def _solid(given: Any, bbox: Any) -> Solid | None:
 
 def _pose_of_thing(pose: Any) -> Transform | None:
     at, turn = pose.position, pose.orientation
-    if not (at.x or at.y or at.z):
+    x, y, z = float(at.x), float(at.y), float(at.z)
+    if not (x or y or z):
         return None
     try:
-        return _transform(at, turn)
+        return unit_transform(
+            x, y, z, *(float(turn.x), float(turn.y), float(turn.z), float(turn.w))
+        )
     except BadTransform:
         pass
     try:  # a detector that knows no orientation may leave it all zeros
-        return unit_transform(at.x, at.y, at.z, 0.0, 0.0, 0.0, 1.0)
+        return unit_transform(x, y, z, 0.0, 0.0, 0.0, 1.0)
     except BadTransform:
         return None
 

@@ -40,7 +40,8 @@ class Stream:
     topics of `eventsrc.ros.named_classes`; ``labels`` names classes by id itself, and counts before
     what they say. ``heights`` says whether ``map_z`` is stated. ``wait_ns`` and ``max_waiting``
     bound how long detections wait for the rest, ``max_gap_ns`` between which two samples a pose is
-    interpolated. ``images`` is the topic of the pictures that crops are cut from.
+    interpolated. ``images`` is the topic of the pictures that crops are cut from,
+    ``scan`` that of the range scans that go with keyframes.
     """
 
     detections: str
@@ -62,6 +63,7 @@ class Stream:
     max_waiting: int = MAX_WAITING
     classes: tuple[str, ...] = ()
     images: str | None = None
+    scan: str | None = None
 
     @property
     def has_poses(self) -> bool:
@@ -92,6 +94,8 @@ class Counts:
     """Detections without a hypothesis."""
     numbered: int = 0
     """Detections whose class is a number, which nothing names."""
+    with_scan: int = 0
+    """Keyframes that have a range scan."""
     crops: int = 0
     """Detections of which a crop is kept."""
     without_picture: int = 0

@@ -16,7 +16,8 @@ The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationA
 (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
 ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
-names only things that deltas before it have introduced. MapGiven is the only one of its event.
+names only things that deltas before it have introduced. A MapGiven is alone, or
+precedes those of places.
 
 A fold makes some ten deltas a keyframe: a msgspec struct takes a third of the time of a frozen
 dataclass, and with ``gc=False`` the garbage collector does not traverse a history of them.
@@ -206,8 +207,7 @@ class MergeRefused(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlaceNamed(msgspec.Struct, frozen=True, gc=False):
-    """A place has a name, or (None) has none any more. ``command`` is the offset of the command
-    that gives it, None if there is none."""
+    """A place has a name, or (None) has none any more; ``command`` is what gives it."""
 
     offset: Offset
     place: PlaceOrdinal
@@ -359,9 +359,7 @@ class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
 
 class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
     """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
-
-    0 removes the edge (one of the two was absorbed, or relabelling moved the transitions).
-    """
+    0 removes the edge (one of the two was absorbed, or relabelling moved the transitions)."""
 
     offset: Offset
     a: PlaceOrdinal
@@ -370,10 +368,11 @@ class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
 
 
 class MapGiven(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """An occupancy map holds for all events after this one, which is a map and no keyframe."""
+    """An occupancy map holds from here on, by scans of keyframes or by an event that is a map."""
 
     offset: Offset
     map: OccupancyMap
+    scanned: bool = False
 
 
 Delta: TypeAlias = (

@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from eventsrc.envelope.model import Envelope, Offset
+from eventsrc.envelope.model import Envelope, Offset, StatedScan
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
@@ -45,6 +45,7 @@ from .exact import metres_to_um
 from .free_floor import FreeFloor, free_floor
 from .occupancy import Point
 from .pair_groups import PairGroups
+from .scans import Scans
 from .settings import Settings
 from .sights import Sighting
 
@@ -193,6 +194,7 @@ class CurrentMap:
         self._uses_walls = settings.places == "rooms"
         self._floors = floors
         self.given: dict[str | None, MapGiven] = {}
+        self._scans = Scans()
         # By number of the floor; only those already computed.
         self._grounds: dict[int, FreeFloor | None] = {}
         self._ways: dict[int, StraightWay | None] = {}
@@ -205,6 +207,26 @@ class CurrentMap:
         delta = self.given[given.floor] = MapGiven(offset, given)
         self._grounds.clear()
         self._ways.clear()
+        return delta
+
+    def scan(
+        self, offset: Offset, number: int, pose: Pose, scan: StatedScan | None
+    ) -> MapGiven | None:
+        """Cast a scan taken on the floor of this number; returns the delta of a map that is made of
+        it and those before. It is left out where a map is given."""
+        name = self._floors.names[number]
+        if scan is None or (number and name is None):
+            return None
+        in_force = map_in_force(self.given, name, is_first=not number)
+        if in_force is not None and not in_force.scanned:
+            self._scans.forget(number)
+            return None
+        made = self._scans.add(number, name if number else None, pose, scan)
+        if made is None:
+            return None
+        delta = self.given[made.floor] = MapGiven(offset, made, scanned=True)
+        self._grounds.pop(number, None)
+        self._ways.pop(number, None)
         return delta
 
     @property
@@ -246,8 +268,8 @@ class CurrentMap:
     def dump(self) -> State:
         """The whole state, to be kept; nothing without a map."""
         parts: State = {}
-        for number, (offset, given) in enumerate(
-            (delta.offset, delta.map) for delta in self.given.values()
+        for number, (offset, given, scanned) in enumerate(
+            (delta.offset, delta.map, delta.scanned) for delta in self.given.values()
         ):
             fields = {
                 "offset": offset,
@@ -257,9 +279,11 @@ class CurrentMap:
                 "origin": list(given.origin),
                 "source": given.source,
                 "cells": given.cells,
+                "scanned": scanned,
             }
             parts |= prefixed(str(number), fields)
-        return {"maps": len(self.given), **parts} if parts else {}
+        scans = prefixed("scans", self._scans.dump())
+        return ({"maps": len(self.given), **parts} if parts else {}) | scans
 
     def load(self, state: State) -> None:
         """Restore the state of `dump`."""
@@ -268,7 +292,9 @@ class CurrentMap:
             x, y, yaw = fields["origin"]
             about = fields["map_id"], fields["resolution"], (x, y, yaw), fields["source"]
             cells = np.ascontiguousarray(fields["cells"])
-            self.fold(fields["offset"], OccupancyMap(*about, cells, fields["floor"]))
+            loaded = OccupancyMap(*about, cells, fields["floor"])
+            self.given[loaded.floor] = MapGiven(fields["offset"], loaded, fields["scanned"])
+        self._scans.load(part("scans", state))
 
 
 def _moved_back(way: StraightWay, dx: int, dy: int, a: Point, b: Point) -> int | None:

@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from msgspec.structs import astuple
 
 from eventsrc.base.machine import crc32
 from eventsrc.envelope.ingest import Accepted
@@ -65,6 +66,8 @@ def content_digest(accepted: Accepted) -> bytes:
         content += (envelope.floor, envelope.map_z)
     if envelope.pose_covariance is not None:
         content += (("pose_covariance", *envelope.pose_covariance),)
+    if envelope.scan is not None:
+        content += (("scan", *astuple(envelope.scan)),)
     if any(d.position_z is not None or d.size is not None for d in envelope.detections):
         content += (("bodies", *((d.position_z, d.size) for d in envelope.detections)),)
     # Format version 2 has no references, so equal values give equal bytes.

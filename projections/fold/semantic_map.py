@@ -34,6 +34,7 @@ from .deltas import (
     KeyframeAdded,
     KeyframeOrdinal,
     KeyframePlaced,
+    MapGiven,
     ObjectEstimated,
     ObjectRelocated,
     ObjectSeen,
@@ -80,8 +81,8 @@ Reducer: TypeAlias = (
 class SemanticMap:
     """The fold's state. `fold` changes it in place and is otherwise pure.
 
-    ``next_offset`` is one past the last event folded or skipped. It is set before an event changes
-    anything else, so that what follows the fold can tell an interrupted one by it.
+    ``next_offset`` is one past the last event folded or skipped, set before an event changes
+    anything else: it tells an interrupted fold.
     """
 
     def __init__(self, settings: Settings, corrections: Corrections = NO_CORRECTIONS) -> None:
@@ -108,14 +109,16 @@ class SemanticMap:
         self._has_vectors = bool(corrections.reembedded_for(settings))
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:
-        """Put an occupancy map into force for the events after it; returns the deltas."""
+        """Put an occupancy map into force for the events after it."""
         self.next_offset = Offset(offset + 1)
-        given_map = self.current_map.fold(offset, given)
-        if given_map is None:
+        return self._in_force(self.current_map.fold(offset, given))
+
+    def _in_force(self, given: MapGiven | None) -> list[Delta]:
+        if given is None:
             return []
         self._use_walls()
         self.standing.use_other_map()
-        return [given_map]
+        return [given]
 
     def _use_walls(self) -> None:
         if self.current_map.has_walls and isinstance(self.places, Rooms):
@@ -130,9 +133,8 @@ class SemanticMap:
     ) -> list[Delta]:
         """Fold one envelope; returns the deltas in the order of `projections.fold.deltas`.
 
-        ``units`` is ``unit_vectors(accepted.vectors)`` for a caller who made it beforehand. Raises
-        FoldError where a correction cannot be applied; the map is as before the event then.
-        """
+        ``units`` is ``unit_vectors(accepted.vectors)``, made beforehand. Raises FoldError where a
+        correction cannot be applied; the map is as before the event then."""
         dropped: tuple[DetId, ...] = ()
         is_corrected = self._is_corrected
         if is_corrected and self.event_edits.any:
@@ -184,6 +186,7 @@ class SemanticMap:
             accepted, units = self.reembedded.applied(accepted, units)
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
+            deltas += self._in_force(self.current_map.scan(offset, ground, pose, envelope.scan))
             pose = self.floors.laid_out(pose, ground)
             for seen in fusible if self._named.group_of else ():
                 self.floors.keep_to_floor(self._named, seen[1], "object", ground)
@@ -215,7 +218,6 @@ class SemanticMap:
         return self.floors.put_back(deltas)
 
     def _stand(self, fused: Sequence[Delta], pose: Pose, place: PlaceOrdinal) -> None:
-        """Report the pose and estimates to the reducer of where Objects stand."""
         standing, at = self.standing, (pose.x_um, pose.y_um)
         standing.pose_placed(*at, place)
         for delta in fused:
@@ -228,8 +230,7 @@ class SemanticMap:
 
     def use_names(self, offset: Offset, corrections: Corrections) -> list[PlaceNamed]:
         """Replace the names of places, as if they had been known from the start; returns the
-        deltas. All else in ``corrections`` must be as in the map: ValueError if it is not.
-        """
+        deltas. All else in ``corrections`` must be as in the map: ValueError if it is not."""
         if not corrections.differs_in_names_only(self.corrections):
             raise ValueError("these corrections differ in more than names; fold the log again")
         self.corrections = corrections  # first: see `LiveFold`

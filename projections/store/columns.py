@@ -45,7 +45,6 @@ DELTAS: Final[Mapping[str, type[msgspec.Struct]]] = {
     "keyframe": deltas.KeyframeAdded,
     "observation": deltas.ObservationAdded,
     "skipped": deltas.EventSkipped,
-    "map": deltas.MapGiven,
     "formed": deltas.PlaceFormed,
     "placed": deltas.KeyframePlaced,
     "changed": deltas.PlaceChanged,
@@ -70,7 +69,6 @@ _ORDINALS: Final = {
 """The field that is the number of the row."""
 _LEFT_OUT: Final = {
     "observation": ("run_id", "keyframe_id"),  # those of its keyframe
-    "map": ("map",),  # it is read from the log
 }
 _SIGNED: Final = ("similarity_q40", "z_um")
 """Optional integers that may be negative."""
@@ -161,8 +159,10 @@ _FIELDS: Final = {table: _fields_of(table, delta) for table, delta in DELTAS.ite
 TABLES: Final[dict[str, Table]] = {
     **{table: _table_of(fields) for table, fields in _FIELDS.items()},
     "merge": {"offset": "int", "document": "text"},
+    "map": {"offset": "int", "document": "code"},
 }
-"""The columns of each table by name. Merges of places, with all that they moved, are documents."""
+"""The columns of each table by name. Merges of places, with all that they moved, are documents, and
+so are maps made of scans; a map without one is read from the log."""
 
 
 def _row_maker(fields: Sequence[_Field]) -> Callable[[Any], Row]:
@@ -187,7 +187,11 @@ def _row_maker(fields: Sequence[_Field]) -> Callable[[Any], Row]:
 
 
 ROWS: Final[Mapping[type, tuple[str, Callable[[Any], Row]]]] = {
-    delta: (table, _row_maker(_FIELDS[table])) for table, delta in DELTAS.items()
+    **{delta: (table, _row_maker(_FIELDS[table])) for table, delta in DELTAS.items()},
+    deltas.MapGiven: (
+        "map",
+        lambda given: (given.offset, given.map.encode().decode() if given.scanned else None),
+    ),
 }
 """The table of each kind of delta, and the function that makes its row."""
 

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
-from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.envelope.occupancy_map import OccupancyMap, decode_map
 from projections.fold.corrections import Corrections
 from projections.fold.deltas import (
     EventSkipped,
@@ -178,8 +178,17 @@ class History:
     @cached_property
     def maps(self) -> Sequence[MapGiven]:
         """The occupancy maps."""
-        offsets = self.tables.column("map", "offset").tolist() if self.tables.count("map") else []
-        return [MapGiven(Offset(offset), self.map_at(Offset(offset))) for offset in offsets]
+        if not (count := self.tables.count("map")):
+            return []
+        offsets = self.tables.column("map", "offset").tolist()
+        return [
+            MapGiven(offset, self.map_at(offset))
+            if document is None
+            else MapGiven(offset, decode_map(document.encode()), scanned=True)
+            for offset, document in zip(
+                offsets, self.tables.texts("map", "document", 0, count), strict=True
+            )
+        ]
 
     @cached_property
     def edges(self) -> Mapping[tuple[PlaceOrdinal, PlaceOrdinal], Sequence[PlacesLinked]]:

@@ -10,7 +10,12 @@ from eventsrc.envelope.grid_messages import is_grid_message, read_grid_message
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.envelope.model import MAX_DEPTH_M, MAX_POSITION_M
 from eventsrc.envelope.occupancy_map import decode_map
-from eventsrc.envelope.readers import DetectionModel, EnvelopeCamera, EnvelopeModel
+from eventsrc.envelope.readers import (
+    DetectionModel,
+    EnvelopeCamera,
+    EnvelopeModel,
+    EnvelopeScan,
+)
 from eventsrc.record.metrics import serving_metrics
 from eventsrc.record.recorder.queue import DEFAULT_QUEUE_BYTES, DEFAULT_QUEUE_SIZE
 from eventsrc.record.recorder.writer_thread import RecorderReport
@@ -86,8 +91,10 @@ def test_the_envelope_on_the_page_has_every_field_and_is_accepted() -> None:
     of_envelope = _blocks("json")[0]
     document = json.loads(of_envelope)
     assert isinstance(ingest(of_envelope.encode()), Accepted)
-    shown = (document, document["camera"], {**document["detections"][0], "det_id": "by default"})
-    for fields, model in zip(shown, (EnvelopeModel, EnvelopeCamera, DetectionModel), strict=True):
+    seen = {**document["detections"][0], "det_id": "by default"}
+    shown = (document, document["camera"], document["scan"], seen)
+    models = (EnvelopeModel, EnvelopeCamera, EnvelopeScan, DetectionModel)
+    for fields, model in zip(shown, models, strict=True):
         assert set(fields) == {f.alias or name for name, f in model.model_fields.items()}
 
 

@@ -1,6 +1,7 @@
 """Bags of ROS 2, written by rosbags, become the log that their detections as JSON lines become."""
 
 import json
+import math
 import shutil
 from itertools import count
 from pathlib import Path
@@ -17,7 +18,7 @@ from tests.support import ros_messages as ros
 from tests.support.commands import Commands
 from tests.support.fixtures_log import read_log
 from tests.support.ros_bags import DRIVE, RUN, Drive, Raw, envelopes, imported, write_bag
-from tests.support.ros_messages import START, flat
+from tests.support.ros_messages import SECOND, START, flat
 from tests.support.thorough import every_other, mostly_slow
 
 
@@ -127,6 +128,33 @@ def test_things_in_three_dimensions_have_positions_and_what_mapfold_shows_is_no_
     flat_too = [*recorded, ("/detections", START, ros.detections(START, "map"))]
     (about,) = imported(tmp_path / "other", write_bag(tmp_path / "again", flat_too)).bags
     assert list(about.streams) == ["/detections"]
+
+
+def test_scans_give_walls_where_the_bag_has_no_map(tmp_path: Path) -> None:
+    ranges = [1.5, 2.0, math.inf, 3.0] * 90
+    recorded: list[Any] = []
+    for number in range(12):
+        at = START + number * SECOND // 5
+        links = [
+            ros.transform("map", "base_link", at, flat(0.1 * number, 0.0, 0.0)),
+            ros.transform("base_link", "laser", at, flat(0.1, 0.0, 0.0)),
+        ]
+        seen = ros.detections(at, "base_link", ros.detection([("cup", 0.9)], ros.box(9, 9, 2, 2)))
+        scan = ros.laser_scan(at, "laser", ranges, angle_min=0.0, angle_increment=0.0174)
+        recorded += [("/tf", at, ros.tf(*links)), ("/scan", at, scan), ("/detections", at, seen)]
+    bag = write_bag(tmp_path / "drive", recorded)
+    (about,) = imported(tmp_path / "log", bag).bags
+    used = {topic.topic: topic.used_for for topic in about.topics}
+    assert used["/scan"] == "walls"
+    assert about.streams["/detections"].with_scan == 12
+    assert all("scan" in each for each in envelopes(tmp_path / "log"))
+    with LogReader(tmp_path / "log") as reader:
+        _, view = fold_log(reader, Settings(places="rooms"))
+    assert view.map is not None
+    assert view.map.scanned
+    with_map = [*recorded, ("/map", START, Raw("nav_msgs/msg/OccupancyGrid", b"\0\1\0\0"))]
+    (about,) = imported(tmp_path / "other", write_bag(tmp_path / "again", with_map)).bags
+    assert not any(topic.used_for for topic in about.topics if topic.topic == "/scan")
 
 
 def test_a_second_import_changes_no_map(drives: dict[str, Path], tmp_path: Path) -> None:

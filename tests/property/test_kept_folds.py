@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import Delta
 from projections.fold.relations import Adjacency
 from projections.fold.settings import Settings
@@ -16,6 +17,7 @@ from tests.support.folds import Folded, fold, resumed, state_bytes
 
 def _plain(delta: Delta) -> tuple[Any, ...]:
     values = (getattr(delta, name) for name in delta.__struct_fields__)
+    values = (v.digest() if isinstance(v, OccupancyMap) else v for v in values)
     return type(delta), *(v.tolist() if isinstance(v, np.ndarray) else v for v in values)
 
 

@@ -13,6 +13,7 @@ Simulated runs, each made once a process: one takes half a second.
 The keyframes of logs/sample alone.
 """
 
+import base64
 import hashlib
 import json
 import math
@@ -279,6 +280,10 @@ def _envelope(rng: random.Random, number: int) -> dict[str, Any]:
         fields["pose_covariance"] = [0.01, 0, 0, 0, 0.02, 0, 0, 0, 0.001]
     if rng.random() < 0.2:
         fields["a field of others"] = {"nested": [1, "two", None]}
+    if number % 4 == 0:
+        ranges = base64.b64encode(bytes(range(4, 52))).decode()
+        scan = {"angle_min": -1.5, "angle_step": 0.25, "range_max": 9.0, "ranges_mm": ranges}
+        fields["scan"] = {**scan, "x": 0.1, "yaw": 0.5}
     x = None if rng.random() < 0.1 else 0.3 * number + rng.random()
     return envelope(
         number, x, rng.random(), detections=[_seen(rng) for _ in range(rng.randrange(5))], **fields

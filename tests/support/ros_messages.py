@@ -139,6 +139,19 @@ def solids(ns: int, frame: str, *each: Any) -> Any:
     return make("vision_msgs/msg/Detection3DArray", header=header(ns, frame), detections=[*each])
 
 
+def laser_scan(ns: int, frame: str, ranges: Any, **fields: Any) -> Any:
+    about = {"range_min": 0.1, "range_max": 8.0, "angle_max": 1.0, **fields}
+    return make(
+        "sensor_msgs/msg/LaserScan",
+        header=header(ns, frame),
+        time_increment=0.0,
+        scan_time=0.1,
+        ranges=np.array(ranges, np.float32),
+        intensities=np.zeros(0, np.float32),
+        **about,
+    )
+
+
 def detections(ns: int, frame: str, *each: Any) -> Any:
     return make("vision_msgs/msg/Detection2DArray", header=header(ns, frame), detections=[*each])
 

@@ -30,6 +30,7 @@ from projections.fold.settings import Settings
 from projections.map.fold import fold_log
 from projections.map.own_events import read_corrections
 from projections.map.place_regions import place_regions
+from projections.map.records import body_fields
 from projections.map.view import MapView
 from projections.postgres import TailProgress, TailReport, rebuild, tail
 from projections.postgres.connection import Targets, connect
@@ -225,6 +226,9 @@ def _expect_objects(view: MapView, rows: dict[str, list[tuple[Any, ...]]]) -> No
             "last_seen": obj.last_seen,
             "confirmed": obj.confirmed,
         }
+        bodies = [view.observations[o].body for o in obj.observations]
+        if any(body is not None for body in bodies):
+            properties |= body_fields(view.body_of(obj))
         if view.settings.fusion == "evidence":
             properties["missing"] = obj.missing_in is not None
             if obj.missing_in is not None:

@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.ros import messages as ros
+from eventsrc.ros.laser import LASER_SCAN
 from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.named_classes import CLASS_TYPES, ClassNames, nearest
@@ -53,14 +54,14 @@ class BagOptions:
     heights: bool = False
     max_gap_ns: int = DEFAULT_MAX_GAP_NS
     images: str | None = None
+    scan: str | None = None
     cut: CutCrops | None = None
     """Cuts crops of detections, to keep them; None to keep none."""
 
 
 @dataclass
 class Choice:
-    """The streams of a bag, the topics of its occupancy grids, the uses of each topic, and notes
-    for the user."""
+    """Streams, topics of occupancy grids, the uses of each topic, and notes for the user."""
 
     streams: list[Stream] = field(default_factory=list)
     grids: list[str] = field(default_factory=list)
@@ -101,8 +102,7 @@ class Chooser:
         }
 
     def choose(self) -> Choice:
-        """Streams, grids, uses and notes. Raises MisuseError for an option that names a missing
-        topic, or one of another type."""
+        """Choose. Raises MisuseError for an option that names a missing or unfit topic."""
         detections = self._detections()
         for topic in detections:
             self._add_stream(topic, several=len(detections) > 1)
@@ -136,16 +136,16 @@ class Chooser:
         embeddings = self._embeddings(topic)
         camera = self._camera(topic, camera_frame)
         images = None if options.cut is None else self._images(topic, camera_frame)
-        told = self._class_names(topic)
+        told, scan = self._class_names(topic), self._scan(topic)
         topics = tf, tf_static, None if by_transforms else pose, covariance, embeddings, camera
         made.streams.append(
             Stream(
                 *(topic, run_id, *topics, map_frame, base_frame),
-                labels={**told, **options.labels},
-                embedding_model=options.embedding_model,
-                heights=options.heights,
+                {**told, **options.labels},
+                *(options.embedding_model, options.heights),
                 max_gap_ns=options.max_gap_ns,
                 images=images,
+                scan=scan,
             )
         )
         made.use(topic, f"keyframes of run {run_id}")
@@ -166,14 +166,13 @@ class Chooser:
                 )
         else:
             made.use(pose, "poses")
-            made.use(tf, "where the camera is")
-            made.use(tf_static, "where the camera is")
+            for each in (tf, tf_static):
+                made.use(each, "where the camera is")
             if pose is None and options.pose != NONE:
                 made.notes.append(f"{topic}: no topic has poses; its keyframes are kept without")
-        made.use(covariance, "errors of poses")
-        made.use(embeddings, "embeddings")
-        made.use(camera, "camera")
-        made.use(images, "crops")
+        uses = "errors of poses", "embeddings", "camera", "crops", "walls"
+        for used, what in zip((covariance, embeddings, camera, images, scan), uses, strict=True):
+            made.use(used, what)
         if embeddings is None and options.embeddings != NONE:
             made.notes.append(
                 f"{topic}: no topic has embeddings, so Objects go by class and box alone; "
@@ -198,7 +197,6 @@ class Chooser:
             self._made.use(topic, "map")
 
     def _given(self, option: str, *type_names: str) -> str | None:
-        """The topic that an option names, `NONE` included; None if it is not given."""
         given: str | None = getattr(self._options, option.removeprefix("--"))
         if given not in (None, NONE):
             self._check(option, given, *type_names)
@@ -246,24 +244,29 @@ class Chooser:
         return self._nearest(topic, same or there, "cameras", "--camera")
 
     def _images(self, topic: str, frame: str) -> str | None:
-        """The topic of the pictures that crops are cut from."""
         if (given := self._given("--images", *IMAGES)) is not None:
             return _unless_none(given)
         there = [each for each in self._of_type(*IMAGES) if "depth" not in each.lower()]
         same = [each for each in there if frame and self._frames.get(each) == frame]
         found = self._nearest(topic, same or there, "pictures", "--images")
         if not there:
-            self._made.notes.append(
-                f"{topic}: no topic has pictures, so there are no crops to keep"
-            )
+            note = f"{topic}: no topic has pictures, so there are no crops to keep"
+            self._made.notes.append(note)
         return found
+
+    def _scan(self, topic: str) -> str | None:
+        if (given := self._given("--scan", LASER_SCAN)) is not None:
+            return _unless_none(given)
+        grid, grids = self._options.grid, self._of_type(ros.GRID)
+        has_map = grid != NONE if grid is not None else any(_last(g) == _MAP for g in grids)
+        there = [] if has_map else self._of_type(LASER_SCAN)
+        return self._nearest(topic, there, "range scans", "--scan")
 
     def _class_names(self, topic: str) -> Mapping[str, str]:
         """The names of classes that messages tell, by id."""
         given = self._options.classes
-        for each in given:
-            if each != NONE:
-                self._check("--classes", each, *CLASS_TYPES)
+        for each in sorted({*given} - {NONE}):
+            self._check("--classes", each, *CLASS_TYPES)
         names = ClassNames()
         by_type: dict[str, str] = {}
         for kind in CLASS_TYPES:
@@ -311,8 +314,7 @@ class Chooser:
         return tree
 
     def _frame_of(self, topic: BagTopic) -> str | None:
-        """The frame of a topic's first message."""
-        frames = self._samples(topic.name, lambda message: ros.frame_name(message.header.frame_id))
+        frames = self._samples(topic.name, lambda m: ros.frame_name(m.header.frame_id))
         return next(iter(frames), None)
 
     def _samples(self, topic: str | None, reader: Callable[[Any], _Read]) -> Iterable[_Read]:
@@ -327,15 +329,13 @@ class Chooser:
         return [t for t in self._of_type(ros.TF) if (_last(t) == "tf_static") is static]
 
     def _of_type(self, *type_names: str) -> list[str]:
-        """The topics of these types, by name."""
         topics = self._contents.topics.values()
         return sorted(topic.name for topic in topics if topic.type_name in type_names)
 
     def _nearest(
         self, topic: str, candidates: Sequence[str], what: str, option: str | None = None
     ) -> str | None:
-        """The candidate that shares the most leading parts with ``topic``, of several the one with
-        the fewest parts; None, with a note, if that leaves several."""
+        """The candidate that is `nearest` to ``topic``; None, with a note, if several are."""
         if not candidates:
             return None
         near = nearest(topic, candidates)
@@ -362,7 +362,7 @@ class Chooser:
             )
 
     def _run_id(self) -> str:
-        """The run id: the bag's name and time, so that importing it again gives the same id."""
+        """The bag's name and time, so that importing it again gives the same id."""
         name = "".join(char if char.isprintable() else "_" for char in self._name)[:_MOST_NAME]
         first_ns = self._contents.first_ns or 0
         try:

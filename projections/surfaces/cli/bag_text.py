@@ -164,6 +164,10 @@ class BagChoice:
         str | None,
         _topic("--images", "Topic of the pictures for --keep-crops. Default: the nearest."),
     ] = None
+    scan: Annotated[
+        str | None,
+        _topic("--scan", "Topic of sensor_msgs/LaserScan; or none. Default: one, if no map."),
+    ] = None
     max_gap: Annotated[float, max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
 
     def options(self) -> BagOptions:
@@ -184,6 +188,7 @@ class BagChoice:
             self.heights,
             max_gap_ns(self.max_gap),
             self.images,
+            self.scan,
             crop_cutter(self.keep_crops, self.images),
         )
 
@@ -254,6 +259,8 @@ def _keyframes(counts: Counts) -> str:
     seen = counted(counts.detections, "detection")
     measured = f", {counts.with_position:,} with a position" if counts.with_position else ""
     parts.append(f"{seen}, {counts.with_embedding:,} with an embedding{measured}")
+    if counts.with_scan:
+        parts.append(f"{counts.with_scan:,} with a scan")
     if counts.crops or counts.without_picture or counts.outside:
         parts.append(counted(counts.crops, "crop"))
     if counts.without_picture:

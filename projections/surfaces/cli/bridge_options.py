@@ -160,6 +160,9 @@ class BridgeChoice:
         str | None,
         _option("--images", "TOPIC", "Topic of the pictures for --keep-crops, which needs it."),
     ] = None
+    scan: Annotated[
+        str | None, _option("--scan", "TOPIC", "Topic of LaserScan, for walls where no map is.")
+    ] = None
     max_gap: Annotated[float, bag_text.max_gap_option(_PANEL)] = DEFAULT_MAX_GAP_NS / 1e9
     topic: Annotated[
         list[str] | None,
@@ -264,6 +267,7 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
         heights=choice.heights,
         max_gap_ns=bag_text.max_gap_ns(choice.max_gap),
         images=full(choice.images, "--images"),
+        scan=full(choice.scan, "--scan"),
         cut=bag_text.crop_cutter(choice.keep_crops, choice.images),
     )
 
@@ -331,6 +335,7 @@ def recording_of(
                 first_keyframe=_next_keyframe(ledger, run_id),
                 classes=tuple(full(t, "--classes") for t in choice.classes or () if t != NONE),
                 images=given(choice.images, "--images"),
+                scan=given(choice.scan, "--scan"),
             )
         )
     grid = given(choice.grid or _GRID, "--grid")
@@ -346,7 +351,7 @@ def used_topics(recording: RosRecording) -> list[str]:
     found: dict[str, None] = {}
     for stream in recording.streams:
         pose = [stream.pose, stream.covariance, stream.tf, stream.tf_static]
-        others = stream.embeddings, stream.camera, *stream.classes
+        others = stream.embeddings, stream.camera, stream.scan, *stream.classes
         for topic in (stream.detections, *pose, *others):
             if topic is not None:
                 found[topic] = None

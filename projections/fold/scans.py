@@ -1,0 +1,184 @@
+"""Walls from the robots' own range scans, where no map of the floor is given.
+
+1.  A floor's grid has cells of `CELL_UM` with odds from -`MOST` to `MOST`; 0 is unknown. A beam
+    adds `HIT` to the cell that it ends in, and `PASSED` to each that it crosses before, once a
+    scan; it is followed for `REACH_M`. A beam without an end crosses cells only.
+2.  A cell is wall from `WALL` on, free below 0.
+3.  A map is made of the grid when a quarter more cells are known than at the last one, and when
+    twice as many scans were cast: so all maps cost a few times what the last one does.
+
+The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, positions on a beam multiples
+of 2⁻¹⁶ cells: integers from there on. A scan that would make a side of the grid longer than
+`MOST_CELLS` is left out.
+"""
+
+from functools import lru_cache
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eventsrc.envelope.model import NO_RETURN_MM, UNKNOWN_MM, StatedScan
+from eventsrc.envelope.occupancy_map import OCCUPIED, UNKNOWN, OccupancyMap
+
+from . import State, part, prefixed
+from .deltas import Pose
+from .exact import UM_PER_M, cos_sin, metres_to_um
+from .sights import small_angle
+
+CELL_UM: Final = 100_000
+CELL_MM: Final = 100
+REACH_M: Final = 8
+PASSED, HIT, MOST, WALL = -2, 5, 40, 5
+MOST_CELLS: Final = 4096
+LEAST_NEWS: Final = 100
+SHARE_OF_NEWS: Final = 4
+FIRST_DOUBLING: Final = 32
+_DIRECTIONS: Final = 1 << 13
+_TURN: Final = 6.283185307179586
+_BITS: Final = 16
+_STEPS: Final = REACH_M * UM_PER_M // CELL_UM
+_HALF: Final = _STEPS + 2
+"""Cells from the sensor's to the border of the window that a scan changes."""
+_GROWN_BY: Final = 64
+
+Odds: TypeAlias = NDArray[np.int8]
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Cosine and sine of each direction, multiples of 2⁻¹⁶."""
+    parts = [cos_sin(number * (_TURN / _DIRECTIONS)) for number in range(_DIRECTIONS)]
+    scaled = np.rint(np.array(parts) * (1 << _BITS)).astype(np.int32)
+    return scaled[:, 0].copy(), scaled[:, 1].copy()
+
+
+class ScannedFloor:
+    """The grid of one floor. ``column`` and ``row`` are those of its first cell."""
+
+    def __init__(self) -> None:
+        self.column = self.row = 0
+        self.odds: Odds = np.zeros((0, 0), np.int8)
+        self.scans = self.scans_at_map = 0
+        self.news = self.known = 0
+
+    def cast(self, pose: Pose, scan: StatedScan) -> None:
+        """Add a scan taken at a pose of the robot."""
+        yaw = small_angle(pose.yaw_rad)
+        cos, sin = cos_sin(yaw)
+        x_um = pose.x_um + metres_to_um(cos * scan.x - sin * scan.y)
+        y_um = pose.y_um + metres_to_um(sin * scan.x + cos * scan.y)
+        column, row = x_um // CELL_UM, y_um // CELL_UM
+        if not self._has_room(column, row):
+            return
+        ranges = scan.ranges()
+        angles = (yaw + scan.yaw + scan.angle_min) + np.arange(len(ranges)) * scan.angle_step
+        numbers = np.rint(angles * (_DIRECTIONS / _TURN)).astype(np.int64) & (_DIRECTIONS - 1)
+        cosines, sines = (part[numbers] for part in _directions())
+        left, below = column - _HALF, row - _HALF
+        ax, ay = (
+            ((at - first * CELL_UM) << _BITS) // CELL_UM
+            for at, first in ((x_um, left), (y_um, below))
+        )
+        touched = np.zeros((2 * _HALF + 1, 2 * _HALF + 1), np.int8)
+        most = min(REACH_M, scan.range_max) * 1000
+        steps = np.where(ranges == NO_RETURN_MM, int(most), ranges) // CELL_MM
+        steps = np.minimum(steps, _STEPS).astype(np.int32)
+        along = np.arange(_STEPS, dtype=np.int32)
+        crossed = along < steps[:, None]
+        columns = (ax + cosines[:, None] * along) >> _BITS
+        rows = (ay + sines[:, None] * along) >> _BITS
+        flat = touched.ravel()
+        flat[(rows * touched.shape[1] + columns)[crossed]] = PASSED
+        ends = (ranges != UNKNOWN_MM) & (ranges < REACH_M * 1000) & (ranges != NO_RETURN_MM)
+        far = ranges[ends].astype(np.int64)
+        columns = (ax + cosines[ends] * far // CELL_MM) >> _BITS
+        rows = (ay + sines[ends] * far // CELL_MM) >> _BITS
+        flat[rows * touched.shape[1] + columns] = HIT
+        self._add(left, below, touched)
+
+    def _has_room(self, column: int, row: int) -> bool:
+        """Make the grid large enough for a scan from a cell; False if that is too large."""
+        first = [(at - _HALF) // _GROWN_BY * _GROWN_BY for at in (column, row)]
+        end = [-(-(at + _HALF + 1) // _GROWN_BY) * _GROWN_BY for at in (column, row)]
+        if self.odds.size:
+            rows, columns = self.odds.shape
+            first = [min(a, b) for a, b in zip(first, (self.column, self.row), strict=True)]
+            ends = self.column + columns, self.row + rows
+            end = [max(a, b) for a, b in zip(end, ends, strict=True)]
+        width, height = end[0] - first[0], end[1] - first[1]
+        if max(width, height) > MOST_CELLS:
+            return False
+        if (height, width) != self.odds.shape:
+            grown = np.zeros((height, width), np.int8)
+            rows, columns = self.odds.shape
+            down, right = (self.row - first[1], self.column - first[0]) if rows else (0, 0)
+            grown[down : down + rows, right : right + columns] = self.odds
+            self.odds, (self.column, self.row) = grown, first
+        return True
+
+    def _add(self, left: int, below: int, touched: Odds) -> None:
+        right, down = left - self.column, below - self.row
+        window = self.odds[down : down + touched.shape[0], right : right + touched.shape[1]]
+        self.news += int(np.count_nonzero((window == 0) & (touched != 0)))
+        np.clip(window + touched, -MOST, MOST, out=window)
+        self.scans += 1
+
+    def is_due(self) -> bool:
+        """Whether a map is to be made."""
+        return self.news >= max(LEAST_NEWS, self.known // SHARE_OF_NEWS) or (
+            self.scans >= 2 * max(self.scans_at_map, FIRST_DOUBLING)
+        )
+
+    def map(self, floor: str | None) -> OccupancyMap:
+        """The grid as an occupancy map, from its first to its last known row and column."""
+        known = self.odds != 0
+        self.scans_at_map, self.news, self.known = self.scans, 0, int(np.count_nonzero(known))
+        rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+        kept = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        odds = self.odds[kept]
+        cells = np.where(odds >= WALL, OCCUPIED, np.where(odds < 0, 0, UNKNOWN)).astype(np.uint8)
+        x, y = self.column + int(columns[0]), self.row + int(rows[0])
+        origin = x * CELL_UM / UM_PER_M, y * CELL_UM / UM_PER_M, 0.0
+        return OccupancyMap(None, CELL_UM / UM_PER_M, origin, "scans", cells, floor)
+
+
+_NUMBERS: Final = ("column", "row", "scans", "scans_at_map", "news", "known")
+
+
+class Scans:
+    """The grids by number of their floor."""
+
+    def __init__(self) -> None:
+        self._floors: dict[int, ScannedFloor] = {}
+
+    def add(
+        self, number: int, floor: str | None, pose: Pose, scan: StatedScan
+    ) -> OccupancyMap | None:
+        """Cast a scan; returns a new map if one is due."""
+        grid = self._floors.setdefault(number, ScannedFloor())
+        grid.cast(pose, scan)
+        return grid.map(floor) if grid.is_due() else None
+
+    def forget(self, number: int) -> None:
+        """Drop the grid of a floor."""
+        self._floors.pop(number, None)
+
+    def dump(self) -> State:
+        """The whole state, to be kept; nothing without a scan."""
+        if not self._floors:
+            return {}
+        state: State = {"floors": list(self._floors)}
+        for number, grid in self._floors.items():
+            fields = {name: getattr(grid, name) for name in _NUMBERS}
+            state |= prefixed(str(number), fields | {"odds": grid.odds})
+        return state
+
+    def load(self, state: State) -> None:
+        """Restore the state of `dump`."""
+        for number in state.get("floors", ()):
+            grid = self._floors[number] = ScannedFloor()
+            fields = part(str(number), state)
+            for name in _NUMBERS:
+                setattr(grid, name, fields[name])
+            grid.odds = np.array(fields["odds"], np.int8)
