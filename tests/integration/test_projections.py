@@ -5,8 +5,10 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import psycopg
 import pytest
+from pgvector.psycopg import register_vector
 
 from eventsrc.log import LogReader
 from projections.fold.map_errors import DatabaseError, FoldError, ProjectionMismatch
@@ -16,6 +18,7 @@ from projections.map.fold import fold_log
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets
+from projections.postgres.vector_sink import build_hnsw
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import WEIRD, append_raw, bridge, walk, write_log
 from tests.support.rows import (
@@ -26,9 +29,10 @@ from tests.support.rows import (
     vector_rows,
     wait_for_drops,
 )
-from tests.support.thorough import mostly_slow
+from tests.support.thorough import mostly_slow, rounds
 
 SETTINGS = Settings()
+PROJECTIONS = Path(__file__).parents[2] / "docs/projections.md"
 
 
 def log_in(folder: Path) -> Path:
@@ -191,6 +195,33 @@ def test_both_queries_of_the_design_work_verbatim(
             place = view.places[landmark.place]
             expected = [(place.place_id, place.centroid_x, place.centroid_y, landmark.class_name)]
         assert [tuple(json.loads(value) for value in r) for r in found] == expected
+
+
+def test_a_search_with_conditions_as_documented_finds_what_is_nearest(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    documented = next(line for line in PROJECTIONS.read_text().splitlines() if "+ 0 LIMIT" in line)
+    search = documented.replace("$query", "%(query)s").replace("= $class", "= ANY(%(classes)s)")
+    rebuild(write_log(tmp_path / "log", walk(300)), one_database, SETTINGS)
+    chance = np.random.default_rng(1)
+    with psycopg.connect(one_database.vector_url, autocommit=True) as connection:
+        register_vector(connection)
+        assert build_hnsw(connection, threshold=1).built
+        connection.execute("SET enable_seqscan = off")  # where an index can be used, it is
+        rows = connection.execute(
+            "SELECT det_id, class_name, embedding::real[] FROM detection_embeddings"
+        ).fetchall()
+        vectors = np.array([row[2] for row in rows])
+        names = sorted({row[1] for row in rows})
+        assert len(names) > 2
+        for _ in range(rounds(1000, 50)):
+            classes = list(chance.choice(names, int(chance.integers(1, 3)), replace=False))
+            query = chance.normal(size=vectors.shape[1]).astype(np.float32)
+            found = connection.execute(search, {"query": query, "classes": classes}).fetchall()
+            away = 1.0 - vectors @ query / np.linalg.norm(query)
+            fitting = [n for n, row in enumerate(rows) if row[1] in classes]
+            best = sorted(fitting, key=lambda n: away[n])[:10]
+            assert [each for (each,) in found] == [rows[n][0] for n in best]
 
 
 @pytest.mark.slow

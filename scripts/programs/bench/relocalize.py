@@ -6,12 +6,15 @@ log and databases in ``--data`` (minutes: the HNSW index alone takes most of the
 measure only.
 
     scripts/bench_relocalize [--data DIR] [--observations N]
+    scripts/bench_relocalize --commands       # instead: processor time of find, room and path on
+                                              # 100,200 keyframes of 334 buildings, 20,000 Objects
 """
 
 import argparse
 import base64
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -24,6 +27,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import psycopg
+from pgvector.psycopg import register_vector
 
 from eventsrc.log import NEVER, LogWriter
 from eventsrc.record.transport.session import ZenohOptions, open_session
@@ -39,6 +44,7 @@ from tests.support.scenes import crops_of
 APART_M = 60.0
 KEYFRAMES = 4_000
 CROPS, QUESTIONS, CLIENTS = 3, 300, 8
+BUILDINGS, KEYFRAMES_OF_MANY = 334, 300
 ENDPOINT = "tcp/127.0.0.1:7462"
 
 
@@ -47,9 +53,9 @@ def building(number: int) -> Building:
     return Building(500 + number, kin=500)
 
 
-def envelopes(number: int) -> Iterator[tuple[bytes, int]]:
+def envelopes(number: int, keyframes: int = KEYFRAMES) -> Iterator[tuple[bytes, int]]:
     """The payloads of a building's run and how many observations each has."""
-    for keyframe in drive(building(number), f"bench-{number}", number, KEYFRAMES):
+    for keyframe in drive(building(number), f"bench-{number}", number, keyframes):
         document = msgspec.to_builtins(keyframe.accepted.envelope)
         document["map_x"] += number * APART_M
         for seen, vector in zip(document["detections"], keyframe.accepted.vectors, strict=True):
@@ -162,6 +168,72 @@ def recall(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
         print(f"recall at {count}: {statistics.mean(shares):.4f}")
 
 
+def with_conditions(targets: Targets, asked: Sequence[tuple[QuestionCrop, ...]]) -> None:
+    """Ten nearest of some classes, through the index and as docs/projections.md says."""
+    chance = np.random.default_rng(5)
+    names = sorted({crop.class_name for crops in asked for crop in crops if crop.class_name})
+    questions = [
+        (crops[0].vector, list(chance.choice(names, int(chance.integers(1, 4)), replace=False)))
+        for crops in asked[:100]
+    ]
+    answers: list[list[set[str]]] = []
+    with psycopg.connect(targets.vector_url, autocommit=True) as connection:
+        register_vector(connection)
+        for way, more in (("exact", " + 0"), ("through the index", "")):
+            statement = (
+                "SELECT det_id FROM detection_embeddings WHERE class_name = ANY(%s)"
+                f" ORDER BY (embedding <=> %s){more} LIMIT 10"
+            )
+            found, seconds = [], []
+            for vector, classes in questions:
+                began = time.perf_counter()
+                rows = connection.execute(statement.encode(), (classes, vector)).fetchall()
+                seconds.append(time.perf_counter() - began)
+                found.append({str(row[0]) for row in rows})
+            answers.append(found)
+            shares = [len(f & e) / len(e) for f, e in zip(found, answers[0], strict=True)]
+            share = f"{statistics.mean(shares):.3f} of the ids"
+            print(f"nearest of some classes, {way}: {percentiles(seconds)}, {share}{load()}")
+
+
+def on_a_large_map(data: Path) -> None:
+    """Commands on a kept history, beside the floor: reading its columns with numpy."""
+    log = data / "many-buildings"
+    if not log.exists():
+        with LogWriter(log, fsync=NEVER) as writer:
+            for number in range(BUILDINGS):
+                for content, _ in envelopes(number, KEYFRAMES_OF_MANY):
+                    writer.append("tb/detections", content)
+    kept = f"import numpy, pathlib; of = pathlib.Path({str(log.with_suffix('.history'))!r})"
+    kept += "; z = numpy.load(max(of.glob('*.npz'), key=lambda p: p.stat().st_mtime))"
+    kept += "; [z[name] for name in z.files]"
+    run = [sys.executable, "-m", "projections.surfaces.cli"]
+    full = [str(log), "--preset", "full"]
+    point, room = f"{100 * APART_M},5", "bench-100_p0"
+    commands = {
+        "kept, not counted": [*run, "find", *full, "class 3"],
+        "floor: python reads what is kept": [sys.executable, "-c", kept],
+        "find CLASS": [*run, "find", *full, "class 3"],
+        "find CLASS --near X,Y": [*run, "find", *full, "class 3", "--near", point],
+        "find CLASS --in PLACE": [*run, "find", *full, "class 3", "--in", room],
+        "find CLASS --from X,Y": [*run, "find", *full, "class 3", "--from", point],
+        "find CLASS --at W": [*run, "find", *full, "class 3", "--at", "50000"],
+        "room PLACE": [*run, "room", *full[:1], room, *full[1:]],
+        "path X,Y X,Y": [*run, "path", *full[:1], point, f"{100 * APART_M + 3},6", *full[1:]],
+    }
+    for what, command in commands.items():
+        spent = [_processor_s(command) for _ in range(1 if "not counted" in what else 5)]
+        print(f"{what}: least {min(spent):.2f} s, median {statistics.median(spent):.2f} s of CPU")
+
+
+def _processor_s(command: Sequence[str]) -> float:
+    """Processor time of a whole command."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
 def payload(crops: Sequence[QuestionCrop]) -> bytes:
     """A question as a robot sends it."""
     seen: list[dict[str, Any]] = [
@@ -222,8 +294,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--data", type=Path, default=Path(".mapfold/bench-relocalize"))
     parser.add_argument("--observations", type=int, default=300_000)
+    parser.add_argument("--commands", action="store_true", help="Measure commands instead.")
     arguments = parser.parse_args()
     arguments.data.mkdir(parents=True, exist_ok=True)
+    if arguments.commands:
+        return on_a_large_map(arguments.data)
     prepare(arguments.data, arguments.observations)
     asked = questions(arguments.data)
     server = EmbeddedServer(arguments.data)
@@ -233,6 +308,7 @@ def main() -> None:
         library(targets, asked)
         other_questions(targets, asked)
         recall(targets, asked)
+        with_conditions(targets, asked)
         over_zenoh(targets, asked)
     finally:
         server.stop()
