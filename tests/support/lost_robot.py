@@ -13,6 +13,7 @@ from tests.support import rmw
 from tests.support.logs import simulated
 from tests.support.ros2dds import KINDS, static
 from tests.support.ros_messages import (
+    SECOND,
     START,
     box,
     camera_info,
@@ -29,6 +30,7 @@ CAMERA_AHEAD_M = 0.2
 ODOM = flat(3.0, -2.0, 0.7)
 """The map's origin in the frame of odometry."""
 _MOST = 2_000
+_EVERY_NS = 500_000_000
 
 
 def look_around(robot: rmw.Node, is_told: Callable[[], bool]) -> list[dict[str, Any]]:
@@ -44,7 +46,7 @@ def look_around(robot: rmw.Node, is_told: Callable[[], bool]) -> list[dict[str, 
     while len(sent) < _MOST and not is_told():
         sent.append(json.loads(keyframes[len(sent) % len(keyframes)]))
         robot.send("/camera_info", lens)
-        for topic, message in _sent(sent[-1], START + len(sent) * 500_000_000):
+        for topic, message in _sent(sent[-1], START + len(sent) * _EVERY_NS):
             robot.send(topic, message)
     return sent
 
@@ -69,11 +71,14 @@ def _sent(envelope: dict[str, Any], stamp_ns: int) -> Iterator[tuple[str, Any]]:
 
 
 def check_initial_pose(message: Any, sent: list[dict[str, Any]]) -> None:
-    """The pose of the base is at one of the last keyframes sent, and says how sure it is."""
+    """The pose of the base is that at the keyframe of its stamp, and says how sure it is."""
     assert message.header.frame_id == "map"
     at, look = message.pose.pose.position, message.pose.pose.orientation
     yaw = 2 * math.atan2(look.z, look.w)
     camera = at.x + CAMERA_AHEAD_M * math.cos(yaw), at.y + CAMERA_AHEAD_M * math.sin(yaw)
-    seen = [(envelope["map_x"], envelope["map_y"]) for envelope in sent[-8:]]
-    assert min(math.dist(camera, spot) for spot in seen) < 1.0
+    stamp = message.header.stamp
+    number = round((stamp.sec * SECOND + stamp.nanosec - START) / _EVERY_NS)
+    envelope = sent[number - 1]
+    assert math.dist(camera, (envelope["map_x"], envelope["map_y"])) < 1.0
+    assert abs(math.remainder(yaw - envelope["map_yaw"], math.tau)) < math.radians(20.0)
     assert min(message.pose.covariance[i] for i in (0, 7, 35)) > 0.0

@@ -77,6 +77,17 @@ def test_answers_that_disagree_or_are_wide_are_not_told() -> None:
         assert told(wrong) is None
 
 
+def test_an_answer_of_another_run_does_not_count() -> None:
+    robot = WakingRobot()
+    for number in (0, 1):
+        assert robot.see(keyframe(number, 0.0, 0.0)) is not None
+    assert robot.judge(answer(5.0, 0.0)) is None
+    for number in (0, 1):
+        assert robot.see(keyframe(number, 0.0, 0.0, run_id="other")) is not None
+    assert robot.judge(answer(5.0, 0.0)) is None
+    assert robot.judge(answer(5.0, 0.0)) is not None
+
+
 def test_questions_have_the_latest_keyframe_and_views_spread_over_the_others() -> None:
     robot, question = WakingRobot(), None
     for number in range(MOST_KEYFRAMES + 5):

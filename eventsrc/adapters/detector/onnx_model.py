@@ -54,6 +54,7 @@ class Description(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     EXAMPLE: ClassVar[str]
+    PAGE: ClassVar[str] = "docs/detector.md"
     model: Text
 
 
@@ -69,14 +70,14 @@ def read_description(model: Path, kind: type[Described]) -> Described:
     except FileFault as fault:
         raise MisuseError(
             f"{path}: {fault}; this file describes the input of {model.name}, such as"
-            f" {kind.EXAMPLE}; see docs/detector.md"
+            f" {kind.EXAMPLE}; see {kind.PAGE}"
         ) from None
     try:
         return kind.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the file"
-        raise MisuseError(f"{path}: {place}: {first['msg']}; see docs/detector.md") from None
+        raise MisuseError(f"{path}: {place}: {first['msg']}; see {kind.PAGE}") from None
 
 
 def model_sha256(path: Path, description: Description, *more: bytes) -> str:

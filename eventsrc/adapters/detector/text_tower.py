@@ -2,7 +2,7 @@
 its image tower.
 
 Beside ``clip_text.onnx`` are its tokenizer, ``tokenizer.json`` as the library `tokenizers` writes
-it, and ``clip_text.json``; docs/detector.md has that for common models:
+it, and ``clip_text.json``, which docs/embedding_spaces.md describes:
 
     {"model": "ViT-B-32/laion2b_s34b_b79k", "context": 77, "prompt": "a photo of a {}"}
 
@@ -38,6 +38,7 @@ class TextDescription(Description):
     """
 
     EXAMPLE = '{"model": "NAME", "context": 77, "prompt": "a photo of a {}"}'
+    PAGE = "docs/embedding_spaces.md"
 
     context: Annotated[int, Field(ge=1, le=4096)] = 77
     pad: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0

@@ -7,7 +7,6 @@ own: finding topics waits for publishers, and questions take a while.
 
 import math
 import threading
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Final
@@ -74,7 +73,7 @@ class InitialPose:
                     seen += 1
                     sure = self._judge(robot, heard)
                     if sure is not None:
-                        self._publish(sure, heard.camera)
+                        self._publish(sure, heard)
                         self._note(_text(sure, seen))
                         return
             if seen:
@@ -90,13 +89,15 @@ class InitialPose:
             self._note(f"a question could not be answered: {error}")
             return None
 
-    def _publish(self, sure: SurePose, camera: tuple[float, float]) -> None:
-        """Publish the pose of the base, whose camera is where the answer says."""
+    def _publish(self, sure: SurePose, heard: Heard) -> None:
+        """Publish the pose of the base, whose camera is where the answer says, with the time of the
+        keyframe: localisers move it on by what odometry says since."""
+        camera, stamp_ns = heard.camera, heard.keyframe.envelope.stamp_ns
         cos, sin = math.cos(sure.yaw), math.sin(sure.yaw)
         x = sure.x - (cos * camera[0] - sin * camera[1])
         y = sure.y - (sin * camera[0] + cos * camera[1])
         self._publisher.publish(
-            self._messages.pose_with_covariance(x, y, sure.yaw, sure.covariance, time.time_ns())
+            self._messages.pose_with_covariance(x, y, sure.yaw, sure.covariance, stamp_ns)
         )
 
 

@@ -66,6 +66,7 @@ class WakingRobot:
         """Take in a keyframe; the question to ask now, None if it shows nothing."""
         if self._seen and keyframe.envelope.run_id != self._seen[-1].envelope.run_id:
             self._seen.clear()
+            self._before = None
         if keyframe.envelope.map_x is None or not _most_confident(keyframe):
             return None
         self._seen = [*self._seen[1 - MOST_KEYFRAMES :], keyframe]

@@ -200,8 +200,7 @@ def _box(array: str) -> Box:
 
 
 def _thing(properties: str) -> _Thing:
-    """An Object; without an estimate under ``fusion = "page"`` and in a map of an older version,
-    which has no covariance."""
+    """An Object; without an estimate under ``fusion = "page"``."""
     found = json.loads(properties)
     estimate = None
     if "est_xx" in found:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 
@@ -54,16 +54,16 @@ Ros2Option = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-DomainOption = Annotated[
-    int | None,
-    option(
-        "N",
-        "The domain of the nodes, with --ros2. [default: ROS_DOMAIN_ID, else 0]",
-        "--domain",
-        min=0,
-        max=MAX_DOMAIN,
-        rich_help_panel=_PANEL,
-    ),
+
+
+def _domain_option(text: str, **more: Any) -> Any:
+    default = " [default: ROS_DOMAIN_ID, else 0]"
+    return option("N", text + default, "--domain", min=0, max=MAX_DOMAIN, **more)
+
+
+DomainOption = Annotated[int | None, _domain_option("The ROS domain of the node.")]
+RecordedDomainOption = Annotated[
+    int | None, _domain_option("The domain of the nodes, with --ros2.", rich_help_panel=_PANEL)
 ]
 Ros2ddsOption = Annotated[
     bool,

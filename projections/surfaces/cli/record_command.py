@@ -94,7 +94,7 @@ def record(
     ] = False,
     new_log: NewLogOptions,
     ros2: bridge_options.Ros2Option = False,
-    domain: bridge_options.DomainOption = None,
+    domain: bridge_options.RecordedDomainOption = None,
     ros2dds: bridge_options.Ros2ddsOption = False,
     choice: bridge_options.BridgeChoice,
     json: JsonOption = False,
