@@ -340,8 +340,9 @@ class _StreamState:
         texts = given.by_index
         if given.by_id is not None:
             texts = [given.by_id.get(name) for name in detected.ids]
+            known = frozenset(detected.ids)
             for name, text in given.by_id.items():
-                if text is not None and name not in detected.ids:
+                if text is not None and name not in known:
                     reason = f"an embedding of {name!r:.80}, which is the id of no detection"
                     self.counts.refuse(self.stream.embeddings or "", reason)
         if len(texts) != len(detected.detections):

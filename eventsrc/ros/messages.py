@@ -168,9 +168,9 @@ def pose_of(message: Any) -> StampedPose:
 def lens_of(message: Any) -> Lens:
     """The camera of a CameraInfo. Raises BadMessage for one that is not calibrated."""
     width, height, fx = float(message.width), float(message.height), float(message.k[0])
-    if not (width > 0.0 and height > 0.0 and fx > 0.0 and math.isfinite(fx)):
+    hfov = round(math.degrees(2.0 * math.atan(width / 2.0 / fx)), 9) if fx > 0.0 else 0.0
+    if not (width > 0.0 and height > 0.0 and hfov > 0.0):
         raise BadMessage(f"a camera of {width:g} × {height:g} pixels with k[0] = {fx:g}")
-    hfov = round(math.degrees(2.0 * math.atan(width / 2.0 / fx)), 9)
     return Lens(frame_name(message.header.frame_id), hfov, width, height)
 
 
@@ -224,7 +224,12 @@ def embeddings_of_floats(message: Any) -> StampedEmbeddings:
         )
     count, dim = int(rows.size), int(columns.size)
     values = np.asarray(message.data, "<f4")
-    if count < 0 or dim < 0 or message.layout.data_offset != 0 or values.size != count * dim:
+    if (
+        count < 0
+        or dim < 1 <= count
+        or message.layout.data_offset != 0
+        or values.size != count * dim
+    ):
         raise BadMessage(f"{values.size:,} values where {count:,} × {dim:,} are declared")
     raw, size = values.tobytes(), 4 * dim
     by_index = [

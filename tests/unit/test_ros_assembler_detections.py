@@ -173,3 +173,13 @@ def test_messages_that_are_not_what_their_type_says() -> None:
     assert counts.unused == {"/tf": 2, "/tf_static": 1, "/camera_info": 1, "/odom": 1}
     assert "unit quaternion" in counts.reasons["/tf"]
     assert counts.keyframes == 0
+
+
+def test_rows_without_numbers_are_refused_before_they_are_counted_out() -> None:
+    rows = ros.float_rows(START, [[1.0]])
+    rows.data = rows.data[:0]
+    rows.layout.dim[0].size, rows.layout.dim[1].size = 2**32 - 1, 0
+    given = RosMessage("/embeddings", rows.__msgtype__, START, rows)
+    _, assembler = run([given], stream(embeddings="/embeddings"))
+    reason = assembler.counts["/detections"].reasons["/embeddings"]
+    assert reason == "0 values where 4,294,967,295 × 0 are declared"

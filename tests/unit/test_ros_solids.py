@@ -140,3 +140,11 @@ def test_hypotheses_of_vision_msgs_2_have_a_pose_too() -> None:
     array = SimpleNamespace(header=ros.header(START, "optical"), detections=[old])
     (cup,) = seen(message("/detections", 0, array))
     assert cup["position"] == pytest.approx([2.0, 2.25])
+
+
+def test_a_camera_that_sees_no_angle_is_refused() -> None:
+    lens = message("/camera_info", 0, ros.camera_info(START, "optical", 1e300))
+    cup = ros.solid("cup", Transform(0.5, -0.2, 3.0, *IDENTITY[3:]), 0.2, 0.2, 0.2)
+    (made,), assembler = run([lens, solids(cup)], stream(camera="/camera_info"))
+    assert "camera" not in made
+    assert assembler.counts["/detections"].unused == {"/camera_info": 1}
