@@ -9,7 +9,7 @@
 
 The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, positions on a beam multiples
 of 2⁻¹⁶ cells: integers from there on. A scan that would make a side of the grid longer than
-`MOST_CELLS` is left out.
+`MOST_CELLS` is left out, so that no map has more cells than one may have.
 """
 
 from functools import lru_cache
@@ -30,7 +30,7 @@ CELL_UM: Final = 100_000
 CELL_MM: Final = 100
 REACH_M: Final = 8
 PASSED, HIT, MOST, WALL = -2, 5, 40, 5
-MOST_CELLS: Final = 4096
+MOST_CELLS: Final = 3968
 LEAST_NEWS: Final = 100
 SHARE_OF_NEWS: Final = 4
 FIRST_DOUBLING: Final = 32
@@ -127,7 +127,7 @@ class ScannedFloor:
     def is_due(self) -> bool:
         """Whether a map is to be made."""
         return self.news >= max(LEAST_NEWS, self.known // SHARE_OF_NEWS) or (
-            self.scans >= 2 * max(self.scans_at_map, FIRST_DOUBLING)
+            self.scans >= 2 * max(self.scans_at_map, FIRST_DOUBLING) and bool(self.odds.any())
         )
 
     def map(self, floor: str | None) -> OccupancyMap:

@@ -10,10 +10,11 @@ import pytest
 from eventsrc.envelope.commands import CorrectPoses, RigidTransform
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest
 from eventsrc.envelope.model import NO_RETURN_MM, Offset, StatedScan
-from eventsrc.envelope.occupancy_map import OccupancyMap
+from eventsrc.envelope.occupancy_map import MAX_MAP_CELLS, OccupancyMap
 from projections.fold import scans
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.deltas import MapGiven, Pose
+from projections.fold.exact import UM_PER_M
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.view import MapView
@@ -111,6 +112,13 @@ def test_beams_of_which_nothing_is_known_change_nothing_and_those_that_end_nowhe
     assert max(np.hypot(rows + grid.row, columns + grid.column)) <= 20
 
 
+def test_of_scans_that_say_nothing_no_map_is_made_however_many_there_are() -> None:
+    blind = [{**d, "scan": scan([0] * 16)} for d in drive(2 * 2 * scans.FIRST_DOUBLING)]
+    folded = Folded.start(ROOMS).extend(blind)
+    assert not folded.all(MapGiven)
+    assert folded.extend(drive(40, run_id="sees")).all(MapGiven)
+
+
 def test_the_sensor_may_stand_and_look_elsewhere_on_the_robot() -> None:
     plain, mounted = scans.ScannedFloor(), scans.ScannedFloor()
     ranges = ranges_in_room(0.5, 0.2, math.pi / 2)
@@ -179,6 +187,18 @@ def test_a_scan_far_away_is_left_out_rather_than_filling_the_memory() -> None:
     shape = grid.odds.shape
     grid.cast(Pose(10**13, -(10**13), 0.0), one)
     assert (grid.odds.shape, grid.scans) == (shape, 1)
+
+
+def test_the_largest_map_of_scans_has_no_more_cells_than_a_map_may_have() -> None:
+    grid = scans.ScannedFloor()
+    open_space = StatedScan(**scan([NO_RETURN_MM] * 8))
+    reach = scans.REACH_M * UM_PER_M // scans.CELL_UM + 2
+    for cell in (reach, scans.MOST_CELLS - reach - 1):
+        grid.cast(Pose(cell * scans.CELL_UM, cell * scans.CELL_UM, 0.0), open_space)
+    assert grid.scans == 2
+    made = grid.map(None)
+    assert min(made.width, made.height) > scans.MOST_CELLS - 10
+    assert made.cells.size <= MAX_MAP_CELLS
 
 
 @pytest.mark.parametrize(
