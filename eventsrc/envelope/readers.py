@@ -19,6 +19,7 @@ from msgspec.structs import force_setattr
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     FailFast,
     Field,
@@ -82,7 +83,31 @@ class _Model(BaseModel):
     )
 
 
-Size = Annotated[float, Field(gt=0.0, le=MAX_SIZE_M)]
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _unless_foreign(is_ours: Callable[[Any], bool]) -> BeforeValidator:
+    """A field that robots may have sent with another meaning before it had one here: of another
+    shape it is taken for an unknown field."""
+
+    def own(value: object) -> object:
+        if value is None or is_ours(value):
+            return tuple(value) if isinstance(value, list) else value
+        _require_finite(value)
+        return None
+
+    return BeforeValidator(own)
+
+
+_Size = Annotated[float, Field(gt=0.0, le=MAX_SIZE_M)]
+Size = Annotated[
+    tuple[_Size, _Size, _Size] | None,
+    _unless_foreign(
+        lambda given: isinstance(given, list) and len(given) == 3 and all(map(_is_number, given))
+    ),
+]
+Height = Annotated[Position | None, _unless_foreign(_is_number)]
 
 
 class DetectionModel(_Model, title="Detection"):
@@ -106,8 +131,8 @@ class DetectionModel(_Model, title="Detection"):
     depth_sigma_m: Annotated[float, SIGMA_M] | None = None
     position: tuple[Position, Position] | None = None
     position_sigma_m: Annotated[float, SIGMA_M] | None = None
-    position_z: Position | None = None
-    size: tuple[Size, Size, Size] | None = None
+    position_z: Height = None
+    size: Size = None
 
 
 class EnvelopeCamera(_Model):
@@ -139,6 +164,12 @@ class EnvelopeScan(_Model):
     yaw: Annotated[float, ANGLE_RAD] = 0.0
 
 
+Scan = Annotated[
+    EnvelopeScan | None,
+    _unless_foreign(lambda given: isinstance(given, dict) and "ranges_mm" in given),
+]
+
+
 class EnvelopeModel(_Model, title="Envelope"):
     """One keyframe: where the robot was and what it saw.
 
@@ -160,7 +191,7 @@ class EnvelopeModel(_Model, title="Envelope"):
     floor: Floor = None
     map_z: Position | None = None
     pose_covariance: PoseCovariance | None = None
-    scan: EnvelopeScan | None = None
+    scan: Scan = None
     detections: Annotated[tuple[DetectionModel, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
 
     @model_validator(mode="after")

@@ -3,6 +3,9 @@
 import random
 from typing import Any
 
+import pytest
+
+from eventsrc.envelope.ingest import Rejected, ingest
 from eventsrc.envelope.model import Offset
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.deltas import Body
@@ -13,7 +16,7 @@ from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.stored_view import StoredView
 from projections.store.tables import Tables, TableWriter
-from tests.support.envelopes import detection, envelope
+from tests.support.envelopes import detection, envelope, payload
 from tests.support.evidence_drives import drive
 from tests.support.folds import Folded
 
@@ -85,3 +88,27 @@ def test_the_kept_history_gives_the_same_bodies_and_digest_at_every_offset() -> 
 
 def _no_map(offset: Offset) -> Any:
     raise AssertionError(offset)
+
+
+FOREIGN: list[dict[str, Any]] = [
+    {"size": [0.4, 0.3]},
+    {"size": "large"},
+    {"size": [1, 2, True]},
+    {"position_z": "on the shelf"},
+]
+
+
+@pytest.mark.parametrize("fields", FOREIGN, ids=str)
+def test_fields_of_another_shape_are_those_of_another_robot(fields: dict[str, Any]) -> None:
+    plain = map_digest(view_of([seen(0)]))
+    assert map_digest(view_of([seen(0, **fields)])) == plain
+    assert map_digest(view_of([{**seen(0), "scan": [1.0, 2.0]}])) == plain
+    read = ingest(payload(seen(0, **fields, more=float("nan"))))
+    assert isinstance(read, Rejected)
+
+
+@pytest.mark.parametrize("wrong", [{"size": [1, 2, 0]}, {"size": [1, 2, 1e9]}, {"position_z": 1e9}])
+def test_wrong_heights_and_sizes_are_refused(wrong: dict[str, Any]) -> None:
+    read = ingest(payload(seen(0, **wrong)))
+    assert isinstance(read, Rejected)
+    assert next(iter(wrong)) in read.reason
