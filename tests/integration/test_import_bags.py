@@ -111,16 +111,17 @@ def test_the_report_says_what_was_used_and_what_was_not(
     assert (counts.unused, about.notes, about.is_useless) == ({}, [], False)
 
 
+@pytest.mark.parametrize("own", ["/mapfold/objects", "/bot1/mapfold/objects"])
 def test_things_in_three_dimensions_have_positions_and_what_mapfold_shows_is_no_input(
-    tmp_path: Path,
+    tmp_path: Path, own: str
 ) -> None:
     seen = ros.solids(START, "map", ros.solid("chair", flat(2.0, 1.0, 0.0, 0.4), 0.5, 0.6, 0.9))
-    shown = ("/mapfold/objects", START, seen)
+    shown = (own, START, seen)
     tree = ros.tf(ros.transform("map", "base_link", START, flat(0.0, 0.0, 0.0)))
     recorded = [("/tf", START, tree), shown, ("/things", START, seen)]
     bag = write_bag(tmp_path / "drive", recorded)
     (about,) = imported(tmp_path / "log", bag).bags
-    assert {t.topic for t in about.topics if not t.used_for} == {"/mapfold/objects"}
+    assert {t.topic for t in about.topics if not t.used_for} == {own}
     assert about.streams["/things"].with_position == 1
     ((chair,),) = (each["detections"] for each in envelopes(tmp_path / "log"))
     assert (chair["position"], chair["position_z"]) == ([2.0, 1.0], 0.4)

@@ -91,7 +91,7 @@ Sampled = Callable[[str, int], bool]
 
 
 _OWN_TOPICS: Final = "/mapfold/"
-"""Where `mapfold ros` publishes."""
+"""Part of the names of the topics on which `mapfold ros` publishes, in any namespace."""
 
 
 @dataclass
@@ -118,7 +118,7 @@ class BagContents:
         return in_picture or sorted(
             name
             for name, kind in kinds.items()
-            if kind == ros.DETECTIONS_3D and not name.startswith(_OWN_TOPICS)
+            if kind == ros.DETECTIONS_3D and _OWN_TOPICS not in name
         )
 
     def span(self, received_ns: int) -> None:
