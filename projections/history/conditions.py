@@ -136,7 +136,8 @@ class _Parser:
             raise self._error(MAX_CHARACTERS, f"more than {MAX_CHARACTERS:,} characters")
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error")  # of a backslash that escapes nothing
+                # Of a backslash that escapes nothing, and of 1or; not those of other threads.
+                warnings.filterwarnings("error", r".*\binvalid .*(sequence|literal)")
                 tree = ast.parse(self._source.strip(), mode="eval")
         except SyntaxError as error:
             at = len(self._source) + 1

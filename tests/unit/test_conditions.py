@@ -1,7 +1,10 @@
 """Conditions: evaluation, and errors with their columns."""
 
+import ast
 import inspect
+import warnings
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
 
@@ -169,3 +172,19 @@ def test_mentions_and_readings() -> None:
 def test_the_help_lists_every_function() -> None:
     listed = functions_help().splitlines()
     assert [line.split("(")[0] for line in listed] == list(FUNCTIONS)
+
+
+def test_what_other_threads_are_warned_of_meanwhile_is_no_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    parse = ast.parse
+
+    def warned(*args: Any, **more: Any) -> Any:
+        warnings.warn("of another thread", DeprecationWarning, stacklevel=1)
+        return parse(*args, **more)
+
+    monkeypatch.setattr(ast, "parse", warned)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        assert Expression("place_count() > 1")
+    assert [str(each.message) for each in heard] == ["of another thread"]
