@@ -7,6 +7,7 @@ import pytest
 
 from eventsrc.envelope.ingest import Rejected, ingest
 from eventsrc.envelope.model import Offset
+from projections.adapters.ros.map_messages import MapMessages
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.deltas import Body
 from projections.fold.settings import Settings
@@ -19,6 +20,7 @@ from projections.store.tables import Tables, TableWriter
 from tests.support.envelopes import detection, envelope, payload
 from tests.support.evidence_drives import drive
 from tests.support.folds import Folded
+from tests.support.ros_messages import TYPES
 
 
 def seen(number: int, **fields: Any) -> dict[str, Any]:
@@ -40,6 +42,20 @@ def test_an_object_has_the_median_height_and_size_in_whatever_order_they_came() 
     assert view.body_of(found) == Body(800_000, 800_000, 500_000, 250_000)
     (row,) = state_document(view, "")["objects"]
     assert (row["z"], row["size"]) == (0.8, [0.8, 0.5, 0.25])
+
+
+def test_ros_is_shown_the_height_and_size_where_they_were_measured() -> None:
+    messages = MapMessages(TYPES)
+    for fields, middle, size in (
+        ({"position_z": 0.9, "size": [0.8, 0.5, 0.25]}, 0.9, (0.8, 0.5, 0.25)),
+        ({}, 0.1, (0.2, 0.2, 0.2)),
+    ):
+        view = view_of([seen(number, **fields) for number in range(2)])
+        (thing,) = messages.objects(view, 0).detections
+        markers = messages.markers(view)
+        (cube,) = (each for (kind, _), each in markers.items() if kind == "objects")
+        for pose, lengths in ((thing.bbox.center, thing.bbox.size), (cube.pose, cube.scale)):
+            assert (pose.position.z, lengths.x, lengths.y, lengths.z) == (middle, *size)
 
 
 def test_what_no_detection_measured_is_absent_and_leaves_the_digest_as_it_was() -> None:

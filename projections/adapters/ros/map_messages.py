@@ -75,11 +75,8 @@ class MapMessages:
             if shown.missing:
                 continue
             found = shown.record
-            body = body_fields(view.body_of(found))
-            floor = _height(view, shown.floor)
-            pose = self._pose(*found.spot, floor + body.get("z", 0.0))
-            length, width, high = body.get("size", (_OBJECT_M,) * 3)
-            size = self._vector(length, width, high)
+            z, lengths = _body_of(view, shown)
+            pose, size = self._pose(*found.spot, z), self._vector(*lengths)
             score = found.obs_count / (found.obs_count + found.misses)
             hypothesis = make(
                 "vision_msgs/msg/ObjectHypothesisWithPose",
@@ -145,12 +142,13 @@ class MapMessages:
     def _objects(self, view: MapView) -> Iterator[Any]:
         for shown in objects_of(view):
             found = shown.record
-            ordinal, z = int(found.ordinal), _height(view, shown.floor) + _OBJECT_M
+            ordinal, (z, size) = int(found.ordinal), _body_of(view, shown)
             colour = _GREY if found.place is None else _colour(found.place)
             at = self._pose(*found.spot, z)
             red = _RED if shown.missing else colour
-            yield self._marker("objects", ordinal, _CUBE, at, _OBJECT_M, red)
-            yield self._text("object_names", ordinal, shown.label, (*found.spot, z + 0.25), 0.18)
+            yield self._marker("objects", ordinal, _CUBE, at, size, red)
+            above = *found.spot, z + size[2] / 2 + 0.15
+            yield self._text("object_names", ordinal, shown.label, above, 0.18)
 
     def _ways(self, view: MapView, places: Iterable[ShownPlace]) -> Iterator[Any]:
         ends = [
@@ -184,7 +182,7 @@ class MapMessages:
         number: int,
         kind: int,
         pose: Any = None,
-        size: float = 0.0,
+        size: float | tuple[float, float, float] = 0.0,
         colour: _Rgb = _INK,
         *,
         text: str = "",
@@ -201,7 +199,7 @@ class MapMessages:
             type=kind,
             action=action,
             pose=self._pose(0.0, 0.0, 0.0) if pose is None else pose,
-            scale=self._vector(size, size, size),
+            scale=self._vector(*(size if isinstance(size, tuple) else (size,) * 3)),
             color=self._types.make(
                 "std_msgs/msg/ColorRGBA", **dict(zip("rgb", colour, strict=True)), a=1.0
             ),
@@ -255,6 +253,14 @@ def _covariance_of(shown: ShownObject) -> Sequence[float]:
         return [0.0] * 9
     xx, xy, yy = (value / 1e12 for value in (at.var_xx_um2, at.var_xy_um2, at.var_yy_um2))
     return [xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, math.pi**2]
+
+
+def _body_of(view: MapView, shown: ShownObject) -> tuple[float, tuple[float, float, float]]:
+    """The height of an object's middle, and its length, width and height, in metres; without a
+    measured one it is a cube of `_OBJECT_M` on the floor."""
+    body = body_fields(view.body_of(shown.record))
+    length, width, high = body.get("size", (_OBJECT_M,) * 3)
+    return _height(view, shown.floor) + body.get("z", high / 2), (length, width, high)
 
 
 def _height(view: MapView, floor: str | None) -> float:
