@@ -26,7 +26,7 @@ TRIGGERED: Final = "std_srvs/msg/Triggered"
 """The response of a Trigger as a message, which rosbags can write."""
 _TRIGGERED_TEXT: Final = "bool success\nstring message\n"
 _MOST_QUERIES: Final = 1_000
-_NO_REQUEST: Final = 17
+_LEAST_ATTACHMENT: Final = 17
 """Fewest bytes of a request's attachment."""
 
 
@@ -67,7 +67,7 @@ class RosNode:
         key = self.names.key(self.full_name(service), end)
 
         def reply(query: Query) -> None:
-            if len(query.attachment) < _NO_REQUEST:
+            if len(query.attachment) < _LEAST_ATTACHMENT:
                 query.reply_error(b'"a request needs the attachment of a client of ROS"')
                 return
             try:

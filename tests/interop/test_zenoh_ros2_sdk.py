@@ -174,7 +174,8 @@ def test_it_lists_our_topics_and_decodes_our_markers_and_the_initial_pose(
 
             def is_told() -> bool:
                 with contextlib.suppress(queue.Empty):
-                    poses.append(told.get(timeout=0.1))
+                    message = told.get(timeout=0.1)
+                    poses.extend([message] if message["kind"] == POSE_WITH_COVARIANCE else [])
                 return bool(poses)
 
             with rmw.node(endpoint, 7) as robot:
