@@ -1,5 +1,6 @@
 """What `why`, `merges --objects` and `diff` say of an object under fusion by evidence."""
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -20,13 +21,20 @@ from tests.support.memory_history import MemoryHistory
 EVIDENCE = Settings(fusion="evidence")
 
 
+_LOOKING_THERE = {
+    4: d.Pose(0, 0, math.atan2(2.0, 1.2)),
+    5: d.Pose(2_000_000, 0, math.atan2(2.0, -0.8)),
+}
+"""Poses that look from two sides at where the thing was."""
+
+
 def _keyframe(n: int, *seen: tuple[int, str]) -> list[d.Delta]:
     """The keyframe of event n, in run n // 4; its observations have their offset's number ×10."""
     run = d.RunOrdinal(n // 4)
     deltas: list[d.Delta] = []
     if n % 4 == 0:
         deltas.append(d.RunSeen(Offset(n), run, f"run-{run}", 100.0 + n))
-    pose = d.Pose(1_000_000 * n, 0, 0.0)
+    pose = _LOOKING_THERE.get(n) or d.Pose(1_000_000 * n, 0, 0.0)
     deltas.append(
         d.KeyframeAdded(Offset(n), d.KeyframeOrdinal(n), run, f"run-{run}", n % 4, 100.0 + n, pose)
     )
