@@ -78,7 +78,7 @@ class Room:
         more: dict[str, Any] = {"map_yaw": yaw} if rng.random() > 0.08 else {}
         if rng.random() < 0.1:
             more["camera"] = {"hfov_deg": 80.0, "width_px": 640.0, "height_px": 400.0}
-        if number % 3 == 0:
+        if number % 30 == 3:
             more["scan"] = {"angle_min": 0.0, "angle_step": 0.2, "range_max": 9.0}
             more["scan"]["ranges_mm"] = base64.b64encode(bytes(range(8, 68))).decode()
         posed = x if "map_yaw" in more else None

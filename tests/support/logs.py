@@ -280,7 +280,7 @@ def _envelope(rng: random.Random, number: int) -> dict[str, Any]:
         fields["pose_covariance"] = [0.01, 0, 0, 0, 0.02, 0, 0, 0, 0.001]
     if rng.random() < 0.2:
         fields["a field of others"] = {"nested": [1, "two", None]}
-    if number % 4 == 0:
+    if number % 16 == 4:
         ranges = base64.b64encode(bytes(range(4, 52))).decode()
         scan = {"angle_min": -1.5, "angle_step": 0.25, "range_max": 9.0, "ranges_mm": ranges}
         fields["scan"] = {**scan, "x": 0.1, "yaw": 0.5}
