@@ -26,6 +26,8 @@ TRIGGERED: Final = "std_srvs/msg/Triggered"
 """The response of a Trigger as a message, which rosbags can write."""
 _TRIGGERED_TEXT: Final = "bool success\nstring message\n"
 _MOST_QUERIES: Final = 1_000
+_MOST_BYTES: Final = 4_096
+"""Of a query that waits, with its attachment."""
 _LEAST_ATTACHMENT: Final = 17
 """Fewest bytes of a request's attachment."""
 
@@ -86,6 +88,9 @@ class RosNode:
         """Answer the queries under a key in the node's thread."""
 
         def receive(query: Query) -> None:
+            if query.size + len(query.attachment) > _MOST_BYTES:
+                query.reply_error(b'"the query is too large"')
+                return
             try:
                 self._queries.put_nowait(lambda: reply(query))
             except queue.Full:

@@ -160,7 +160,9 @@ class _Parser:
                 return _Term(column, Type.TEXT, lambda _: text, text=text)
             case ast.Constant(value=int() as number) if type(number) is int:
                 return _Term(column, Type.NUMBER, lambda _: number)
-            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as number)):
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as number)) if (
+                type(number) is int
+            ):
                 return _Term(column, Type.NUMBER, lambda _: -number)
             case ast.Name(id="none"):
                 return _Term(column, Type.TEXT, lambda _: None)

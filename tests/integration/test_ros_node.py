@@ -2,10 +2,12 @@
 own advanced subscriber, which is that of rmw_zenoh."""
 
 import contextlib
+import itertools
 import json
 import math
 import queue
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +17,15 @@ import pytest
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.record.recorder.bridged import Bridge
+from eventsrc.record.recorder.listener import Heard, Listener
 from eventsrc.record.ros_node import TRIGGER, TRIGGER_HASH, TRIGGERED, RosNode
 from eventsrc.record.transport.session import Session
+from eventsrc.ros.derivation import RosRecording
+from eventsrc.ros.stream import Stream
 from eventsrc.ros.wire import RmwWire, end_of_key
+from projections.adapters.ros.initial_pose import InitialPose
 from projections.adapters.ros.map_messages import (
     DETECTIONS,
     GRID,
@@ -27,12 +35,15 @@ from projections.adapters.ros.map_messages import (
     MapMessages,
 )
 from projections.adapters.ros.shown_map import ShownMap
+from projections.fold.map_errors import QuestionError
 from projections.surfaces.python.map import fold
 from tests.support import rmw
+from tests.support import ros2dds as drives
 from tests.support.commands import Commands
 from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
+from tests.support.logs import simulated
 from tests.support.lost_robot import check_initial_pose, look_around
-from tests.support.ros_messages import TYPES
+from tests.support.ros_messages import START, TYPES, detections, flat, tf, transform
 
 Sessions = Callable[[], Session]
 SAMPLE = "logs/sample"
@@ -136,8 +147,68 @@ def test_a_trigger_is_answered(connected: Sessions) -> None:
             )
             made = TYPES.decode(reply.ok.payload.to_bytes(), TRIGGERED)
             assert (made.success, made.message) == expected
-        (reply,) = asking.raw.get(key)
-        assert reply.err is not None
+        for wrong in (None, bytes(16), bytes(5_000)):
+            (reply,) = asking.raw.get(key, attachment=wrong)
+            assert reply.err is not None
+
+
+def test_a_transform_that_is_none_hides_no_other_of_its_message(
+    endpoint: str, connected: Sessions
+) -> None:
+    seen = Stream("/detections", "lost", tf=None, wait_ns=0)
+    recording = RosRecording(key="lost", streams=(seen,))
+    bridge = Bridge(recording, ["/detections", "/tf_static"], TYPES, RmwWire(3))
+    nowhere = transform("base_link", "lidar", 0, flat(math.nan, 0.0, 0.0))
+    with rmw.node(endpoint, 3) as robot:
+        for topic in ("/tf_static", "/detections"):
+            robot.advertise(topic, drives.KINDS[topic])
+        robot.send("/tf_static", tf(nowhere, *drives.static().transforms))
+        with Listener(connected(), bridge, TYPES) as listener:
+            heard: list[Heard] = []
+            for number in itertools.count():
+                robot.send("/detections", detections(START + number, "optical"))
+                heard += listener.take(0.1)
+                if heard and heard[-1].camera != (0.0, 0.0):
+                    break
+    assert heard[-1].camera == (0.2, 0.0)
+
+
+@pytest.mark.parametrize("most", [3, 200])
+def test_of_a_flood_of_keyframes_no_more_are_judged_than_it_takes(
+    connected: Sessions, most: int
+) -> None:
+    read = map(ingest, simulated(7, "b").payloads)
+    made = next(e for e in read if isinstance(e, Accepted) and e.envelope.detections)
+    flood = contextlib.nullcontext(Flood([Heard(made, (0.0, 0.0))] * 1_000))
+    asked, notes, stop = [], list[str](), threading.Event()
+
+    def note(text: str) -> None:
+        notes.append(text)
+        if "gave up" in text:
+            stop.set()
+
+    def ask(question: Any) -> Any:
+        asked.append(question)
+        if len(asked) == most:
+            stop.set()
+        raise QuestionError("not now")
+
+    with RosNode(connected(), TYPES, 3, "", "mapfold") as node:
+        pose = InitialPose(node, lambda: flood, ask, note)
+        pose.start()
+        pose.run(stop)
+    assert len(asked) == most
+    assert notes[-1] == f"after {most} keyframes it is not sure where the robot is; gave up"
+
+
+class Flood:
+    """Keyframes, faster than they are judged."""
+
+    def __init__(self, heard: list[Heard]) -> None:
+        self._heard = heard
+
+    def take(self, _timeout_s: float) -> list[Heard]:
+        return self._heard
 
 
 @pytest.mark.seconds

@@ -185,6 +185,13 @@ def test_another_space_is_refused(mapfold: Commands, words: dict[str, Any], mode
     (model.parent / "tokenizer.json").write_text("{")
     refused = mapfold("edit", "log", "use-settings", *options, code=2).err
     assert "tokenizer.json: no tokenizer of the library tokenizers" in refused
+    text_tower(model, words, SPACE)
+    tokenizer = model.with_name("tokenizer.json")
+    tokenizer.write_text(tokenizer.read_text().replace('"unk_token": "[UNK]"', '"unk_token": "?"'))
+    refused = mapfold("find", "log", "qz", "--text-encoder", model, code=2).err
+    assert "classes only: tokenizer.json: WordLevel error: Missing [UNK] token" in refused
+    long = mapfold("find", "log", "couch", "--set", f"text_encoder={'x' * 300}")
+    assert "is not here" in long.err
 
 
 @pytest.mark.parametrize(

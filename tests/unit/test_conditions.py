@@ -111,6 +111,7 @@ def test_expressions_hold(text: str, holds: bool) -> None:
         ("1 < 2 < 3", 9, "one comparison at a time"),
         ("1 in 3", 1, "expected a number, a text in quotes or a function"),
         ("True", 1, "expected a number, a text in quotes or a function"),
+        ("1 < -True", 5, "expected a number, a text in quotes or a function"),
         ("merged(place='a_p0')", 1, "expected a number, a text in quotes or a function"),
         ("(1 < 2", 1, "was never closed"),
         ("1 < 2)", 6, "unmatched ')'"),

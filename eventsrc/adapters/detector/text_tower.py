@@ -79,7 +79,10 @@ class TextTower:
         """The unit vector of some words. Raises MisuseError for words that have none."""
         if len(words) > MOST_TEXT:
             raise MisuseError(f"the words have {len(words):,} characters; give at most {MOST_TEXT}")
-        vector = self._run(words).astype(np.float64)
+        try:
+            vector = self._run(words).astype(np.float64)
+        except ModelError as error:  # of these words, not of all
+            raise MisuseError(str(error)) from None
         norm = float(np.linalg.norm(vector))
         if not np.isfinite(norm) or norm < 1e-12:
             raise MisuseError(f"{self.path} has no vector for {words!r}")
@@ -104,7 +107,10 @@ class TextTower:
 
     def _run(self, words: str) -> NDArray[np.floating[Any]]:
         spoken = words.encode("utf-8", "replace").decode()  # half a pair of UTF-16 is no character
-        found = self._tokenizer.encode(self._description.prompt.replace("{}", spoken))
+        try:
+            found = self._tokenizer.encode(self._description.prompt.replace("{}", spoken))
+        except Exception as error:  # noqa: BLE001 - the library raises no class of its own
+            raise ModelError(f"{self.path.with_name('tokenizer.json')}: {error}") from None
         given = {self._description.input: found.ids, self._description.mask: found.attention_mask}
         inputs = {name: np.array([given[name]], kind) for name, kind in self._types.items()}
         answer = self._file.answer(inputs, self._output)

@@ -7,7 +7,7 @@ bounded queue; `take` derives in the caller's thread.
 import queue
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.record.transport.session import Received, Session, Subscription
@@ -130,11 +130,8 @@ class Listener:
         try:
             if parts.topic in self._static | self._moving:
                 content = self._types.decode(message.payload, parts.type_name)
-                for each in read(lambda m: [transform_of(t) for t in m.transforms], content):
-                    if parts.topic in self._static:
-                        self._buffer.add_static(each.parent, each.child, each.pose)
-                    else:
-                        self._buffer.add(each.parent, each.child, each.stamp_ns, each.pose)
+                for each in content.transforms:
+                    self._note_transform(each, is_static=parts.topic in self._static)
             elif parts.topic in self._bases:
                 header = self._types.decode(message.payload, parts.type_name).header
                 stamp_ns = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
@@ -145,3 +142,13 @@ class Listener:
                     self._camera = at.x, at.y
         except (BadMessage, Undecodable, AttributeError):
             return
+
+    def _note_transform(self, given: Any, *, is_static: bool) -> None:
+        try:
+            each = read(transform_of, given)
+        except BadMessage:  # the others of its message are used, as by the bridge
+            return
+        if is_static:
+            self._buffer.add_static(each.parent, each.child, each.pose)
+        else:
+            self._buffer.add(each.parent, each.child, each.stamp_ns, each.pose)

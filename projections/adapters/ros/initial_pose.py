@@ -70,6 +70,8 @@ class InitialPose:
             robot, seen = WakingRobot(), 0
             while not stop.is_set() and seen < _MOST_KEYFRAMES:
                 for heard in listener.take(_WAIT_S):
+                    if stop.is_set() or seen == _MOST_KEYFRAMES:
+                        break
                     seen += 1
                     sure = self._judge(robot, heard)
                     if sure is not None:
