@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager
 from typing import Final
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.base.text import counted
 from eventsrc.record.recorder.listener import Heard, Listener
 from eventsrc.record.ros_node import RosNode
 from projections.fold.map_errors import DatabaseError, QuestionError
@@ -67,19 +68,25 @@ class InitialPose:
         if found is None:
             return
         with found as listener:
-            robot, seen = WakingRobot(), 0
-            while not stop.is_set() and seen < _MOST_KEYFRAMES:
-                for heard in listener.take(_WAIT_S):
-                    if stop.is_set() or seen == _MOST_KEYFRAMES:
-                        break
-                    seen += 1
-                    sure = self._judge(robot, heard)
-                    if sure is not None:
-                        self._publish(sure, heard)
-                        self._note(_text(sure, seen))
-                        return
-            if seen:
-                self._note(f"after {seen} keyframes it is not sure where the robot is; gave up")
+            self._look_by(listener, stop)
+            if listener.lost:
+                lost = counted(listener.lost, "message")
+                self._note(f"left out {lost}, which came faster than they could be read")
+
+    def _look_by(self, listener: Listener, stop: threading.Event) -> None:
+        robot, seen = WakingRobot(), 0
+        while not stop.is_set() and seen < _MOST_KEYFRAMES:
+            for heard in listener.take(_WAIT_S):
+                if stop.is_set() or seen == _MOST_KEYFRAMES:
+                    break
+                seen += 1
+                sure = self._judge(robot, heard)
+                if sure is not None:
+                    self._publish(sure, heard)
+                    self._note(_text(sure, seen))
+                    return
+        if seen:
+            self._note(f"after {seen} keyframes it is not sure where the robot is; gave up")
 
     def _judge(self, robot: WakingRobot, heard: Heard) -> SurePose | None:
         question = robot.see(heard.keyframe)
