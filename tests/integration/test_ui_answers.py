@@ -242,6 +242,7 @@ def test_find_is_that_of_the_command(server: UiServer, mapfold: Commands) -> Non
         ("digest?at=tomorrow", 400, "bad_question", "tomorrow"),
         ("digest?at=-1", 400, "bad_question", "-1"),
         ("digest?set=eps=1", 400, "bad_settings", "no setting 'eps'"),
+        ("find?what=cup&set=%20text_encoder=/x.onnx", 400, "bad_settings", "names a file"),
         ("digest?eps_m=nan", 400, "bad_settings", "eps_m"),
         ("history?from=x", 400, "bad_question", "from is 'x'"),
         ("why", 400, "bad_question", "what is missing"),

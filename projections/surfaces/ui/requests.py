@@ -95,11 +95,14 @@ def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
 
 def assignments_of(query: QueryParams) -> tuple[str, ...]:
     """The settings that a question changes: ``set=name=value`` and the short forms ``eps_m`` and
-    ``min_samples``, in the order of their names."""
+    ``min_samples``, in the order of their names. Raises SettingsError, also for a text encoder:
+    whoever may ask could have any file of this machine opened."""
     found = query.getlist("set")
     found += [f"{name}={query[name]}" for name in ("eps_m", "min_samples") if query.get(name)]
     if len(found) > MOST_SETS:
         raise SettingsError(f"{len(found)} settings are changed; at most {MOST_SETS} can be")
+    if any(text.lstrip().startswith("text_encoder") for text in found):
+        raise SettingsError("text_encoder names a file; give it to mapfold ui, or to the log")
     return tuple(sorted(found))
 
 
