@@ -209,6 +209,12 @@ def test_settings_without_a_log_are_advised_with_the_settings(run: Commands) -> 
     assert words == ["replay", "LOG", *OWN]
 
 
+def test_what_is_asked_of_databases_is_no_log(run: Commands, one_database: Targets) -> None:
+    url = one_database.graph_url
+    (words,) = told(run("find", "chair", "--db", url, code=1))
+    assert words == ["replay", "LOG", "--db", url]
+
+
 @pytest.mark.slow
 @pytest.mark.seconds
 def test_what_db_check_advises_repairs_under_the_same_settings_and_databases(

@@ -303,9 +303,14 @@ def _options_in_force(words: Sequence[str], without: Collection[str]) -> list[st
 
 
 def _log_of(context: Any) -> Any:
-    """The log of the running command, or of the group that it is in."""
+    """The log of the running command, or of the group that it is in. Where ``--db`` stands for a
+    log that may be left out, the first argument is what is asked."""
     while context is not None:
-        if context.params.get(_LOG) is not None:
+        is_left_out = context.params.get("db") is not None and any(
+            each.name == _LOG and each.param_type_name == "argument" and not each.required
+            for each in context.command.params
+        )
+        if context.params.get(_LOG) is not None and not is_left_out:
             return context.params[_LOG]
         context = context.parent
     return None
