@@ -59,13 +59,19 @@ def received_crop(key: str, payload: bytes) -> tuple[str, Crop]:
         det_id = unquote(last, errors="strict")
     except UnicodeDecodeError:
         raise InvalidCrop(f"{visible(last)}: the det_id in the key is no UTF-8") from None
-    if not slash or not topic or not 0 < len(det_id) <= MAX_ID_LENGTH or "\0" in det_id:
+    if not slash or not topic:
         raise InvalidCrop(f"{visible(key)}: a crop's key is PREFIX/DET_ID")
-    if len(payload) > MAX_CROP_BYTES:
-        raise InvalidCrop(f"a crop of {len(payload):,} bytes; at most {MAX_CROP_BYTES:,}")
-    if not payload.startswith(_JPEG_START) or _JPEG_END not in payload[-64:]:
-        raise InvalidCrop(f"a crop that is no whole JPEG: it begins with {payload[:4].hex(' ')}")
-    return topic, Crop(DetId(det_id), payload)
+    return topic, _checked(det_id, payload)
+
+
+def _checked(det_id: str, jpeg: bytes) -> Crop:
+    if not 0 < len(det_id) <= MAX_ID_LENGTH or "\0" in det_id:
+        raise InvalidCrop(f"{visible(det_id)[:80]!r} is no det_id")
+    if len(jpeg) > MAX_CROP_BYTES:
+        raise InvalidCrop(f"a crop of {len(jpeg):,} bytes; at most {MAX_CROP_BYTES:,}")
+    if not jpeg.startswith(_JPEG_START) or _JPEG_END not in jpeg[-64:]:
+        raise InvalidCrop(f"a crop that is no whole JPEG: it begins with {jpeg[:4].hex(' ')}")
+    return Crop(DetId(det_id), jpeg)
 
 
 def encode_crop(crop: Crop, stamp_ns: int) -> bytes:
@@ -81,7 +87,7 @@ def _padded(body: bytes) -> bytes:
 
 
 def decode_crop(payload: bytes) -> Crop:
-    """The crop that `encode_crop` made. Raises InvalidCrop."""
+    """The crop that `encode_crop` made; others may write to the topic, too. Raises InvalidCrop."""
     if payload[: len(_HEAD)] != _HEAD:
         raise InvalidCrop("it is no message in CDR of little endian")
     fields = CdrFields(payload)
@@ -90,6 +96,7 @@ def decode_crop(payload: bytes) -> Crop:
         det_id = fields.text("header.frame_id").decode()
         fields.text("format")
         (length,) = fields.numbers("I", "the length of data")
-        return Crop(DetId(det_id), bytes(fields.last(length, "data")))
+        jpeg = bytes(fields.last(length, "data"))
     except (CdrFault, UnicodeDecodeError) as error:
         raise InvalidCrop(f"it is no sensor_msgs/CompressedImage: {error}") from None
+    return _checked(det_id, jpeg)

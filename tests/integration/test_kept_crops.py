@@ -17,8 +17,17 @@ from starlette.datastructures import QueryParams
 from eventsrc.adapters.detector.keyframes import crops_of_message
 from eventsrc.adapters.detector.vision import decode, encode_jpeg
 from eventsrc.base.errors import MisuseError
-from eventsrc.envelope.crops import CROPS_TOPIC, decode_crop
+from eventsrc.envelope.crops import (
+    CROPS_TOPIC,
+    MAX_CROP_BYTES,
+    Crop,
+    decode_crop,
+    encode_crop,
+)
+from eventsrc.envelope.model import DetId, Offset
+from eventsrc.log import NEVER, LogReader, LogWriter
 from eventsrc.record.importers.ros_bags import BagReport
+from eventsrc.record.kept_crops import KeptCrops
 from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.transport.session import Session
 from projections.ask.best_views import views_in_order
@@ -27,6 +36,7 @@ from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
+from projections.store.tables import Tables
 from projections.surfaces.cli.bag_text import BagChoice, stream_lines
 from projections.surfaces.cli.bridge_options import BridgeChoice, recording_of
 from projections.surfaces.python import fold
@@ -40,6 +50,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
 from tests.support.fixtures_log import read_log
 from tests.support.logs import write_log
+from tests.support.models import FORMAT
 from tests.support.ros2dds import KINDS
 from tests.support.ros2dds_recordings import (
     announce_all,
@@ -309,8 +320,45 @@ def got(url: str, headers: dict[str, str] | None = None) -> tuple[int, Any, byte
         return refused.code, refused.headers, refused.read()
 
 
+@pytest.mark.parametrize(
+    "crop",
+    [
+        Crop(DetId("a"), b"<html><script>"),
+        Crop(DetId("a"), FIRST[:-40]),
+        Crop(DetId("a"), FIRST[:-2] + bytes(MAX_CROP_BYTES) + FIRST[-2:]),
+        Crop(DetId(""), FIRST),
+        Crop(DetId(300 * "a"), FIRST),
+    ],
+)
+def test_what_others_write_to_the_topic_is_no_crop(tmp_path: Path, crop: Crop) -> None:
+    """A recorder keeps messages of any publisher. Of two of one detection the first is kept."""
+    other = encode_jpeg(np.full((9, 9, 3), 80, np.uint8))
+    with LogWriter(tmp_path / "log", fsync=NEVER) as writer:
+        for each in (crop, Crop(DetId("a"), FIRST), Crop(DetId("a"), other)):
+            writer.append(CROPS_TOPIC, encode_crop(each, 1), form=FORMAT)
+    with LogReader(tmp_path / "log") as reader:
+        assert KeptCrops(reader).jpeg(crop.det_id) == (FIRST if crop.det_id == "a" else None)
+        assert KeptCrops(reader).jpeg("a", Offset(0)) == FIRST
+
+
+@pytest.mark.parametrize("command", ["find", "why"])
+def test_a_folder_of_crops_that_cannot_be_written_is_refused(tmp_path: Path, command: str) -> None:
+    bag, log = write_bag(tmp_path / "drive", compressed_pictures()), tmp_path / "log"
+    imported(log, bag, cut=crops_of_message)
+    one = next(iter(fold(log, preset="full").view.objects.values())).object_id
+    mapfold = Commands.in_folder(tmp_path)
+    words = command, "log", one, "--preset", "full", "--crops"
+    (tmp_path / "file").write_bytes(b"mine")
+    assert "cannot be written: " in mapfold(*words, "file", code=2).err
+    assert (tmp_path / "file").read_bytes() == b"mine"
+    named = f"{one}.jpg" if command == "find" else f"{one}-1.jpg"
+    (tmp_path / "taken" / named).mkdir(parents=True)
+    assert "cannot be written: Is a directory" in mapfold(*words, "taken", code=2).err
+    assert [each.name for each in (tmp_path / "taken").iterdir()] == [named]
+
+
 def test_http_gives_crops_of_detections_and_objects(
-    tmp_path: Path, module_database: Targets
+    tmp_path: Path, module_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag, log = write_bag(tmp_path / "drive", compressed_pictures()), tmp_path / "log"
     imported(log, bag, cut=crops_of_message)
@@ -340,6 +388,10 @@ def test_http_gives_crops_of_detections_and_objects(
                 status, _, content = got(at + hostile)
                 assert status in (400, 404), hostile
                 assert json.loads(content)["error"]["kind"] == "bad_question"
+            with monkeypatch.context() as patched:  # of a log that did not grow no id is read again
+                patched.delattr(Tables, "texts")
+                assert got(at + "unknown")[0] == 404
+                assert got(at + quote(next(iter(kept)), safe=""))[0] == 200
             without = Answerer(pools, per_second=1000.0)
             with pytest.raises(QuestionError, match="start the service with --log LOG"):
                 without.crop(next(iter(kept)))

@@ -17,7 +17,7 @@ from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.record.kept_crops import KeptCrops
 from projections.ask.best_views import best_view
 from projections.ask.driven_ground import CLEARANCE_M
@@ -171,6 +171,7 @@ class ServedLog:
         self._timeline = LogTimeline(log, lambda _: self._settings, note=note, histories=1)
         self._past: tuple[object, MapView] | None = None
         self._crops = KeptCrops(self._timeline.reader)
+        self._offsets, self._offsets_until = dict[str, Offset](), FIRST_OFFSET
 
     def close(self) -> None:
         """Close the log."""
@@ -192,7 +193,8 @@ class ServedLog:
         with self._reading(served):
             found = self._crops.jpeg(name, self._offset_of(name))
             if found is None and name.startswith("obj-"):
-                found = self._best_view(self._timeline.at(served.next_offset), name)
+                end = served.next_offset
+                found = self._best_view(self._past_map(end, end), name)
         if found is None:
             raise NotInMapError(f"the log keeps no crop of {describe_value(name)}")
         return found
@@ -206,10 +208,7 @@ class ServedLog:
             known_at = end
             if query.known_at is not None:
                 known_at = self._timeline.moment(query.known_at, is_end=True)
-            at = end, known_at, self._settings
-            if self._past is None or self._past[0] != at:  # what it knows of its things is kept
-                self._past = at, self._timeline.at(end, known_at=known_at)
-            return query.question()(self._past[1])
+            return query.question()(self._past_map(end, known_at))
 
     def changes(self, served: LiveView, asked: ChangesQuery) -> dict[str, Any]:
         """A page of what changed. Raises NotInMapError."""
@@ -224,6 +223,13 @@ class ServedLog:
         more = {"next": str(until)} if len(found.changes) > until else {}
         document = found.document()
         return {**document, "changes": document["changes"][first:until], **more}
+
+    def _past_map(self, end: Offset, known_at: Offset) -> MapView:
+        """The last one asked is kept, with what it knows of its things."""
+        at = end, known_at, self._settings
+        if self._past is None or self._past[0] != at:
+            self._past = at, self._timeline.at(end, known_at=known_at)
+        return self._past[1]
 
     @contextlib.contextmanager
     def _reading(self, served: LiveView) -> Iterator[None]:
@@ -242,12 +248,19 @@ class ServedLog:
             self._lock.release()
 
     def _offset_of(self, det_id: str) -> Offset | None:
-        """The offset of a detection by the kept history, so that no index of crops is needed."""
+        """The offset of a detection by the kept history, so that no index of crops is needed. Of
+        each event the ids are read once."""
         tables = self._timeline.history.tables
-        names = tables.texts("observation", "det_id", 0, tables.count("observation"))
-        if det_id not in names:
-            return None
-        return Offset(int(tables.integers("observation", "offset")[names.index(det_id)]))
+        first, count = (
+            tables.before("observation", end) for end in (self._offsets_until, tables.end)
+        )
+        if first < count:
+            names = tables.texts("observation", "det_id", first, count)
+            numbers = tables.integers("observation", "offset", count)[first:].tolist()
+            for name, offset in zip(names, numbers, strict=True):
+                self._offsets.setdefault(name or "", Offset(offset))
+        self._offsets_until = max(self._offsets_until, tables.end)
+        return self._offsets.get(det_id)
 
     def _best_view(self, view: MapView, object_id: str) -> bytes | None:
         meant = thing_called(object_id, things_of(view), ["object"])
