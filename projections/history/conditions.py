@@ -189,6 +189,8 @@ class _Parser:
             case ast.Compare(ops=[_, _, *_], comparators=[_, second, *_]):
                 column = self._column(second.lineno, second.col_offset)
                 raise self._error(column, "one comparison at a time; join two with and")
+            case ast.BinOp():
+                raise self._error(column, "a condition does no arithmetic, it only compares")
             case ast.Constant(value=float()):
                 raise self._error(column, "numbers are whole")
             case _:

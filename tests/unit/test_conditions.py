@@ -109,6 +109,7 @@ def test_expressions_hold(text: str, holds: bool) -> None:
         ("1 < 2 or 'x'", 10, "an operand of or"),
         ("not place_count", 5, "the operand of not"),
         ("1 < 2 < 3", 9, "one comparison at a time"),
+        ("place_count() + 1 > 3", 1, "a condition does no arithmetic, it only compares"),
         ("1 in 3", 1, "expected a number, a text in quotes or a function"),
         ("True", 1, "expected a number, a text in quotes or a function"),
         ("1 < -True", 5, "expected a number, a text in quotes or a function"),

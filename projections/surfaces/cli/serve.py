@@ -196,7 +196,7 @@ def serve(
         Path | None,
         option(
             "LOG",
-            "The log that the databases were made from; HTTP's /changes and /crops need it.",
+            "The log that the databases were made from, for HTTP's /changes, /crops and past maps.",
             "--log",
         ),
     ] = None,
