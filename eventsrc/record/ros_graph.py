@@ -9,7 +9,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Final
 
@@ -111,7 +111,7 @@ def _announced(
     waiting = False
     contents = BagContents()
     while not stop.is_set():
-        _add_announced(session, wire, contents)
+        _add_announced(session, wire, contents, options.detections)
         topics = contents.topics
         wanted = options.detections or contents.detections(under)
         if wanted and all(topic in topics for topic in wanted):
@@ -123,11 +123,15 @@ def _announced(
     return None
 
 
-def _add_announced(session: Session, wire: RmwWire, contents: BagContents) -> None:
-    """Add the topics that have publishers now."""
+def _add_announced(
+    session: Session, wire: RmwWire, contents: BagContents, named: Collection[str]
+) -> None:
+    """Add the topics that have publishers now, of our own nodes only those that are ``named``."""
     for token in session.tokens(wire.all_tokens(), timeout_s=_TOKENS_S):
         found = wire.read_token(token)
-        if found is not None and len(contents.topics) < _MOST_TOPICS:
+        if found is None or (found.is_own and found.topic not in named):
+            continue
+        if len(contents.topics) < _MOST_TOPICS:
             topic = BagTopic(found.topic, found.type_name, "", "", 0)
             contents.topics.setdefault(found.topic, topic)
 
@@ -156,7 +160,7 @@ def _sample(
     began = time.monotonic()
     with contextlib.ExitStack() as subscriptions:
         while (looked_s := time.monotonic() - began) < _SAMPLES_S:
-            _add_announced(session, wire, contents)
+            _add_announced(session, wire, contents, options.detections)
             there = _wanted_topics(contents, options)  # new ones are behind those of before
             for topic in there[len(wanted) : _MOST_WANTED]:
                 if stop.is_set():

@@ -41,13 +41,15 @@ _ANY_KEY: Final = "?_anyke"
 """The parameter of a query that accepts answers under other keys than its own."""
 _BRIDGE_TOKEN: Final = re.compile(r"(?:@/[^/]+/@ros2_lv|@ros2_lv/[^/]+)/MP/([^/]+)/([^/]+)(?:/.*)?")
 _RMW_TOKEN: Final = re.compile(
-    r"@ros2_lv/(\d+)/[^/]+/[^/]+/[^/]+/MP/[^/]+/[^/]+/[^/]+/([^/]+)/([^/]+)/([^/]+)/([^/]+)"
+    r"@ros2_lv/(\d+)/[^/]+/[^/]+/[^/]+/MP/([^/]+)/[^/]+/[^/]+/([^/]+)/([^/]+)/([^/]+)/([^/]+)"
 )
 _TYPE: Final = re.compile(r"[A-Za-z]\w{0,99}/msg/[A-Za-z]\w{0,99}", re.ASCII)
 _DDS_TYPE: Final = re.compile(r"([A-Za-z]\w{0,99})::msg::dds_::([A-Za-z]\w{0,99})_", re.ASCII)
 _NAME: Final = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 _MAX_NAME: Final = 500
 _TRANSIENT_LOCAL: Final = "1"
+_OWN_ENCLAVE: Final = "%mapfold"
+"""The security enclave in the tokens of our own nodes, by which they are known under any name."""
 _LABELLED: Final = b"\x0fsequence_number"
 """The start of attachments that name their fields, which older versions of rmw_zenoh send."""
 _FIELDS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
@@ -65,11 +67,12 @@ class KeyParts(NamedTuple):
 
 class PublisherToken(NamedTuple):
     """What a publisher's liveliness token says; ``is_latched`` if it keeps messages for late
-    subscribers."""
+    subscribers, ``is_own`` if it is that of a `RmwNode`."""
 
     topic: str
     type_name: str
     is_latched: bool = False
+    is_own: bool = False
 
 
 class Wire(Protocol):
@@ -166,13 +169,12 @@ class RmwWire:
         found = _RMW_TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN else None
         if found is None or found[1] != str(self.domain):
             return None
-        topic, type_name = found[2].replace("%", "/"), _from_dds(found[3])
+        topic, type_name = found[3].replace("%", "/"), _from_dds(found[4])
         if type_name is None or not topic.startswith("/") or not _is_name(topic[1:]):
             return None
-        _, _, after_reliability = found[5].partition(":")
-        return PublisherToken(
-            topic, type_name, after_reliability.partition(":")[0] == _TRANSIENT_LOCAL
-        )
+        _, _, after_reliability = found[6].partition(":")
+        is_latched = after_reliability.partition(":")[0] == _TRANSIENT_LOCAL
+        return PublisherToken(topic, type_name, is_latched, found[2] == _OWN_ENCLAVE)
 
     def cache_selectors(self, topic: str) -> tuple[str, ...]:
         """`Wire.cache_selectors`."""
@@ -222,9 +224,8 @@ class RmwNode(NamedTuple):
 
     def _tokens(self, number: int, kind: str) -> str:
         namespace = self.namespace.replace("/", "%") or "%"
-        return (
-            f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{kind}/%/{namespace}/{self.name}"
-        )
+        entity = f"@ros2_lv/{self.domain}/{self.session_id}/0/{number}/{kind}"
+        return f"{entity}/{_OWN_ENCLAVE}/{namespace}/{self.name}"
 
     def key(self, topic: str, end: str) -> str:
         """The key of a topic's messages, or of a service's requests."""

@@ -23,8 +23,10 @@ from eventsrc.record.recorder.bridged import MAX_KEYS, Bridge
 from eventsrc.record.recorder.checking import CheckedMessage
 from eventsrc.record.recorder.queue import BridgedMessage
 from eventsrc.record.ros_graph import find_topics
+from eventsrc.record.ros_node import RosNode
 from eventsrc.record.transport.session import Router, Session, ZenohOptions, open_session
 from eventsrc.ros.library import Undecodable
+from eventsrc.ros.messages import DETECTIONS_3D, GRID
 from eventsrc.ros.wire import KeyParts, PublisherToken, RmwWire
 from projections.surfaces.cli.bridge_options import recording_of
 from tests.support import rmw
@@ -103,6 +105,8 @@ def test_keys(key: str, found: KeyParts | None) -> None:
          PublisherToken("/tf", TF)),
         (f"@ros2_lv/3/f0/0/11/MP/%/%bot1/talker/%bot1%tf/{rmw.dds_type(TF)}/{HASH}/:1:,1:,:,:,,",
          PublisherToken("/bot1/tf", TF, is_latched=True)),
+        (f"@ros2_lv/3/f0/0/11/MP/%mapfold/%/any/%tf/{rmw.dds_type(TF)}/{HASH}/::,10:,:,:,,",
+         PublisherToken("/tf", TF, is_own=True)),
         (f"@ros2_lv/0/f0/0/11/MP/%/%/talker/%tf/{rmw.dds_type(TF)}/{HASH}/q", None),
         (f"@ros2_lv/3/f0/0/11/MS/%/%/talker/%tf/{rmw.dds_type(TF)}/{HASH}/q", None),
         ("@ros2_lv/3/f0/0/0/NN/%/%/talker", None),
@@ -366,6 +370,28 @@ def test_of_several_topics_of_transforms_none_is_taken(endpoint: str, connected:
     assert found is not None
     assert (found.streams[0].tf, found.streams[0].tf_static) == (None, None)
     assert any("/bot1/tf, /bot2/tf" in note for note in found.notes)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_of_a_map_that_mapfold_shows_under_any_name_nothing_is_taken_unasked(
+    endpoint: str, connected: Sessions
+) -> None:
+    session, stop = connected(), threading.Event()
+    with RosNode(connected(), TYPES, 3, "/bot1", "house") as own, rmw.node(endpoint, 3) as robot:
+        shown = own.publisher("~/objects", DETECTIONS_3D, latched=True)
+        own.publisher("~/walls", GRID, latched=True)
+        robot.advertise("/things", DETECTIONS_3D)
+        own.session.confirm()
+        for options, taken in (
+            (BagOptions(), "/things"),
+            (BagOptions(detections=(shown.topic,)), shown.topic),
+        ):
+            found = find_topics(
+                session, RmwWire(3), TYPES, options, "", stop=stop, note=pytest.fail
+            )
+            assert found is not None
+            assert [each.detections for each in found.streams] == [taken]
+            assert found.grids == ["/map"]
 
 
 @pytest.mark.usefixtures("impatient")

@@ -5,7 +5,9 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import queue
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -18,6 +20,8 @@ import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from eventsrc.envelope.ingest import Accepted, ingest
+from eventsrc.log import NEVER, LogWriter
+from eventsrc.record.append import append_payload
 from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.recorder.listener import Heard, Listener
 from eventsrc.record.ros_node import TRIGGER, TRIGGER_HASH, TRIGGERED, RosNode
@@ -40,6 +44,7 @@ from projections.surfaces.python.map import fold
 from tests.support import rmw
 from tests.support import ros2dds as drives
 from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_zenoh import DEADLINE_S, MAPFOLD, Program
 from tests.support.logs import simulated
 from tests.support.lost_robot import check_initial_pose, look_around
@@ -87,7 +92,7 @@ def test_the_graph_has_its_tokens(connected: Sessions) -> None:
         node.session.confirm()
         zid, wire = node.session.id, RmwWire(3)
         tokens = asking.tokens("@ros2_lv/3/**", timeout_s=DEADLINE_S)
-        assert f"@ros2_lv/3/{zid}/0/0/NN/%/%bot1/mapfold" in tokens
+        assert f"@ros2_lv/3/{zid}/0/0/NN/%mapfold/%bot1/mapfold" in tokens
         found = [each for t in tokens if (each := wire.read_token(t)) is not None]
         assert sorted(each.topic for each in found) == sorted(shown.topics)
         assert all(each.is_latched for each in found)
@@ -191,14 +196,16 @@ def test_of_a_flood_of_keyframes_no_more_are_judged_than_it_takes(
         asked.append(question)
         if len(asked) == most:
             stop.set()
-        raise QuestionError("not now")
+        raise QuestionError("not now" if len(asked) > 1 else "not yet")
 
     with RosNode(connected(), TYPES, 3, "", "mapfold") as node:
         pose = InitialPose(node, lambda: flood, ask, note)
         pose.start()
         pose.run(stop)
     assert len(asked) == most
-    assert notes[-2:] == [
+    assert notes == [
+        "a question could not be answered: not yet",
+        "a question could not be answered: not now",
         f"after {most} keyframes it is not sure where the robot is; gave up",
         "left out 5 messages, which came faster than they could be read",
     ]
@@ -233,6 +240,31 @@ def test_the_command_shows_the_map_and_its_walls(
     assert (grid.info.width, grid.info.height) == (view.map.map.width, view.map.map.height)
     assert set(grid.data.tolist()) <= {-1, *range(101)}
     assert program.end(signal.SIGINT) == 0
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        (0, "it ends before the segment's metadata; run `mapfold log recover"),
+        (3_000, "has 0 events that can be read now and had 20; run `mapfold log recover"),
+    ],
+)
+def test_a_growing_log_that_is_cut_off_beneath_the_command_ends_it(
+    tmp_path: Path, endpoint: str, start_code: Callable[..., Program], size: int, said: str
+) -> None:
+    log = tmp_path / "log"
+    with LogWriter(tmp_path / "growing", fsync=NEVER) as writer:
+        for number in range(20):
+            append_payload(writer, "tb/x", payload(envelope(number)), logged_ns=number + 1)
+        writer.sync()
+        shutil.copytree(writer.path, log)
+    program = start_code(MAPFOLD, "ros", str(log), "--connect", endpoint, "--no-cache")
+    program.wait_for("map of 20 events")
+    (growing,) = log.glob("*.active")
+    os.truncate(growing, size)
+    program.wait_for(said)
+    assert program.process.wait(DEADLINE_S) == 1
 
 
 def test_options_of_the_command(tmp_path: Path) -> None:

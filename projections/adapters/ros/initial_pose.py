@@ -42,6 +42,7 @@ class InitialPose:
         self._messages = MapMessages(node.types)
         self._publisher = node.publisher(TOPIC, POSE_WITH_COVARIANCE)
         self._wanted = threading.Event()
+        self._fault: str | None = None  # why the last question was not answered
         node.trigger("~/localize", self.start)
 
     def start(self) -> tuple[bool, str]:
@@ -75,6 +76,7 @@ class InitialPose:
 
     def _look_by(self, listener: Listener, stop: threading.Event) -> None:
         robot, seen = WakingRobot(), 0
+        self._fault = None
         while not stop.is_set() and seen < _MOST_KEYFRAMES:
             for heard in listener.take(_WAIT_S):
                 if stop.is_set() or seen == _MOST_KEYFRAMES:
@@ -93,10 +95,14 @@ class InitialPose:
         if question is None:
             return None
         try:
-            return robot.judge(self._ask(question))
+            answer = self._ask(question)
         except (QuestionError, DatabaseError) as error:
-            self._note(f"a question could not be answered: {error}")
+            if self._fault != str(error):
+                self._fault = str(error)
+                self._note(f"a question could not be answered: {error}")
             return None
+        self._fault = None
+        return robot.judge(answer)
 
     def _publish(self, sure: SurePose, heard: Heard) -> None:
         """Publish the pose of the base, whose camera is where the answer says, with the time of the

@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from eventsrc.base.errors import LogError, MisuseError
+from eventsrc.base.errors import LogDamaged, LogError, MisuseError
+from eventsrc.base.text import advised
 from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
@@ -141,9 +142,16 @@ class LogMaps:
         return recorded_document(made)
 
     def _refresh(self) -> None:
-        """Include events recorded since. Raises LogError where another log, or none, is there."""
+        """Include events recorded since. Raises LogError where another log, or none, or less of it
+        is there."""
+        known = self._timeline.reader.readable_end
         with LogReader(self._log) as there:
             self._refuse_other(there)
+            if there.readable_end < known:
+                raise LogDamaged(
+                    f"{self._log} has {there.readable_end:,} events that can be read now and had"
+                    f" {known:,}; run `{advised('log', 'recover', self._log)}`"
+                )
         self._timeline.refresh()
 
     def _refuse_other(self, there: LogReader) -> None:
