@@ -39,9 +39,9 @@ def words_of(
 def with_text_encoder(settings: Settings, current: MapToEdit) -> Settings:
     """Settings to record in a log: with the SHA-256 of a text encoder that they newly name. Raises
     MisuseError for files that are none, and for a space other than that of the map's embeddings."""
-    if settings.text_encoder is None or settings.text_encoder_sha256 is not None:
+    found = identified(settings)
+    if settings.text_encoder is None or found is settings:
         return settings
-    path = Path(settings.text_encoder)
     view = map_after(
         current.reader,
         settings.model_copy(update={"text_encoder": None}),
@@ -51,11 +51,21 @@ def with_text_encoder(settings: Settings, current: MapToEdit) -> Settings:
         embeddings=True,
     )
     with _LOCK:
-        tower = _opened(path)
         first = view.embedded()[:1]
         if len(first):
             model = view.observations[int(first[0])].embedding_model
+            tower = _opened(Path(settings.text_encoder))
             _check_space(tower, model, view.vectors(first).shape[1])
+    return found
+
+
+def identified(settings: Settings) -> Settings:
+    """Settings with path and SHA-256 of a text encoder that they newly name. Raises MisuseError."""
+    if settings.text_encoder is None or settings.text_encoder_sha256 is not None:
+        return settings
+    path = Path(settings.text_encoder)
+    with _LOCK:
+        tower = _opened(path)
     return settings.model_copy(
         update={"text_encoder": str(path.absolute()), "text_encoder_sha256": tower.sha256}
     )

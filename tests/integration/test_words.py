@@ -118,6 +118,24 @@ def test_without_a_text_encoder_the_answer_says_so(mapfold: Commands, model: Pat
 
 
 @pytest.mark.seconds
+def test_a_new_log_begins_with_what_the_command_would_record(said: Commands, model: Path) -> None:
+    named = "--set", f"text_encoder={model.relative_to(said.folder)}"
+    again = "import", "new", "one.jsonl", *named
+    said("simulate", "--out", "one.jsonl", *named)
+    said("import", "copy", "one.jsonl")
+    for _ in range(2):  # the second time the log has these settings
+        said(*again)
+    expected = fold(said.folder / "log").view.settings
+    for log in ("copy", "new"):
+        found = fold(said.folder / log).view.settings
+        assert found.text_encoder_sha256 == expected.text_encoder_sha256 is not None
+        assert found.text_encoder == str(model.absolute())
+    gone = "--set", "text_encoder=gone.onnx"
+    assert "gone.onnx" in said("import", "other", "one.jsonl", *gone, code=2).err
+    assert not (said.folder / "other").exists()
+
+
+@pytest.mark.seconds
 def test_said_once_it_holds_for_every_surface(said: Commands, one_database: Targets) -> None:
     word, log = backwards("potted plant"), said.folder / "log"
     by_log = said("find", "log", word, "--json").json

@@ -70,8 +70,9 @@ class NewLogOptions:
         return NamedSettings(preset=self.preset).around(self.set_)
 
     def check(self) -> None:
-        """Raise SettingsError for settings that no map can have."""
-        Settings().with_assignments(self.assignments)
+        """Raise SettingsError for settings that no map can have, MisuseError for a text encoder
+        that cannot be read."""
+        _assigned(Settings(), self.assignments)
 
     def command(self) -> UseSettings | None:
         """The command that a new log begins with; None where nothing is chosen. Raises
@@ -94,8 +95,19 @@ class NewLogOptions:
         return [*preset, *(word for text in self.set_ or () for word in ("--set", text))]
 
 
+def _assigned(settings: Settings, assignments: Sequence[str]) -> Settings:
+    """Changed settings, with the SHA-256 of a text encoder as `edit use-settings` records it."""
+    changed = settings.with_assignments(assignments)
+    if changed.text_encoder is None:
+        return changed
+    # Imported here: it takes long, and few logs begin with a text encoder.
+    from projections.surfaces.text_encoders import identified
+
+    return identified(changed)
+
+
 def _command(assignments: Sequence[str], reason: str) -> UseSettings:
-    document = Settings().with_assignments(assignments).model_dump(mode="json")
+    document = _assigned(Settings(), assignments).model_dump(mode="json")
     return UseSettings(
         command_id=uuid.uuid4().hex, issued_by=user_at_host(), reason=reason, settings=document
     )
@@ -231,7 +243,7 @@ def _known_commands(log: Path, *, is_needed: bool) -> list[RecordedCommand]:
 
 
 def _check_same(log: Path, known: Settings, options: NewLogOptions) -> None:
-    asked = known.with_assignments(options.assignments)
+    asked = _assigned(known, options.assignments)
     if asked == known:
         return
     here = known.by_name()
