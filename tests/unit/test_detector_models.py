@@ -264,7 +264,7 @@ GOOD = {"model": "m", "size": 32, "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5, 0.5
         ({"mean": [0.5]}, "mean"),
         ({"resize": "magic"}, "resize"),
         ({"model": "a\nb"}, "model"),
-        ({"speed": 1}, "speed"),
+        ({"speed": 1}, "speed: no such field;"),
         ({"mean": [0.5, "x", 0.5]}, "mean.1"),
     ],
 )

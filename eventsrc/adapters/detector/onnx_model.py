@@ -77,7 +77,8 @@ def read_description(model: Path, kind: type[Described]) -> Described:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "the file"
-        raise MisuseError(f"{path}: {place}: {first['msg']}; see {kind.PAGE}") from None
+        reason = "no such field" if first["type"] == "extra_forbidden" else first["msg"]
+        raise MisuseError(f"{path}: {place}: {reason}; see {kind.PAGE}") from None
 
 
 def model_sha256(path: Path, description: Description, *more: bytes) -> str:
