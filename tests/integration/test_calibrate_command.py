@@ -23,6 +23,7 @@ from tests.support.thorough import mostly_slow, rounds
 
 BY_EVIDENCE = ("--set", "fusion=evidence")
 COUNT = rounds(80, 30)
+SIZED = ("--set", "camera.width_px=800", "--set", "camera.height_px=600")
 """Keyframes of each of the two runs; a calibration costs three seconds with 80."""
 
 
@@ -187,8 +188,7 @@ def test_a_camera_that_nothing_states_is_estimated_and_recorded(tmp_path: Path) 
     assert 0 < counts["without_camera"] <= 2 * COUNT
     assert "without_camera" not in mapfold("state", "log", "--json").json["counts"]
 
-    sized = ("--set", "camera.width_px=800", "--set", "camera.height_px=600")
-    said = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE, *sized).json
+    said = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE, *SIZED).json
     camera = said["camera"]
     assert camera["hfov_deg"] == pytest.approx(90.0, abs=4.0)
     assert abs(camera["hfov_deg"] - 90.0) < 4.0 * camera["hfov_error_deg"] + 0.5
@@ -205,7 +205,7 @@ def test_a_camera_that_nothing_states_is_estimated_and_recorded(tmp_path: Path) 
 def test_an_estimated_camera_is_not_recorded_again(tmp_path: Path) -> None:
     write_room(tmp_path / "log", count=COUNT, camera=False)
     mapfold = Commands.in_folder(tmp_path)
-    camera = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE).json["camera"]
+    camera = mapfold("calibrate", "log", "--write", "--json", *BY_EVIDENCE, *SIZED).json["camera"]
     again = mapfold("calibrate", "log", "--write").out
     assert f"field of view {camera['hfov_deg']:g}° ± {camera['hfov_error_deg']:g}°" in again
     assert again.endswith("the log has these constants already; nothing is recorded\n")

@@ -170,7 +170,8 @@ def check_floors(folded: Folded) -> None:
     sums = {p.ordinal: (p.keyframe_count, p.sum_x_um, p.sum_y_um) for p in view.places.values()}
     assert sums == recounted_places(view)
     assert view.adjacency == recounted_adjacency(view)
-    assert [o.place for o in view.objects.values()] == recounted_votes(view, deltas)
+    if not view.maps:  # else those of a region are in its place
+        assert [o.place for o in view.objects.values()] == recounted_votes(view, deltas)
 
 
 def drive(*floors: dict[str, Any]) -> list[dict[str, Any]]:
