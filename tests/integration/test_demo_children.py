@@ -4,20 +4,27 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from eventsrc.adapters.sim import simulate_run
 from eventsrc.base.errors import LogBusy, MapfoldError
 from eventsrc.log import LogWriter
 from eventsrc.record.transport.session import Router, ZenohOptions
-from projections.surfaces.demo.recorded_run import Children
+from projections.postgres.connection import Targets
+from projections.surfaces.demo import recorded_run
+from projections.surfaces.demo.recorded_run import Children, record_run
 from tests.support.fixtures_zenoh import Program
 
 STARTER = """
 import signal, sys
 from pathlib import Path
-from projections.surfaces.demo.recorded_run import Children
+from projections.postgres.connection import Targets
+from projections.surfaces.demo import recorded_run
+from projections.surfaces.demo.recorded_run import Children, record_run
 log, endpoint, said = sys.argv[1:]
 with Children() as children:
     children.start("record", ("record", log, "--connect", endpoint), Path(said))
@@ -96,3 +103,18 @@ def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:
 def test_what_is_waited_for_last_is_named_when_no_child_runs(tmp_path: Path) -> None:
     with Children() as children, pytest.raises(MapfoldError, match=r"0\.1 s by the databases$"):
         children.wait(lambda: False, stalled_s=0.1, at_last="the databases")
+
+
+@pytest.mark.seconds
+def test_a_signal_while_the_tail_is_started_ends_it(
+    tmp_path: Path, module_database: Targets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, *args: Any, **kwargs: Any) -> Any:
+            super().submit(*args, **kwargs)
+            raise SystemExit(128 + signal.SIGTERM)  # as the handler does
+
+    monkeypatch.setattr(recorded_run, "ThreadPoolExecutor", Interrupted)
+    with pytest.raises(SystemExit):
+        record_run(simulate_run(7, "a"), 300.0, tmp_path, module_database)
+    _wait_until_free(tmp_path / "log", 30.0)

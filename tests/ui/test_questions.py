@@ -135,7 +135,7 @@ def test_a_wrong_condition_is_shown_at_its_column(sample: UiServer, visit: Visit
     page.get_by_role("combobox", name="Condition over the map").fill("place_count() > 'x'")
     page.get_by_role("button", name="Find", exact=True).click()
     expect(page.get_by_role("alert")).to_contain_text("cannot compare a number with a text")
-    assert page.locator(".pointer").inner_text().split("\n")[1] == " " * 14 + "^"
+    assert page.locator(".pointer").inner_text().split("\n")[1] == " " * 16 + "^"
 
 
 @pytest.fixture(scope="module")

@@ -198,17 +198,17 @@ def record_run(
         recorder = ("record", str(log), *connect, "--max-events", str(count))
         children.start("record", recorder, folder / "record.txt")
         children.wait_for_output("record", "recording")
-        tailing = pool.submit(
-            tail,
-            log,
-            targets,
-            SETTINGS,
-            stop=stop,
-            on_batch=lambda report: commits.append((report.next_offset, time.time_ns())),
-        )
         robot = ("simulate", "--seed", str(run.house.seed), "--run", "a", *connect)
         paced = ("--speed", str(speed), "--wait", str(_WAIT_S))
-        try:
+        try:  # the tail ends however this does, also by a signal while it is started
+            tailing = pool.submit(
+                tail,
+                log,
+                targets,
+                SETTINGS,
+                stop=stop,
+                on_batch=lambda report: commits.append((report.next_offset, time.time_ns())),
+            )
             children.start("simulate", (*robot, *paced), folder / "simulate.txt")
             children.wait(
                 lambda: tailing.done() or (not children.running and at_end()),
