@@ -42,8 +42,8 @@ from projections.surfaces.cli.bridge_options import BridgeChoice, recording_of
 from projections.surfaces.python import fold
 from projections.surfaces.serve import Answerer, FairQueue, Pools
 from projections.surfaces.serve.asked import ServedLog
+from projections.surfaces.ui.crop_pictures import pictures_answer
 from projections.surfaces.ui.log_map import LogMap, Opened
-from projections.surfaces.ui.pictures import pictures_answer
 from tests.support import ros2dds
 from tests.support import ros_messages as ros
 from tests.support.commands import Commands

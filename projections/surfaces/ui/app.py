@@ -34,13 +34,13 @@ from .comparisons import (
     merges_answer,
     whatif_answer,
 )
+from .crop_pictures import pictures_answer
 from .editor import MOST_BYTES as MOST_EDIT_BYTES
 from .editor import Editor, corrections_answer, read_edit
 from .live_watch import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
 from .map_answers import digest_answer, history_answer, walls_answer
-from .pictures import pictures_answer
 from .question_threads import GoOn, UiService
 from .requests import assignments_of, encoded, refusal
 from .search import find_answer, keyframe_answer, search_answer
