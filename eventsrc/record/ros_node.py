@@ -151,7 +151,7 @@ class RosPublisher:
         self._sender.put(payload, attached)
 
     def wait_for_subscriber(self, timeout_s: float) -> bool:
-        """Wait until somebody subscribes; False when there was nobody in time."""
+        """Wait for a subscriber; False if none came within ``timeout_s``."""
         return self._sender.wait_for_subscriber(timeout_s)
 
     def _reply(self, key: str, query: Query) -> None:

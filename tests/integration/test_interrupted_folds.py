@@ -216,13 +216,13 @@ def test_a_served_log_answers_rightly_after_an_interrupted_question(log: Path) -
         expected = ask(beside)
     kept = log.with_name("log.history")
 
-    def anew() -> list[Any]:
+    def ask_without_history() -> list[Any]:
         for path in kept.glob("*"):
             path.unlink()
         with closing(ServedLog(log)) as beside:
             return ask(beside)
 
-    for moment in in_each_event(anew, seed=8):
+    for moment in in_each_event(ask_without_history, seed=8):
         for path in kept.glob("*"):
             path.unlink()
         with closing(ServedLog(log)) as beside:

@@ -348,7 +348,7 @@ def test_the_command_finds_its_topics_by_itself(
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A search that waits only briefly for messages that nobody sends."""
+    """A search for topics that waits 0.1 s for their first messages."""
     monkeypatch.setattr("eventsrc.record.ros_graph._SAMPLES_S", 0.1)
 
 

@@ -271,7 +271,7 @@ def test_the_user_of_the_server_is_made_where_the_path_lacks_useradd(
     name = f"pgserver-test-{os.getpid()}"
     monkeypatch.setattr(server_user, "SYSTEM_USER", name)
     with monkeypatch.context() as patched:
-        patched.setenv("PATH", "/bin-of-nobody")
+        patched.setenv("PATH", "/no-such-folder")
         try:
             assert server_user.server_identity()["user"] == name
             assert pwd.getpwnam(name).pw_uid == server_user.server_uid()

@@ -39,7 +39,7 @@ _AGREE_M: Final = 0.5
 _AGREE_RAD: Final = math.radians(10.0)
 _NEAR_M: Final = 1.0
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.1, math.radians(3.0)
-"""Of the pose that is told: poses of the posterior are about so far apart."""
+"""Least standard errors of the published pose: the spacing of the poses of the posterior."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,7 +89,7 @@ class GoalSender(ZenohClient):
             publisher = node.publisher(_TOPIC, POSE)
             if not publisher.wait_for_subscriber(_WAIT_S):
                 raise MapfoldError(
-                    f"nobody subscribes to {publisher.topic} in domain {number}; check that Nav2"
+                    f"{publisher.topic} has no subscriber in domain {number}; check that Nav2"
                     " runs over rmw_zenoh, and --domain, --namespace and --connect"
                 )
             x, y, yaw = goal.x, goal.y, goal.yaw

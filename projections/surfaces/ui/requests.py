@@ -96,7 +96,7 @@ def refusal(error: MapfoldError) -> tuple[int, dict[str, Any]]:
 def assignments_of(query: QueryParams) -> tuple[str, ...]:
     """The settings that a question changes: ``set=name=value`` and the short forms ``eps_m`` and
     ``min_samples``, in the order of their names. Raises SettingsError, also for a text encoder:
-    whoever may ask could have any file of this machine opened."""
+    a client could open any file of this machine by it."""
     found = query.getlist("set")
     found += [f"{name}={query[name]}" for name in ("eps_m", "min_samples") if query.get(name)]
     if len(found) > MOST_SETS:

@@ -12,8 +12,8 @@ scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no
 With --no-embeddings the detectors are bare ones; in the table of Objects page is then as if all
 looked alike: the class and the radius decide.
 
-With --localise another table: where the robot is, asked of the map of run a. With --lost: robots
-that wake somewhere and turn once, and when they are told where they are.
+With --localise another table: where the robot is, asked of the map of run a. With --lost: lost
+robots that turn once, and after how many keyframes the initial pose is published.
 
 A line for each robot (profile) in a building (world), runs a, b and c in one log; the worst last.
 """

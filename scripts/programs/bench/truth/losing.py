@@ -117,7 +117,7 @@ def turns(
 
 
 def _told(turn: Turn, index: ExactIndex, case: Case) -> tuple[int, float, float] | None:
-    """After how many keyframes a pose is told, and its errors in metres and radians."""
+    """Keyframes until the initial pose is published, and its errors in metres and radians."""
     robot = WakingRobot()
     for number, (keyframe, (x, y, yaw)) in enumerate(turn, start=1):
         question = robot.see(keyframe)
