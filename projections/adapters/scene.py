@@ -1,9 +1,11 @@
 """What is drawn of a map, for pictures, files and viewers: places with outline and label, objects
-where they stand, ways, drives, the robot; and what pictures add: a plan, a lost robot, merges.
+where they stand, ways, drives, the robot; and what pictures add: a plan, a lost robot, merges; and
+the colours of all of these.
 
 Lengths in metres, angles in radians.
 """
 
+import colorsys
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -11,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from eventsrc.envelope.model import RunId
-from projections.adapters import palette
 from projections.fold.deltas import Pose
 from projections.fold.exact import UM_PER_M
 from projections.map import records
@@ -21,14 +22,40 @@ from projections.map.view import MapView
 if TYPE_CHECKING:
     from eventsrc.adapters.sim import House
 
+INK = "#22262b"
+FAINT = "#8b939c"
+WALL = "#3b4149"
+FLOOR = "#fbfaf7"
+FURNITURE = "#e9e5dc"
+FURNITURE_EDGE = "#d8d2c4"
+ROOM_NAME = "#6a7179"
+SMALL_PRINT = "#4b525a"
+LEADER = "#9aa1a9"
+BRIDGE = "#8a1c7c"
+TRUTH = "#0b0d10"
+ESTIMATE = "#d3262e"
+
+_BASE = (
+    *("#3b82c4", "#e08a1e", "#3a9d5d", "#c2508f", "#7a63c7", "#b3a12a"),
+    *("#2aa5a8", "#d9634c", "#7d8f2b", "#a2583b", "#5f7fe0", "#cf78c6"),
+)
+_GOLDEN = 0.618033988749895
+
+
+def place_colour(index: int) -> str:
+    """The colour of the ``index``-th place as #rrggbb: twelve chosen ones, then hues between."""
+    if index < len(_BASE):
+        return _BASE[index]
+    red, green, blue = colorsys.hls_to_rgb((index * _GOLDEN) % 1.0, 0.45, 0.5)
+    return f"#{round(red * 255):02x}{round(green * 255):02x}{round(blue * 255):02x}"
+
+
 _NEAR_M = 1.0
 _MOST_LETTERS = 24
 """Most letters of a place's name; longer names are cut."""
 
 Line = tuple[float, float, float, float]
 Box = tuple[float, float, float, float]
-
-
 Point = tuple[float, float]
 _T = TypeVar("_T")
 _MOST_POSES: Final = 2_000
@@ -60,7 +87,7 @@ class ShownPlace:
     @property
     def colour(self) -> str:
         """Its colour, #rrggbb."""
-        return palette.place_colour(self.record.ordinal)
+        return place_colour(self.record.ordinal)
 
 
 @dataclass(frozen=True, slots=True)

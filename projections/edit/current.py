@@ -14,7 +14,7 @@ from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.objects import object_id
 from projections.fold.settings import Settings
 from projections.map.naming import NoSuchThing, ShortIds, Thing, thing_called, things_of
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after

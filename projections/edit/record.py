@@ -38,7 +38,7 @@ from eventsrc.record.transport.session import Session
 from projections.fold.corrections import Keyframe, RecordedCommand, check_settings
 from projections.fold.deltas import ObjectOrdinal, PlaceOrdinal
 from projections.fold.map_errors import FoldError
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 from projections.map.view import MapView
 
 from .conflicts import EditRefused, describe

@@ -105,7 +105,7 @@ class SemanticMap:
         self.located_in = LocatedIn(self.standing)
         self.adjacency = Adjacency()
         self.observation_count = 0
-        self.reembedded: Reembedded | None = None  # by `projections.map.own_events`
+        self.reembedded: Reembedded | None = None  # by `projections.map.parsing`
         self._has_vectors = bool(corrections.reembedded_for(settings))
 
     def use_map(self, offset: Offset, given: OccupancyMap) -> list[Delta]:

@@ -20,7 +20,7 @@ from projections.fold.corrections import Corrections, RecordedCommand, compile_c
 from projections.fold.settings import Settings
 from projections.map.fold import FoldedEvent
 from projections.map.naming import NoSuchThing
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_records import Cause, Merge

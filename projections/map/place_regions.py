@@ -4,20 +4,26 @@ any other (`projections.fold.free_floor`); where walls are known and places use 
 A region is given as a GeoJSON geometry in metres of the map frame: its outline along the borders of
 cells, with holes. Outer rings run counter-clockwise, holes clockwise; a ring touches itself or
 another one in single points only.
+
+Walls are line segments: the outline of a map's occupied cells, a straight one a segment. Where a
+map has more than `MOST_SEGMENTS`, cells are pooled: a square of them is occupied if one of them is,
+so that no wall is lost.
 """
 
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.exact import UM_PER_M
 from projections.fold.free_floor import FreeFloor, free_floor
-from projections.fold.occupancy import NOWHERE
+from projections.fold.occupancy import NOWHERE, occupied, pooled
 
 from .view import MapView
 
@@ -196,3 +202,44 @@ def _is_in(hole: _Ring, ring: _Ring) -> bool:
         if 2 * cx > x and min(cy, dy) * 2 < y < max(cy, dy) * 2
     )
     return crossed % 2 == 1
+
+
+MOST_SEGMENTS: Final = 20_000
+_Mask = NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def wall_segments(given: OccupancyMap) -> list[list[float]]:
+    """The segments: x and y of both ends, in metres in the map frame, to the millimetre."""
+    walls = occupied(given)
+    step = 1
+    while True:
+        mask = pooled(walls, step)
+        across, along = _wall_ends(mask), _wall_ends(mask.T)
+        # A segment has two turns. They are counted first: a noisy map has millions of segments.
+        if np.count_nonzero(across) + np.count_nonzero(along) <= 2 * MOST_SEGMENTS:
+            ends = np.concatenate([_wall_lines(across), _wall_lines(along)[..., ::-1]])
+            return _lines_in_map(given, ends * step * given.resolution)
+        step *= 2
+
+
+def _wall_ends(mask: _Mask) -> _Mask:
+    """The corners of cells at which horizontal parts of the outline begin or end."""
+    framed = np.pad(mask, ((1, 1), (0, 0)))
+    edges = np.pad(framed[1:] != framed[:-1], ((0, 0), (1, 1)))
+    return np.asarray(edges[:, 1:] != edges[:, :-1])
+
+
+def _wall_lines(turns: _Mask) -> NDArray[np.intp]:
+    """(column, row) of both ends of each; the turns of a row come in pairs, begin and end."""
+    rows, columns = np.nonzero(turns)
+    return np.stack([columns, rows], axis=-1).reshape(-1, 2, 2)
+
+
+def _lines_in_map(given: OccupancyMap, ends: NDArray[Any]) -> list[list[float]]:
+    x, y, yaw = given.origin
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    u, v = ends[..., 0], ends[..., 1]
+    placed = np.stack([x + cos * u - sin * v, y + sin * u + cos * v], axis=-1)
+    found: list[list[float]] = np.round(placed.reshape(-1, 4), 3).tolist()
+    return found

@@ -19,7 +19,7 @@ from projections.fold.corrections import (
 )
 from projections.fold.pair_groups import ApartPairs
 from projections.fold.settings import Settings
-from projections.map.own_events import read_command, read_commands
+from projections.map.parsing import read_command, read_commands
 
 from .sink import Checkpoint
 

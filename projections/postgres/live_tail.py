@@ -31,7 +31,7 @@ from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import Event, LogReader, event_hash, follow
 from projections.fold.map_errors import FoldError, ImpossibleCommand, ProjectionMismatch
 from projections.fold.settings import Settings
-from projections.map.own_events import read_command
+from projections.map.parsing import read_command
 from projections.store.history_recorder import HistoryRecorder, resumed_under_other_names
 from projections.store.timeline_cache import TimelineCache
 

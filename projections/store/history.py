@@ -33,7 +33,7 @@ from projections.map.records import ObjectRecord
 
 from . import history_records
 from .columns import Array
-from .lazy_rows import Chunks, Items, OrdinalsByName
+from .history_records import Chunks, Items, OrdinalsByName
 from .neighbours import Neighbours, posed
 from .object_states import ObjectStates
 from .tables import Groups, Tables

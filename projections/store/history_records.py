@@ -1,4 +1,5 @@
-"""Records of a history: causes, merges, and what happened to each place and object.
+"""Records of a history: causes, merges, and what happened to each place and object; and sequences
+and mappings whose items are made from rows of tables on access.
 
 Keyframes, places and objects are ordinals here, as in the deltas; ids are put in where text or JSON
 is made. No record is removed: an absorbed place keeps its history and the merge that ended it.
@@ -9,16 +10,113 @@ and later keyframes are folded, so its offset is where it was recorded, not wher
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from operator import attrgetter
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Final, Literal, Protocol, TypeVar, overload
+
+from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset, RunId
 from projections.fold import deltas as d
 from projections.map.phrases import iso_time
 
-from .lazy_rows import Items
+_T = TypeVar("_T")
+_KEPT: Final = 64
+_AT_ONCE: Final = 4_096
+_MOST_CHUNKS: Final = 256
+
+
+class Chunks(Sequence[_T]):
+    """A sequence of ``count`` items; ``make(first, last)`` returns those from ``first`` to before
+    ``last``.
+
+    Indexing keeps some of the chunks made last; iterating keeps none. For many threads.
+    """
+
+    __slots__ = ("_count", "_kept", "_make")
+
+    def __init__(self, count: int, make: Callable[[int, int], list[_T]]) -> None:
+        self._count, self._make = count, make
+        self._kept: dict[int, list[_T]] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> _T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[_T]: ...
+    def __getitem__(self, index: int | slice) -> _T | list[_T]:
+        if isinstance(index, slice):
+            first, last, step = index.indices(self._count)
+            if step != 1:
+                return [self[i] for i in range(first, last, step)]
+            return self._make(first, last) if first < last else []
+        at = index + self._count if index < 0 else index
+        if not 0 <= at < self._count:
+            raise IndexError(f"{index} of {self._count}")
+        chunk, within = divmod(at, _KEPT)
+        made = self._kept.get(chunk)
+        if made is None:
+            first = chunk * _KEPT
+            made = self._make(first, min(first + _KEPT, self._count))
+            if len(self._kept) >= _MOST_CHUNKS:
+                self._kept = {}  # all at once, as another thread may be reading it
+            self._kept[chunk] = made
+        return made[within]
+
+    def __iter__(self) -> Iterator[_T]:
+        for first in range(0, self._count, _AT_ONCE):
+            yield from self._make(first, min(first + _AT_ONCE, self._count))
+
+
+class Items(Chunks[_T]):
+    """A sequence of items made from ``rows``, in order of offset. ``make`` returns the items of
+    given rows, ``offsets`` the offsets of their events."""
+
+    __slots__ = ("_made_offsets", "_offsets", "_rows")
+
+    def __init__(
+        self,
+        rows: NDArray[Any],
+        make: Callable[[NDArray[Any]], list[_T]],
+        offsets: Callable[[NDArray[Any]], NDArray[Any]],
+    ) -> None:
+        super().__init__(len(rows), lambda first, last: make(rows[first:last]))
+        self._rows, self._offsets = rows, offsets
+        self._made_offsets: memoryview | None = None
+
+    def before(self, end: int) -> int:
+        """The number of items of events below ``end``."""
+        if self._made_offsets is None:
+            found: Any = self._offsets(self._rows)
+            self._made_offsets = memoryview(found)
+        return bisect_left(self._made_offsets, end)
+
+
+class OrdinalsByName(Mapping[Any, Any]):
+    """A mapping from ``count`` names to ordinals: ``find`` returns a name's ordinal or None,
+    ``names`` iterates over all names."""
+
+    def __init__(
+        self, count: int, find: Callable[[Any], int | None], names: Callable[[], Iterator[Any]]
+    ) -> None:
+        self._count, self._find, self._names = count, lru_cache(_KEPT)(find), names
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Any]:
+        return self._names()
+
+    def __getitem__(self, name: Any) -> Any:
+        found = self._find(name)
+        if found is None:
+            raise KeyError(name)
+        return found
+
 
 CauseKind = Literal["keyframe", "command"]
 
@@ -223,7 +321,7 @@ class _HasOffset(Protocol):
     def offset(self) -> int: ...
 
 
-_T = TypeVar("_T", bound=_HasOffset)
+_Dated = TypeVar("_Dated", bound=_HasOffset)
 _offset = attrgetter("offset")
 
 
@@ -234,7 +332,7 @@ def count_before(items: Sequence[_HasOffset], end: Offset) -> int:
     return bisect_left(items, end, key=_offset)
 
 
-def last_before(items: Sequence[_T], end: Offset) -> _T | None:
+def last_before(items: Sequence[_Dated], end: Offset) -> _Dated | None:
     """The last item, sorted by offset, of the events below ``end``."""
     count = count_before(items, end)
     return items[count - 1] if count else None

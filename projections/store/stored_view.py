@@ -37,7 +37,7 @@ from projections.map.view import MapView
 
 from .columns import NO_INT, NONE, TABLES
 from .history import History
-from .lazy_rows import Chunks
+from .history_records import Chunks
 from .moment import Moment
 from .object_states import ObjectStates
 from .timeline_cache import TimelineCache

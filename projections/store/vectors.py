@@ -20,8 +20,7 @@ from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader
 from projections.fold.exact import Units
-from projections.map.own_events import vectors_of
-from projections.map.parsing import READ_AHEAD, parse_events
+from projections.map.parsing import READ_AHEAD, parse_events, vectors_of
 
 from .columns import NONE, Stripe
 from .history import History

@@ -21,7 +21,7 @@ from eventsrc.log import LogReader
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from tests.docs.console import ROOT, Command, matches, read
 from tests.support.commands import Commands, Said
 from tests.support.logs import simulated

@@ -13,7 +13,7 @@ from eventsrc.log import LogReader, LogWriter
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import Settings
 from projections.localize.calibrate.rounds import calibrate
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope
 from tests.support.fixtures_zenoh import Program

@@ -22,7 +22,7 @@ from projections.edit.current import MapToEdit
 from projections.edit.effect import Change, Effect, effect_of
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from tests.support.commands import Commands
 from tests.support.fixtures_log import flip, read_log
 from tests.support.logs import EVENTS, FAR, LEFT, MERGE, RIGHT, walk, write_rooms

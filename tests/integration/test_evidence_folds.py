@@ -14,7 +14,7 @@ from projections.fold import deltas as d
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check

@@ -23,7 +23,7 @@ from eventsrc.log import LogReader
 from projections.adapters.foxglove.playback import PROTOCOL, ClientTroubles, PastMaps, Playback
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.settings import Settings
-from projections.map.scenes import Moments
+from projections.map.fold import Moments
 from tests.support.commands import Commands, ReadyProgram
 from tests.support.envelopes import detection, envelope
 from tests.support.logs import sample_drive, write_log

@@ -14,7 +14,7 @@ from eventsrc.envelope.system_events import REJECTED_KEY, RejectedPayload
 from eventsrc.log import LogReader, LogWriter
 from projections.fold.map_errors import FoldInterrupted
 from projections.map.digest import map_digest
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.postgres.live_fold import LiveFold
 from projections.postgres.queries.live_view import LiveView
 from projections.surfaces.serve.asked import ChangesQuery, FindQuery, ServedLog

@@ -14,7 +14,7 @@ from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces.cli import command_line
 from tests.integration.test_reembed import IN_B, A, run

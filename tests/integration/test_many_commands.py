@@ -32,7 +32,7 @@ from projections.history.rule_folds import Rules, fold_in_this_process
 from projections.localize.calibrate.rounds import calibrate
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log, new_map
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.postgres.connection import Targets
 from projections.postgres.inputs import LogInputs

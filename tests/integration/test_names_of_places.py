@@ -12,7 +12,7 @@ from projections.ask.room_and_path import path, room
 from projections.fold.settings import Settings
 from projections.localize.relocalize import ExactIndex, rank, read_question
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.cypher import connect_for_cypher

@@ -14,7 +14,7 @@ from eventsrc.envelope.system_events import COMMAND_KEY, MAP_KEY
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.log.durable_files import ALWAYS
 from projections.fold.settings import Settings
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.surfaces.cli.new_log import LogStart, NewLogOptions
 from tests.support.commands import PROGRAM, Commands
 from tests.support.envelopes import detection, envelope, payload

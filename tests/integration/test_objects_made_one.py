@@ -10,7 +10,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets

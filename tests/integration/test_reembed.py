@@ -24,7 +24,7 @@ from projections.fold.settings import Settings
 from projections.localize.evaluate.questions import read_keyframes
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.postgres import rebuild, tail
 from projections.postgres.check import check

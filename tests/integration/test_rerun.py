@@ -12,9 +12,9 @@ import pytest
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
-from projections.adapters.palette import place_colour
+from projections.adapters.scene import place_colour
 from projections.fold.settings import Settings
-from projections.map.scenes import RecordedFold
+from projections.map.fold import RecordedFold
 from projections.surfaces.cli.export_command import _recorder
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope

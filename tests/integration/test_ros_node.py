@@ -37,8 +37,8 @@ from projections.adapters.ros.map_messages import (
     POSE,
     POSE_WITH_COVARIANCE,
     MapMessages,
+    ShownMap,
 )
-from projections.adapters.ros.shown_map import ShownMap
 from projections.fold.map_errors import QuestionError
 from projections.surfaces.python.map import fold
 from tests.support import rmw

@@ -18,7 +18,7 @@ from projections.localize.calibrate.field_of_view import (
     FieldOfView,
     field_of_view,
 )
-from projections.localize.calibrate.sightings import Row
+from projections.localize.calibrate.qualified_things import Row
 from tests.support.thorough import examples, rounds
 
 PRIOR = EvidenceConstants()

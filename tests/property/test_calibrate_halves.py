@@ -9,9 +9,8 @@ import pytest
 from projections.fold.deltas import Pose
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import metres_to_um
-from projections.localize.calibrate.qualified_things import inflation, qualified
+from projections.localize.calibrate.qualified_things import Row, inflation, qualified, sightings_of
 from projections.localize.calibrate.rounds import read
-from projections.localize.calibrate.sightings import Row, sightings_of
 from tests.support.known_worlds import Known, rows_of
 from tests.support.thorough import stride
 

@@ -13,9 +13,9 @@ from projections.fold.evidence import EvidenceConstants
 from projections.fold.exact import quantise
 from projections.fold.settings import CameraConstants, CameraSettings
 from projections.localize.calibrate.field_of_view import field_of_view
+from projections.localize.calibrate.qualified_things import Row, sightings_of
 from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import _bounded, read
-from projections.localize.calibrate.sightings import Row, sightings_of
 from tests.support.thorough import examples
 
 FAR_UM = 10**13

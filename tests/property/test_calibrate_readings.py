@@ -8,9 +8,9 @@ import pytest
 
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraConstants
+from projections.localize.calibrate.qualified_things import sightings_of
 from projections.localize.calibrate.readings import Reading
 from projections.localize.calibrate.rounds import Round, read
-from projections.localize.calibrate.sightings import sightings_of
 from tests.support.known_worlds import CAMERA, Known, rows_of
 from tests.support.thorough import mostly_slow, rounds
 

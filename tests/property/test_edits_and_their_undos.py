@@ -21,7 +21,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from tests.support.logs import EVENTS, FAR, LEFT, RIGHT, append, make, write_rooms
 from tests.support.thorough import examples

@@ -20,7 +20,7 @@ from projections.history.rule_folds import Rules
 from projections.history.whatif import command_trials, what_if
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.own_events import read_commands, read_corrections
+from projections.map.parsing import read_commands, read_corrections
 from projections.map.state_output import state_document
 from projections.map.view import MapView
 from tests.support.envelopes import envelope

@@ -16,7 +16,7 @@ from projections.fold.deltas import ObjectMissing, ObjectRelocated
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.map.fold import fold_events, fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.surfaces.ui.log_map import LogMap, Opened
 from projections.surfaces.ui.map_answers import history_columns

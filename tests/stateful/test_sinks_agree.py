@@ -34,7 +34,7 @@ from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.postgres import rebuild, tail
 from projections.postgres.connection import Targets, connect
 from projections.postgres.live_fold import LiveFold

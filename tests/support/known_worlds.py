@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from projections.fold.deltas import Pose
 from projections.fold.exact import metres_to_um, quantise
 from projections.fold.settings import CameraConstants
-from projections.localize.calibrate.sightings import Row
+from projections.localize.calibrate.qualified_things import Row
 
 CAMERA = CameraConstants(hfov_deg=80.0, width_px=800.0, height_px=600.0)
 DIM = 1024

@@ -44,7 +44,7 @@ MODULES = (
     "prometheus_client",
     "projections.adapters.drawing",
     "projections.adapters.export",
-    "projections.adapters.palette",
+    "projections.adapters.scene",
     "rich._emoji_codes",
     "rich.progress",
     "rosbags.rosbag2",

@@ -28,7 +28,7 @@ from projections.fold.exact import Q40
 from projections.fold.place_types import place_type
 from projections.fold.settings import Settings
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.place_regions import place_regions
 from projections.map.records import body_fields
 from projections.map.view import MapView

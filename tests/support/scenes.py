@@ -39,7 +39,7 @@ from projections.localize.relocalize import (
 from projections.localize.relocalize.camera import half_field_rad
 from projections.localize.relocalize.question import Box
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from tests.support.buildings import Keyframe
 

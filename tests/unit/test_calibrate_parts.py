@@ -13,7 +13,7 @@ from projections.fold.deltas import Pose
 from projections.fold.exact import metres_to_um, quantise
 from projections.fold.settings import CameraConstants
 from projections.localize.calibrate import likenesses, qualified_things, readings
-from projections.localize.calibrate.sightings import Row, Sightings, sightings_of
+from projections.localize.calibrate.qualified_things import Row, Sightings, sightings_of
 
 CAMERA = CameraConstants(hfov_deg=90.0, width_px=800.0, height_px=600.0)
 FOCAL = 400.0

@@ -12,8 +12,7 @@ from eventsrc.base.errors import MisuseError
 from projections.adapters.drawing import HousePlan, LostRobot, MergeMark, Spot, draw_map, plan_of
 from projections.adapters.drawing.map_picture import compose, legend_lines
 from projections.adapters.drawing.sheet import Sheet
-from projections.adapters.palette import place_colour
-from projections.adapters.scene import objects_of, objects_shown
+from projections.adapters.scene import objects_of, objects_shown, place_colour
 from projections.fold import deltas as d
 from projections.fold.settings import Settings
 from projections.map.view import MapView

@@ -11,7 +11,7 @@ from eventsrc.envelope.commands import CorrectedPose, CorrectPoses, encode_comma
 from eventsrc.envelope.model import KeyframeId, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 
 
 def _is_young(thing: object) -> bool:

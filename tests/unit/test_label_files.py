@@ -7,7 +7,7 @@ import pytest
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.user_files import read_label_file
-from eventsrc.record.importers.label_files import read_labels
+from eventsrc.record.importers.map_yaml import read_labels
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projections.store.lazy_rows import Chunks, Items, OrdinalsByName
+from projections.store.history_records import Chunks, Items, OrdinalsByName
 
 
 class Making:

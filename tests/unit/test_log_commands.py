@@ -14,7 +14,7 @@ from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
-from projections.map.own_events import read_commands, read_corrections
+from projections.map.parsing import read_commands, read_corrections
 from projections.postgres.live_fold import LiveFold
 from projections.store.history_recorder import map_after
 from tests.support.envelopes import envelope, payload

@@ -8,8 +8,8 @@ from itertools import pairwise
 import pytest
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.adapters.export.geojson import geojson
 from projections.adapters.export.graphs import graphml
+from projections.adapters.export.lists import geojson
 from projections.adapters.scene import places_of
 from projections.fold.settings import Settings
 from projections.map.place_regions import place_regions

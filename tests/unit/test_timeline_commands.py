@@ -24,7 +24,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
 from projections.fold.settings import Settings
 from projections.history import LogTimeline, NoSuchThing
-from projections.history.diff_rendering import difference_text
+from projections.history.diff_rendering import difference_text, whatif_text
 from projections.history.merge_reasons import (
     merge_document,
     object_merge_document,
@@ -38,7 +38,6 @@ from projections.history.rendering import (
 )
 from projections.history.rule_folds import Rules
 from projections.history.whatif import command_trials, what_if
-from projections.history.whatif_rendering import whatif_text
 from projections.map.state_output import state_document, state_text
 from tests.support.envelopes import detection, envelope
 from tests.support.walks import anchor, write_mixed_log

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
-from projections.map.wall_segments import MOST_SEGMENTS, wall_segments
+from projections.map.place_regions import MOST_SEGMENTS, wall_segments
 from tests.support.thorough import stride
 
 

@@ -24,7 +24,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, UNKNOWN, OccupancyMap
-from projections.adapters import palette
+from projections.adapters import scene
 from projections.adapters.scene import Box, HousePlan, drives, place_spots
 from projections.fold.occupancy import pooled
 from projections.map.place_regions import place_regions
@@ -94,16 +94,16 @@ def _within(span: slice, whole: slice) -> slice:
 def draw_floor(sheet: Sheet, plan: HousePlan) -> None:
     """Rooms and the furniture in them."""
     for _, box in plan.rooms:
-        _rectangle(sheet, box, palette.FLOOR, palette.FLOOR, 0)
+        _rectangle(sheet, box, scene.FLOOR, scene.FLOOR, 0)
     for box in plan.furniture:
-        _rectangle(sheet, box, palette.FURNITURE, palette.FURNITURE_EDGE, 1)
+        _rectangle(sheet, box, scene.FURNITURE, scene.FURNITURE_EDGE, 1)
 
 
 def draw_walls(sheet: Sheet, plan: HousePlan) -> None:
     """Walls, on top of the regions, which may reach a little through them."""
     for x0, y0, x1, y1 in plan.walls:
         sheet.axes.plot(
-            (x0, x1), (y0, y1), color=palette.WALL, lw=3.2, solid_capstyle="projecting", zorder=7
+            (x0, x1), (y0, y1), color=scene.WALL, lw=3.2, solid_capstyle="projecting", zorder=7
         )
         if x0 == x1 or y0 == y1:  # labels keep off upright walls; a slanted one's box is too large
             half_x, half_y = abs(x1 - x0) / 2 + 0.03, abs(y1 - y0) / 2 + 0.03
@@ -115,7 +115,7 @@ def draw_regions(sheet: Sheet, view: MapView) -> None:
     regions = place_regions(view)
     for owner, region in regions.items():
         rings = [ring for rings in region.polygons for ring in rings]
-        colour = palette.place_colour(owner)
+        colour = scene.place_colour(owner)
         path = Path.make_compound_path(*(Path(ring, closed=True) for ring in rings))
         sheet.axes.add_patch(PathPatch(path, facecolor=colour, lw=0, alpha=0.28, zorder=2))
         sheet.axes.add_patch(PathPatch(path, facecolor="none", edgecolor=colour, lw=1.1, zorder=3))
@@ -132,7 +132,7 @@ def draw_regions(sheet: Sheet, view: MapView) -> None:
             continue
         field = np.where(patch.field <= nearest[patch.rows, patch.columns], patch.field, FAR_M)
         grid = raster.xs[patch.columns], raster.ys[patch.rows], field
-        colours = [palette.place_colour(place)]
+        colours = [scene.place_colour(place)]
         sheet.axes.contourf(*grid, levels=[-1.0, REACH_M], colors=colours, alpha=0.28, zorder=2)
         sheet.axes.contour(*grid, levels=[REACH_M], colors=colours, linewidths=1.1, zorder=3)
 
@@ -142,12 +142,12 @@ def draw_drives(sheet: Sheet, view: MapView) -> None:
     for _, spots in drives(view):
         if spots:
             xs, ys = zip(*spots, strict=True)
-            sheet.axes.plot(xs, ys, color=palette.FAINT, lw=0.8, alpha=0.8, zorder=4)
-            sheet.axes.plot(xs[0], ys[0], marker="s", markersize=5.5, color=palette.INK, zorder=6)
+            sheet.axes.plot(xs, ys, color=scene.FAINT, lw=0.8, alpha=0.8, zorder=4)
+            sheet.axes.plot(xs[0], ys[0], marker="s", markersize=5.5, color=scene.INK, zorder=6)
     for place, spots in place_spots(view).items():
         if spots:
             xs, ys = zip(*spots, strict=True)
-            sheet.axes.scatter(xs, ys, s=6, color=palette.place_colour(place), zorder=5)
+            sheet.axes.scatter(xs, ys, s=6, color=scene.place_colour(place), zorder=5)
 
 
 def _rectangle(sheet: Sheet, box: Box, fill: str, edge: str, zorder: int) -> None:
@@ -198,7 +198,7 @@ def draw_map_walls(sheet: Sheet, view: MapView) -> None:
     placed = Affine2D().translate(first_column, first_row).scale(given.resolution)
     to_map = placed.rotate(yaw).translate(x, y) + sheet.axes.transData
     limits = sheet.axes.get_xlim(), sheet.axes.get_ylim()
-    for drawn, colour, zorder in ((free & ~walls, palette.FLOOR, 0.5), (walls, palette.WALL, 7)):
+    for drawn, colour, zorder in ((free & ~walls, scene.FLOOR, 0.5), (walls, scene.WALL, 7)):
         image = sheet.axes.imshow(
             _image(drawn, colour),
             extent=(0.0, width, 0.0, height),

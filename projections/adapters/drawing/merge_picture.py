@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from eventsrc.envelope.model import Offset
-from projections.adapters import palette
+from projections.adapters import scene
 from projections.adapters.scene import HousePlan, drives
 from projections.history.known_history import KnownHistory
 from projections.history.merge_reasons import chains_of, merge_reason
@@ -24,7 +24,7 @@ from projections.store.history import History
 from projections.store.history_records import Merge
 
 from .base_layers import draw_drives, draw_map_walls, draw_regions, wall_spots
-from .overlays import draw_place_names
+from .map_picture import draw_place_names
 from .sheet import HALO, Bounds, Sheet, check_suffix, new_sheet
 
 _PANEL_IN = 6.5
@@ -103,13 +103,13 @@ def draw_alignment(
     axes = sheet.axes
     for way in ways:
         axes.plot(*way.T, color=_MOVED, linewidth=0.8, alpha=0.6)
-    axes.plot(*np.array([*here.values()]).T, "o", color=palette.FAINT, markersize=4, zorder=5)
+    axes.plot(*np.array([*here.values()]).T, "o", color=scene.FAINT, markersize=4, zorder=5)
     axes.plot(*into.T, "x", color=_MOVED, markersize=5, zorder=6)
     for one, other, _ in found.pairs:
         ends = np.array([here[one], there[other]])
         axes.plot(*ends.T, color=_PAIR, linewidth=1.6, zorder=7)
-    sheet.header(0, title, 14, palette.INK, "bold")
-    sheet.footer(0, _ALIGNED_LEGEND, palette.SMALL_PRINT)
+    sheet.header(0, title, 14, scene.INK, "bold")
+    sheet.footer(0, _ALIGNED_LEGEND, scene.SMALL_PRINT)
     sheet.save(out)
 
 
@@ -157,11 +157,11 @@ def _draw_chains(panel: Sheet, history: History, merge: Merge) -> None:
         _draw_neighbours(panel, history, merge, end)
     for chain in chains_of(history, merge):
         path = history.neighbours.positions(chain.points)
-        panel.axes.plot(*path.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
-    panel.axes.scatter([x], [y], s=90, marker="*", color=palette.BRIDGE, zorder=15)
+        panel.axes.plot(*path.T, color=scene.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
+    panel.axes.scatter([x], [y], s=90, marker="*", color=scene.BRIDGE, zorder=15)
     panel.axes.annotate(
         keyframe_name(history, merge.bridge), (x, y), textcoords="offset points", xytext=(7, 7),
-        fontsize=8.5, color=palette.BRIDGE, weight="bold", path_effects=HALO, zorder=16,
+        fontsize=8.5, color=scene.BRIDGE, weight="bold", path_effects=HALO, zorder=16,
     )  # fmt: skip
 
 
@@ -169,18 +169,18 @@ def _draw_links(panel: Sheet, history: History, merge: Merge) -> None:
     """The founders of the cells of places by rooms that are the shortest drive apart."""
     for link in merge.links:
         ends = history.neighbours.positions([link.core, link.neighbour])
-        panel.axes.plot(*ends.T, color=palette.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
+        panel.axes.plot(*ends.T, color=scene.ESTIMATE, lw=2.2, marker="o", ms=5, zorder=14)
 
 
 def _draw_neighbours(panel: Sheet, history: History, merge: Merge, end: Offset) -> None:
     """The bridge's ε circle, and the keyframes in it."""
     x, y = map(float, history.neighbours.positions([merge.bridge])[0])
     circle = Circle((x, y), history.settings.eps_m, fill=False, lw=1.2, ls="--", zorder=12)
-    circle.set_edgecolor(palette.BRIDGE)
+    circle.set_edgecolor(scene.BRIDGE)
     panel.axes.add_patch(circle)
     near = history.neighbours.positions(history.neighbours.of(merge.bridge, end))
     panel.axes.scatter(
-        near[:, 0], near[:, 1], s=26, facecolor="none", edgecolor=palette.BRIDGE, lw=0.9, zorder=12
+        near[:, 0], near[:, 1], s=26, facecolor="none", edgecolor=scene.BRIDGE, lw=0.9, zorder=12
     )
 
 

@@ -4,9 +4,7 @@ spark_dsg.
 Each function takes a `MapView` and returns the text of a file; the same view gives the same bytes.
 """
 
-from .geojson import Origin, geojson
-from .graphs import dot, graphml
-from .lists import nav2_waypoints, tables
-from .spark_dsg import spark_dsg
+from .graphs import dot, graphml, spark_dsg
+from .lists import Origin, geojson, nav2_waypoints, tables
 
 __all__ = ["Origin", "dot", "geojson", "graphml", "nav2_waypoints", "spark_dsg", "tables"]

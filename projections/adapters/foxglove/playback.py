@@ -39,10 +39,9 @@ from projections.fold.corrections import Corrections
 from projections.fold.deltas import KeyframeAdded, MapGiven, PlacesMerged
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
-from projections.map.fold import fold_events, new_map
+from projections.map.fold import Moments, RecordedFold, fold_events, new_map
 from projections.map.parsing import READ_AHEAD
 from projections.map.phrases import change_lines
-from projections.map.scenes import Moments, RecordedFold
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.history_recorder import map_at

@@ -51,12 +51,12 @@ from foxglove.messages import (
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, MessageFormat
 from eventsrc.log.channels import schema_of
-from projections.adapters.palette import place_colour
 from projections.adapters.scene import (
     Point,
     ShownPlace,
     Way,
     objects_of,
+    place_colour,
     places_of,
     robot_of,
     thinned,
@@ -64,7 +64,7 @@ from projections.adapters.scene import (
 )
 from projections.fold.deltas import MapGiven, PlaceOrdinal, PlacesMerged
 from projections.fold.deltas import Pose as MapPose
-from projections.map.scenes import format_of
+from projections.map.fold import format_of
 from projections.map.view import MapView
 
 ROBOT_FRAME: Final = "base_link"

@@ -20,11 +20,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from projections.adapters import palette, scene
+from projections.adapters import scene
 from projections.fold.deltas import PlaceOrdinal
+from projections.map.place_regions import wall_segments
 from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
-from projections.map.wall_segments import wall_segments
 
 Path = tuple[str, ...]
 """The path of an entity: its parts, not escaped."""
@@ -86,7 +86,7 @@ def map_parts(view: MapView, *, everything: bool) -> dict[Path, Part]:
         ends = wall_segments(given.map)
         strips = tuple(((x0, y0), (x1, y1)) for x0, y0, x1, y1 in ends)
         if strips:
-            parts[*_root(floor), "walls"] = _lines(strips, palette.WALL, 0.03)
+            parts[*_root(floor), "walls"] = _lines(strips, scene.WALL, 0.03)
     for floor in {k.floor: None for k in view.keyframes}:
         for name, part in _floor(view, floor, places, objects, ways):
             parts[*_root(floor), *name] = part
@@ -148,7 +148,7 @@ def _floor(
         ("ways",),
         Lines(
             tuple((way.ends[0].centroid, way.ends[1].centroid) for way in ways),
-            (palette.INK,) * len(ways),
+            (scene.INK,) * len(ways),
             tuple(min(0.02 * way.transitions, 0.1) for way in ways),
         ),
     )
@@ -158,9 +158,7 @@ def _floor(
         ("keyframes",),
         Dots(
             tuple(_spots(shown)),
-            tuple(
-                palette.FAINT if k.place is None else palette.place_colour(k.place) for k in shown
-            ),
+            tuple(scene.FAINT if k.place is None else scene.place_colour(k.place) for k in shown),
             None,
             0.05,
         ),
@@ -171,7 +169,7 @@ def _floor(
     for run_id, path in runs.items():
         if len(path) > 1:
             strips = (tuple(_spots(scene.thinned(path))),)
-            yield ("path", run_id), _lines(strips, palette.FAINT, 0.015)
+            yield ("path", run_id), _lines(strips, scene.FAINT, 0.015)
 
 
 def _spots(keyframes: Iterable[KeyframeRecord]) -> list[scene.Point]:
@@ -186,7 +184,7 @@ def _object_colour(found: scene.ShownObject) -> str:
     place = found.record.place
     if found.missing:
         return _MISSING
-    return palette.FAINT if place is None else palette.place_colour(place)
+    return scene.FAINT if place is None else scene.place_colour(place)
 
 
 def _graph(

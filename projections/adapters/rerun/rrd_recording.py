@@ -30,8 +30,8 @@ from eventsrc.base.errors import MapfoldError
 from eventsrc.base.text import visible
 from eventsrc.base.user_files import OutputFile, written_whole
 from eventsrc.log import Event
+from projections.map.fold import RecordedFold
 from projections.map.phrases import change_lines
-from projections.map.scenes import RecordedFold
 from projections.map.view import MapView
 
 from .parts import Arrow, Dots, Graph, Lines, Part, Path, map_parts, robot_parts

@@ -2,21 +2,29 @@
 
 Markers are incremental: each has a namespace and an id of its own, and `changed_markers` are those
 that differ from the ones shown before, with a DELETE for each that is gone. Their stamps are 0, so
-RViz shows them in the frame ``map`` at any time.
+RViz shows them in the frame ``map`` at any time. `ShownMap` publishes each when it changed.
 """
 
 import itertools
 import math
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
+from eventsrc.record.ros_node import RosNode, RosPublisher
 from eventsrc.ros.library import MessageTypes
-from projections.adapters.palette import place_colour
-from projections.adapters.scene import ShownObject, ShownPlace, objects_of, places_of, ways_of
-from projections.fold.deltas import PlaceOrdinal
+from projections.adapters.scene import (
+    ShownObject,
+    ShownPlace,
+    objects_of,
+    place_colour,
+    places_of,
+    ways_of,
+)
+from projections.fold.deltas import MapGiven, PlaceOrdinal
 from projections.map.records import body_fields
 from projections.map.view import MapView
 
@@ -270,3 +278,42 @@ def _height(view: MapView, floor: str | None) -> float:
 def _colour(place: PlaceOrdinal) -> _Rgb:
     red, green, blue = (int(place_colour(place)[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return red, green, blue
+
+
+class ShownMap:
+    """Publishes maps on ``~/markers``, ``~/objects`` and, once there are walls, ``~/walls``.
+
+    Subscribers that are there get the markers that changed, late ones all of them. Of several
+    floors the walls of the first are shown.
+    """
+
+    def __init__(self, node: RosNode) -> None:
+        self._node, self._messages = node, MapMessages(node.types)
+        self._markers = node.publisher("~/markers", MARKERS, latched=True)
+        self._objects = node.publisher("~/objects", DETECTIONS, latched=True)
+        self._walls: RosPublisher | None = None
+        self._shown: Mapping[MarkerKey, Any] | None = None
+        self._given: MapGiven | None = None
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics that are published on."""
+        there = (self._markers, self._objects, self._walls)
+        return [each.topic for each in there if each is not None]
+
+    def show(self, view: MapView) -> int:
+        """Publish what differs from the map before; returns how many markers do."""
+        messages, stamp_ns = self._messages, time.time_ns()
+        markers = messages.markers(view)
+        changed = messages.changed(self._shown or {}, markers)
+        if changed or self._shown is None:
+            whole = messages.array(markers.values())
+            self._markers.publish(messages.array(changed), kept=whole)
+        self._objects.publish(messages.objects(view, stamp_ns))
+        self._shown = markers
+        if view.map is not None and view.map != self._given:
+            if self._walls is None:
+                self._walls = self._node.publisher("~/walls", GRID, latched=True)
+            self._walls.publish(messages.grid(view.map.map, stamp_ns))
+            self._given = view.map
+        return len(changed)

@@ -28,7 +28,7 @@ import numpy as np
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.settings import CameraConstants, CameraSettings
 
-from .sightings import Floats, Ints, Row
+from .qualified_things import Floats, Ints, Row
 
 USUAL_DEG, USUAL_SPREAD_DEG = 70.0, 15.0
 """Fields of view of robots' cameras: 50 to 95°, mostly."""

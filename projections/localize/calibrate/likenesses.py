@@ -13,9 +13,8 @@ import numpy as np
 
 from projections.fold.evidence import EvidenceConstants
 
-from .qualified_things import QualifiedThing
+from .qualified_things import Flags, Floats, Ints, QualifiedThing, Sightings
 from .readings import PRIOR_COUNT, Reading, level, robust_spread, rounded, spread, unread
-from .sightings import Flags, Floats, Ints, Sightings
 
 KAPPAS = (2.0, 1.0, 4.0)
 """The values that are tried; of equally good ones the first, which is the prior."""

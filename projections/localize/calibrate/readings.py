@@ -12,8 +12,7 @@ import numpy as np
 
 from projections.fold.evidence import EvidenceConstants
 
-from .qualified_things import QualifiedThing, inflation
-from .sightings import Flags, Floats, Sightings
+from .qualified_things import Flags, Floats, QualifiedThing, Sightings, inflation
 
 PRIOR_COUNT = 100
 """The number of observations that a prior weighs as much as: a reading of n has the weight n/(n +

@@ -26,9 +26,8 @@ from projections.map.view import MapView
 from .field_of_view import FieldOfView, field_of_view, without_estimate
 from .likenesses import different, in_pictures, of_things, same, scale
 from .localiser import NOT_ASKED, OwnScores, read_localiser
-from .qualified_things import qualified
+from .qualified_things import Row, Sightings, qualified, sightings_of
 from .readings import Reading, camera_faults, errors, ranges, sizes, unread
-from .sightings import Row, Sightings, sightings_of
 
 ROUNDS = 2
 

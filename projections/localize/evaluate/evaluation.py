@@ -21,8 +21,8 @@ from projections.fold.corrections import Corrections
 from projections.fold.settings import CameraConstants, Settings
 from projections.localize.relocalize import Method
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
 from projections.map.parsed_log import default_workers
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 
 from .own_questions import ask_own_questions, own_scores

@@ -29,7 +29,7 @@ from projections.fold.sights import camera_of
 from projections.localize import relocalize
 from projections.localize.relocalize import QuestionCrop, QuestionView
 from projections.localize.relocalize.waking_robot import crop_of, moved_between, pose_of
-from projections.map.own_events import read_corrections, vectors_of
+from projections.map.parsing import read_corrections, vectors_of
 
 from .truth import Key, Truth
 

@@ -14,7 +14,7 @@ from eventsrc.log import LogReader
 from projections.edit.correct_poses import Span, by_transform
 from projections.edit.make import Stamp
 from projections.edit.record import Made, record_command, recorded_document
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 

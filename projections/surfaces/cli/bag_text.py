@@ -14,7 +14,7 @@ from eventsrc.adapters.detector.vision import check_installed
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
 from eventsrc.record.importers.bag_streams import BagOptions
-from eventsrc.record.importers.label_files import read_labels
+from eventsrc.record.importers.map_yaml import read_labels
 from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts

@@ -18,7 +18,7 @@ from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.importers.bag_streams import BagOptions, Choice
-from eventsrc.record.importers.label_files import read_labels
+from eventsrc.record.importers.map_yaml import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport

@@ -19,7 +19,7 @@ from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
 from projections.localize.calibrate.report import document, text
 from projections.localize.calibrate.rounds import Calibration, calibrate
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 
 from .edit_command import keep_effect, recorded_text
 from .folded_log import LogSettings

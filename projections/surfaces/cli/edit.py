@@ -14,7 +14,7 @@ from eventsrc.envelope.commands import Command
 from eventsrc.envelope.model import KeyframeId
 from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.log import LogReader
-from eventsrc.record.importers.label_files import read_labels
+from eventsrc.record.importers.map_yaml import read_labels
 from projections.edit import make
 from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
 from projections.edit.current import MapToEdit

@@ -22,7 +22,7 @@ from projections.fold.corrections import NO_CORRECTIONS, Corrections
 from projections.fold.map_errors import SettingsError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings, preset_assignments, read_settings
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 
 from .option import option
 from .terminal import say

@@ -309,7 +309,7 @@ def spaces(log: LogArgument, json_: JsonOption = False) -> None:
 
     `mapfold reembed` adds vectors of another space; --space NAME maps a log in it.
     """
-    from projections.map.own_events import log_spaces
+    from projections.map.parsing import log_spaces
 
     with LogReader(log) as reader, Bar() as bar:
         found = log_spaces(reader, lambda done, all_: bar.show("reading", done, all_))

@@ -24,7 +24,7 @@ from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 from projections.map.state_output import camera_advice
 
 from .folded_log import NamedSettings, complete_preset

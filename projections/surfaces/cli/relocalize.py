@@ -35,7 +35,7 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.track import Track, movement_of
 from projections.map.naming import ShortIds, things_of
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
 

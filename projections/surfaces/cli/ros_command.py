@@ -30,7 +30,7 @@ from .signals import stop_on_signals
 from .terminal import say
 
 if TYPE_CHECKING:
-    from projections.adapters.ros.shown_map import ShownMap
+    from projections.adapters.ros.map_messages import ShownMap
     from projections.surfaces.mcp.cited_maps import LiveMaps, LogMaps
 
 _LOOK_S: Final = 1.0
@@ -75,7 +75,7 @@ def ros(
     under = topic_of(namespace, name, "--name").removesuffix(f"/{name}")
     number, types = domain_of(domain), MessageTypes()
     from projections.adapters.ros.initial_pose import InitialPose
-    from projections.adapters.ros.shown_map import ShownMap
+    from projections.adapters.ros.map_messages import ShownMap
     from projections.surfaces.mcp.cited_maps import LiveMaps, LogMaps
 
     with ExitStack() as stack:

@@ -8,6 +8,7 @@ from eventsrc.base.text import counted, shorten_by
 from eventsrc.log import LogReader
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, compile_corrections
 from projections.fold.settings import Settings
+from projections.history.diff_rendering import whatif_text
 from projections.history.rule_folds import Rules
 from projections.history.whatif import (
     Alternative,
@@ -18,9 +19,8 @@ from projections.history.whatif import (
     setting_trials,
     what_if,
 )
-from projections.history.whatif_rendering import whatif_text
 from projections.localize.evaluate.truth import read_truth
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 
 from . import folded_log
 from .option import option

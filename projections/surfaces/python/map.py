@@ -14,8 +14,7 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
-from eventsrc.record.kept_crops import KeptCrops
-from projections.ask.best_views import best_views
+from projections.ask.best_views import KeptCrops, best_views
 from projections.ask.driven_ground import CLEARANCE_M, GoalPose
 from projections.ask.find import FoundObjects, Wanted, find
 from projections.ask.room_and_path import DrivenPath, Room, goal_of, path, room
@@ -38,7 +37,7 @@ from projections.localize.relocalize.reading import MAX_QUESTION_BYTES
 from projections.map.digest import map_digest
 from projections.map.fold import fold_log
 from projections.map.naming import thing_called, things_of
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView
 from projections.surfaces.text_encoders import words_of

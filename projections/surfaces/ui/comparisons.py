@@ -14,13 +14,12 @@ from eventsrc.log.seek import resolve
 from projections.fold.corrections import compile_corrections
 from projections.history import Expression, ExpressionError
 from projections.history.condition_functions import FUNCTIONS
-from projections.history.diff_rendering import difference_text
+from projections.history.diff_rendering import difference_text, whatif_text
 from projections.history.merge_reasons import merge_document
 from projections.history.rendering import search_text
 from projections.history.rule_folds import Rules
 from projections.history.whatif import alternatives, command_trials, setting_trials, what_if
-from projections.history.whatif_rendering import whatif_text
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 
 from .log_map import LogMap, Opened, PrefixReader
 from .requests import AskedPoint, assignments_of, command_line, lines_of, text_of

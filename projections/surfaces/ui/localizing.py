@@ -32,7 +32,7 @@ from projections.localize.relocalize import (
     rank,
 )
 from projections.localize.relocalize.layout import Hypotheses
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.store.history_recorder import map_after
 
 from .log_map import LogMap, Opened, PrefixReader

@@ -19,9 +19,8 @@ from projections.fold.exact import UM_PER_M, mean_m
 from projections.fold.map_errors import QuestionError
 from projections.history.names import keyframe_name
 from projections.map.digest import map_digest
-from projections.map.place_regions import place_regions
+from projections.map.place_regions import place_regions, wall_segments
 from projections.map.view import MapView
-from projections.map.wall_segments import wall_segments
 from projections.store.columns import NONE, Array
 from projections.store.history import History
 from projections.store.object_states import ObjectStates

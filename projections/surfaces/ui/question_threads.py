@@ -20,7 +20,7 @@ from eventsrc.base.text import visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from projections.fold.corrections import Corrections
 from projections.fold.settings import Settings
-from projections.map.wall_segments import wall_segments
+from projections.map.place_regions import wall_segments
 from projections.surfaces.serve import FairQueue
 from projections.surfaces.serve.answering import TooMuchError
 

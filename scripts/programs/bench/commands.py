@@ -31,7 +31,7 @@ from eventsrc.envelope.commands import (
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import NEVER, LogReader, LogWriter
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 
 SAMPLE = Path("logs/sample")
 RUN, KEYFRAMES = RunId("sim-7-a"), 445

@@ -27,7 +27,7 @@ from eventsrc.record.recorder.edits import send_command
 from eventsrc.record.transport.session import Router, ZenohOptions, open_session
 from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
-from projections.map.own_events import read_commands
+from projections.map.parsing import read_commands
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.status import projection_status

@@ -20,7 +20,7 @@ from projections.history.merge_reasons import (
     refusal_document,
 )
 from projections.map.fold import fold_log
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from tests.support.histories import whole
 
 CHOICES = [

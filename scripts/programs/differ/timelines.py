@@ -15,7 +15,7 @@ from eventsrc.log import LogReader
 from projections.edit.current import MapToEdit
 from projections.history import LogTimeline
 from projections.history.rule_folds import Rules, fold_all
-from projections.map.own_events import read_corrections
+from projections.map.parsing import read_corrections
 from projections.store.history_recorder import map_after
 from projections.surfaces import python as api
 from tests.support.commands import reports_exceptions
