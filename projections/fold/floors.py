@@ -187,7 +187,7 @@ class CurrentMap:
     """The reducer. ``given`` are the maps by the floor that they name.
 
     Walls are computed when the first pose on their floor is folded after the map, because that
-    takes a second or two for a large map: maps replaced before that cost nothing.
+    takes time for a large map: maps replaced before that cost nothing.
     """
 
     def __init__(self, settings: Settings, floors: Floors) -> None:

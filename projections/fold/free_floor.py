@@ -236,5 +236,5 @@ class FreeFloor:
 
 @lru_cache(maxsize=8)
 def free_floor(given: OccupancyMap) -> FreeFloor:
-    """The floor of a map; kept for the maps used last, since it takes a second for a large one."""
+    """The floor of a map; kept for the maps used last, since it takes time for a large one."""
     return FreeFloor(OccupancyGrid(given))
