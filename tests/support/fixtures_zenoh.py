@@ -121,14 +121,14 @@ class Program:
     def _line(self, text: str) -> str | None:
         return next((line for line in self.lines if text in line), None)
 
-    def end(self, number: int) -> int:
+    def end(self, number: int, within_s: float = DEADLINE_S) -> int:
         """Send a signal and return the exit code."""
         self.process.send_signal(number)
-        return self.wait()
+        return self.wait(within_s)
 
-    def wait(self) -> int:
+    def wait(self, within_s: float = DEADLINE_S) -> int:
         """The exit code, once it has ended and all it said is in ``lines``."""
-        code = self.process.wait(DEADLINE_S)
+        code = self.process.wait(within_s)
         self._reader.join(DEADLINE_S)
         return code
 

@@ -3,6 +3,7 @@ after the first."""
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -59,6 +60,14 @@ def unhandled() -> Iterator[None]:
 
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
+
+
+def test_the_handler_starts_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would wait for ever where it interrupted a `join` that holds the lock of all threads."""
+    with stop_on_signals() as stop:
+        monkeypatch.delattr(threading.Thread, "start")
+        _ctrl_c()
+        assert stop.wait(60)
 
 
 @pytest.mark.usefixtures("unhandled")

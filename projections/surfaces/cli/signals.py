@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from queue import SimpleQueue
 from types import FrameType, TracebackType
 from typing import Final, Self
 
@@ -50,10 +51,16 @@ def stop_on_signals() -> Iterator[threading.Event]:
     def set_stop(_number: int, _frame: FrameType | None) -> None:
         for number, handler in usual.items():
             signal.signal(number, handler if number == signal.SIGINT else _ignore)
-        # In another thread: the handler may have interrupted this one inside `stop.wait`, while it
-        # holds the lock that `stop.set` takes.
-        threading.Thread(target=stop.set, name="stop").start()
+        came.put(True)
 
+    def set_when_it_came() -> None:
+        if came.get():
+            stop.set()
+
+    # A handler may interrupt this thread while it holds a lock: that of `stop`, or one that is
+    # taken to start a thread. `SimpleQueue.put` may be called all the same.
+    came = SimpleQueue[bool]()
+    threading.Thread(target=set_when_it_came, name="stop", daemon=True).start()
     for number in usual:
         signal.signal(number, set_stop)
     try:
@@ -61,6 +68,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in usual.items():
             signal.signal(number, handler)
+        came.put(False)
 
 
 @contextlib.contextmanager

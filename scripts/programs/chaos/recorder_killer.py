@@ -50,7 +50,7 @@ from tests.support.logs import name_place
 
 LONGEST_LIFE_S = 0.6
 LONGEST_RECOVERY_S = 0.06
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 COMMANDS_A_SECOND = 8.0
 FAR = Offset(10**9)
 EXPECTED = ("duplicate", "loss")
@@ -307,7 +307,7 @@ class Ordeal:
             acknowledged = self._robot.finish()
             if self._editor is not None:
                 self._editor.finish()
-            code = last.end(signal.SIGINT)
+            code = last.end(signal.SIGINT, PATIENCE_S)
         finally:
             last.close()
         assert acknowledged, f"{self._log}: not everything was acknowledged: {last.lines}"
