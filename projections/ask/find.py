@@ -23,6 +23,7 @@ from projections.fold.exact import UM_PER_M
 from projections.map.naming import MOST_NEAR, Rule, Thing, Things, matches, thing_called, things_of
 from projections.map.phrases import iso_time
 from projections.map.records import KeyframeRecord, ObjectRecord
+from projections.map.state_output import space_advice
 from projections.map.view import MapView
 
 from .driven_ground import DrivenGround
@@ -252,6 +253,9 @@ def _meant(view: MapView, what: str | None, things: Things, words: Words | None)
             objects = [*(of_class if is_class else ()), *looking_like(scored, standing, kept)]
             return _Meant(match if is_class else "look", objects, kept, scored, model)
     if not classes:
+        if not standing and not places:
+            why = space_advice(view)
+            raise MisuseError(f"no {shown!r}: this map has no Objects{f'; {why}' if why else ''}")
         raise _nothing(shown, standing, places, remark)
     return _Meant(match, of_class, classes, remark=remark)
 
@@ -268,8 +272,6 @@ def _nothing(
         lists = visible(advised("find", "--in", what))
         return MisuseError(f"{what!r} is a place: {listed}; `{lists}` lists what is in it")
     classes = sorted({each.class_name for each in standing})
-    if not classes:
-        return MisuseError(f"no {what!r}: this map has no Objects")
     near = near_classes(what, classes)
     listed = f"near it: {', '.join(near)}" if near else f"there are {', '.join(classes[:10])}"
     more = f" and {len(classes) - 10} more" if not near and len(classes) > 10 else ""

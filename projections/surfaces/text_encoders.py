@@ -111,13 +111,14 @@ class _MapWords:
         return f"words are compared with names of classes only: {text}"
 
     def _tower(self) -> "TextTower":
-        file = Path(os.environ.get(ELSEWHERE) or self._file)
-        if not os.path.isfile(file):  # noqa: PTH113 - `is_file` raises for a name that is too long
-            raise MisuseError(
-                f"the text encoder {file.name} is not here; {ELSEWHERE}=MODEL.onnx says where it is"
-            )
-        tower = _opened(file)
         wanted = self._view.settings.text_encoder_sha256
+        file = self._file  # of this machine, unless the log recorded it
+        if wanted is not None:
+            file = Path(os.environ.get(ELSEWHERE) or file)
+        if not os.path.isfile(file):  # noqa: PTH113 - `is_file` raises for a name that is too long
+            elsewhere = f"; {ELSEWHERE}=MODEL.onnx says where it is" if wanted else ""
+            raise MisuseError(f"the text encoder {file.name} is not here{elsewhere}")
+        tower = _opened(file)
         if wanted not in (None, tower.sha256):
             raise MisuseError(
                 f"the text encoder {file.name} or a file beside it is another one than the log's:"

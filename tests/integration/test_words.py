@@ -115,6 +115,16 @@ def test_without_a_text_encoder_the_answer_says_so(mapfold: Commands, model: Pat
     assert {each["class_name"] for each in once["answers"]} == {"refrigerator"}
     assert {each["match"] for each in once["answers"]} == {"look"}
     assert once["answers"][0]["score"] >= once["answers"][-1]["score"] > 1.0
+    elsewhere = Commands.in_folder(mapfold.folder, **{ELSEWHERE: "other.onnx"})
+    assert elsewhere("find", "log", word, "--text-encoder", model, "--json").json == once
+    gone = mapfold("find", "log", word, "--text-encoder", "gone.onnx", code=2).err
+    assert gone.endswith("the text encoder gone.onnx is not here\n")
+
+
+def test_a_space_that_the_log_does_not_have_is_named(mapfold: Commands) -> None:
+    refused = mapfold("find", "log", "chair", "--space", "nope", code=2).err
+    assert "this map has no Objects; no detection has a vector of space nope" in refused
+    assert "`mapfold log spaces log`" in refused
 
 
 @pytest.mark.seconds
