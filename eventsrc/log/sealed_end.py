@@ -180,5 +180,8 @@ def _segments_of(path: Path) -> list[SegmentPath]:
     if not segments:
         if end is not None:
             end.require(path, FIRST_OFFSET)
-        raise NotALog(f"{path} holds no log segment (….mcap); check the path")
+        raise NotALog(
+            f"{path} holds no log segment (….mcap); check the path, or make a log there:"
+            f" `{advised('import', path, 'FILE')}`, or record"
+        )
     return segments

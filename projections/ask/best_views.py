@@ -47,6 +47,17 @@ class KeptCrops:
         found = () if at is None else self._crops(at, Offset(at + 1))
         return next((crop.jpeg for _, crop in found), None)
 
+    @property
+    def are_kept(self) -> bool:
+        """Whether the log keeps any crop."""
+        if not self._offsets:
+            end = self._reader.readable_end
+            found = next(self._crops(self._indexed, end), None)
+            if found is not None:
+                end, self._offsets[found[1].det_id] = Offset(found[0] + 1), found[0]
+            self._indexed = max(self._indexed, end)
+        return bool(self._offsets)
+
     def _index(self) -> dict[str, Offset]:
         """The offset of each crop; of several of one detection the first."""
         end = self._reader.readable_end

@@ -1,6 +1,7 @@
 """What a room is and holds, and the way from one thing to another."""
 
 import math
+from collections import Counter
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -34,9 +35,8 @@ class NextRoom(NamedPlace):
 
 
 @dataclass(frozen=True, slots=True)
-class Room(NamedPlace):
-    """A Place, metres of the map frame. ``objects`` are the confirmed ones, those seen most often
-    first, ``unconfirmed`` the number of others."""
+class VisitedPlace(NamedPlace):
+    """A Place and when robots were there, metres of the map frame."""
 
     type_probability: float | None
     floor: str | None
@@ -46,6 +46,37 @@ class Room(NamedPlace):
     keyframe_count: int
     first_visited: SeenAt
     last_visited: SeenAt
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRoom(VisitedPlace):
+    """A Place with how many confirmed and how many other Objects are in it."""
+
+    objects: int
+    unconfirmed: int
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+def rooms(view: MapView) -> list[ListedRoom]:
+    """The Places of a map, those with most keyframes first."""
+    inside = Counter((each.place, each.confirmed) for each in view.objects.values())
+    listed = [
+        ListedRoom(
+            **_visited(view, place), objects=inside[place, True], unconfirmed=inside[place, False]
+        )
+        for place in view.places
+    ]
+    return sorted(listed, key=lambda each: -each.keyframe_count)
+
+
+@dataclass(frozen=True, slots=True)
+class Room(VisitedPlace):
+    """A Place. ``objects`` are the confirmed ones, those seen most often first, ``unconfirmed`` the
+    number of others."""
+
     neighbours: tuple[NextRoom, ...]
     objects: tuple[FoundObject, ...]
     unconfirmed: int
@@ -64,23 +95,12 @@ def room(view: MapView, name: str) -> Room:
     """The Place that a text names. Raises NoSuchThing and SeveralThings."""
     meant = thing_called(name, things_of(view), ["place"])
     place = view.survivors.find(PlaceOrdinal(meant.ordinal))
-    record, kind = view.all_places[place], view.type_of(place)
-    visits = [view.keyframes[number] for number in record.members]
     beside = {b if a == place else a: n for a, b, n in view.edges() if place in (a, b)}
     inside = [each for each in view.objects.values() if each.place == place]
     inside.sort(key=lambda each: (each.missing_in is not None, -each.obs_count, each.ordinal))
     kept = [each for each in inside if each.confirmed]
-    region = place_regions(view).get(place)
     return Room(
-        **asdict(_named(view, place)),
-        type_probability=None if kind is None else kind.probability,
-        floor=view.floor_of(place),
-        centroid_x=record.centroid_x,
-        centroid_y=record.centroid_y,
-        area_m2=None if region is None else region.area_m2,
-        keyframe_count=record.keyframe_count,
-        first_visited=seen_at(min(visits, key=_moment)),
-        last_visited=seen_at(max(visits, key=_moment)),
+        **_visited(view, place),
         neighbours=tuple(
             NextRoom(**asdict(_named(view, other)), shared_transitions=n)
             for other, n in sorted(beside.items(), key=lambda item: (-item[1], item[0]))
@@ -203,6 +223,25 @@ def _object(view: MapView, object_id: str) -> ObjectRecord:
 def _named(view: MapView, place: PlaceOrdinal) -> NamedPlace:
     kind, record = view.type_of(place), view.all_places[place]
     return NamedPlace(record.place_id, record.name, None if kind is None else kind.type)
+
+
+def _visited(view: MapView, place: PlaceOrdinal) -> dict[str, Any]:
+    """The fields of a `VisitedPlace`."""
+    record, kind = view.all_places[place], view.type_of(place)
+    visits = [view.keyframes[number] for number in record.members]
+    region = view.once(place_regions).get(place)
+    first, last = min(visits, key=_moment), max(visits, key=_moment)
+    return {
+        **asdict(_named(view, place)),
+        "type_probability": None if kind is None else kind.probability,
+        "floor": view.floor_of(place),
+        "centroid_x": record.centroid_x,
+        "centroid_y": record.centroid_y,
+        "area_m2": None if region is None else region.area_m2,
+        "keyframe_count": record.keyframe_count,
+        "first_visited": seen_at(first),
+        "last_visited": seen_at(last),
+    }
 
 
 def _moment(keyframe: KeyframeRecord) -> tuple[float, int]:

@@ -10,11 +10,15 @@ from typing import Any
 
 import pytest
 
+from projections.surfaces.python import Timeline
 from tests.support.commands import Commands
 from tests.support.logs import sample_drive, write_log
 from tests.support.shared_data import ROOT, shared_run
 from tests.support.thorough import rounds
 from tests.support.ui_page import UiServer, read_arrays, replay, showing
+from tests.unit.test_moved_things import ROOM
+from tests.unit.test_moved_things import run as moved_run
+from tests.unit.test_what_changed import LATER
 
 WIDE = ("eps_m=1.0", "min_samples=8")
 SETS = [word for text in WIDE for word in ("--set", text)]
@@ -227,9 +231,39 @@ def test_find_is_that_of_the_command(server: UiServer, mapfold: Commands) -> Non
     assert server.ask("/api/find", what="chair", top=0).status == 400
 
 
+def test_the_overview_has_the_rooms_that_are_asked_for_one_by_one(
+    server: UiServer, sample: Path
+) -> None:
+    overview = server.api("overview", at=300)
+    with Timeline(sample) as timeline:
+        known = timeline.at(300)
+    assert len(overview["rooms"]) == len(known.places) > 0
+    for each in overview["rooms"]:
+        wanted = known.room(each["place_id"]).document()
+        objects = len(wanted.pop("objects"))
+        del wanted["neighbours"]
+        listed = {name: each[name] for name in wanted}
+        assert json.dumps(listed) == json.dumps(wanted)
+        assert each["objects"] == objects
+    assert not overview["crops"]
+
+
+def test_changes_are_those_of_the_command(mapfold: Commands, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log", [*moved_run("a", ROOM), *moved_run("b", LATER)])
+    with showing(mapfold, log, "--set", "fusion=evidence") as server:
+        for query in ({}, {"since": "a", "until": "b"}, {"since": 9, "until": 150}):
+            answer = server.api("changes", **query)
+            printed = json.loads(run(mapfold, answer["command"], "--json"))
+            assert {name: answer[name] for name in printed} == printed
+        told = [(each["kind"], each["class_name"]) for each in server.api("changes")["changes"]]
+        assert told == [("moved", "chair"), ("missing", "plant"), ("new", "bed")]
+        assert "no run 'c'" in server.ask("/api/changes", since="c").error[2]
+
+
 @pytest.mark.parametrize(
     ("path", "status", "kind", "said"),
     [
+        ("changes", 400, "bad_question", "only a map with fusion by evidence"),
         ("digest?at=446", 400, "bad_question", "446"),
         (f"digest?at={NINES}", 400, "bad_question", "9999… is beyond the end"),
         (f"digest?at=sim-7-a:{NINES}", 400, "bad_question", "no such keyframe"),

@@ -61,9 +61,17 @@ def answered(page: Page) -> None:
     page.evaluate(_TWO_FRAMES)
 
 
+def whole(page: Page) -> None:
+    """Waits until the page has what the server knows about the map shown."""
+    page.wait_for_selector(".facts[data-whole=true]", timeout=WAIT_MS)
+
+
 def digest(page: Page) -> str:
-    """The digest shown, when the page has it."""
-    shown = page.locator(".digest code[data-digest]:not([data-digest=''])")
+    """The digest of the map, when the page has it; it is shown on demand."""
+    asked = page.get_by_role("button", name="digest")
+    if asked.get_attribute("aria-expanded") != "true":
+        asked.click()
+    shown = page.locator(".facts code[data-digest]:not([data-digest=''])")
     shown.wait_for()
     return shown.get_attribute("data-digest") or ""
 
@@ -72,9 +80,9 @@ _DRAWN = "document.querySelector(`canvas[data-side=${side}]`).toDataURL()"
 
 
 def pixels(page: Page, side: str = "main") -> str:
-    """What a map's canvas shows, without what lies over it, when drawing has rested. The types of
-    places are drawn when they come with the digest."""
-    digest(page)
+    """What a map's canvas shows, without what lies over it, when drawing has rested: also the types
+    of places, which come from the server."""
+    whole(page)
     answered(page)
     before = ""
     while (now := str(page.evaluate(f"side => {_DRAWN}", side))) != before:

@@ -24,7 +24,7 @@ from tests.support.commands import Commands
 from tests.support.envelopes import payload
 from tests.support.logs import KEY, write_log
 from tests.support.ui_page import UiServer, showing
-from tests.ui.browser import answered, digest, other_pixels, pixels
+from tests.ui.browser import answered, other_pixels, pixels, whole
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
 
@@ -136,6 +136,20 @@ def test_walls_are_the_occupied_cells_at_any_zoom_and_can_be_hidden(
     assert outlines(picture(page)) == []
 
 
+def test_the_map_fills_the_height_at_first_beside_its_counts(
+    building: Building, visit: Visit
+) -> None:
+    page = visit(building[1], "#at=300")
+    corners = np.vstack(outlines(picture(page)))
+    canvas = page.locator("canvas.map").bounding_box()
+    facts = page.locator(".facts").bounding_box()
+    assert canvas is not None
+    assert facts is not None
+    share = np.ptp(corners[:, 1]) / canvas["height"]
+    assert 0.85 <= share <= 0.95  # objects beside the walls are shown, too
+    assert corners[:, 0].min() >= facts["x"] + facts["width"] - canvas["x"]
+
+
 def test_walls_are_those_in_force_on_the_floor_at_the_moment(
     building: Building, visit: Visit
 ) -> None:
@@ -171,7 +185,7 @@ def test_the_region_of_a_place_is_its_free_floor(
     page = visit(server, "#at=300&panel=none")
     for at in (RUN_A + 1, 300):
         go(page, at)
-        digest(page)
+        whole(page)
         state = mapfold("state", log, *ROOMS, "--at", str(at), "--json").json
         rooms = {place["place_id"]: rings_of(place) for place in state["places"]}
         drawn = regions(picture(page))
@@ -287,12 +301,11 @@ def test_the_type_of_each_place_is_that_of_state(
     for at in (445, 150, 60):
         go(page, at)
         for place in places_of(mapfold, SAMPLE, at, *WIDE):
-            name = page.get_by_role("button", name=_short(place), exact=True)
-            row = page.locator("ol.places li").filter(has=name)
+            name = re.compile(rf"\b{_short(place)}\b")
+            row = page.locator("table.rooms tbody tr").filter(has_text=name)
             kind, share = place.get("type"), place.get("type_probability")
             types_seen.add((kind is None, share is None))
-            count = f"{place['keyframe_count']} keyframe"
-            expect(row).to_contain_text(count if kind is None else f"{kind}, {count}")
+            expect(row).to_contain_text(_short(place) if kind is None else kind)
             row.get_by_role("button").click()
             fact = page.locator(".facts-list div").filter(has_text=re.compile("^type"))
             if share is None:
@@ -307,7 +320,7 @@ def test_the_type_of_each_place_is_that_of_state(
         assert moment(page) == at
     assert {(False, False), (True, False)} <= types_seen
     go(page, 445)
-    expect(page.locator("ol.places")).to_contain_text("kitchen")
+    expect(page.locator("table.rooms")).to_contain_text("kitchen")
     assert any(text.endswith("· kitchen") for text in labels(picture(page)))
 
 
@@ -324,7 +337,7 @@ def test_the_state_taken_away_has_types_floors_and_regions(
 ) -> None:
     log, server = building
     page = visit(server, "#at=500")
-    digest(page)
+    whole(page)
     page.get_by_role("button", name="Take away").click()
     with page.expect_download() as waiting:
         page.get_by_role("menuitem", name="State as JSON").click()

@@ -14,7 +14,7 @@ from eventsrc.log import LogReader
 from tests.support.commands import Commands
 from tests.support.logs import append_raw
 from tests.support.ui_page import UiServer, showing
-from tests.ui.browser import digest, point_over
+from tests.ui.browser import point_over, whole
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
 
@@ -54,7 +54,7 @@ def test_a_place_is_renamed_from_the_context_menu_and_the_name_undone(
     page.get_by_role("tab", name="Why").click()
     page.keyboard.press("End")
     page.keyboard.press("Escape")
-    expect(page.locator("ol.places")).to_contain_text("<b>guests</b>")
+    expect(page.locator("table.rooms")).to_contain_text("<b>guests</b>")
     page.get_by_role("tab", name="Correct").click()
     corrections.get_by_role("button", name="Undo").click()
     record(page, "not asked")
@@ -110,10 +110,12 @@ def test_a_growing_log_is_followed_and_a_moment_kept(
     with showing(mapfold, log, *WIDE) as server:
         page = visit(server)
         expect(page.locator(".facts")).to_contain_text("100 keyframes")
-        expect(page.get_by_role("button", name="Live")).to_have_attribute("aria-pressed", "true")
+        live = page.get_by_role("button", name="Live")
+        expect(live).to_have_count(0)  # it is as if imported
         for payload in payloads[100:180]:
             append_raw(log, payload)
         expect(page.locator(".facts")).to_contain_text("180 keyframes")
+        expect(live).to_have_attribute("aria-pressed", "true")
         assert moment(page) == 180
         page.get_by_role("button", name="Live").click()
         for payload in payloads[180:200]:
@@ -152,7 +154,7 @@ def test_the_view_is_taken_away_as_picture_state_and_command(
     assert {p["place_id"]: p["keyframes"] for p in saved["places"]} == places
     assert len(saved["objects"]) == wanted["counts"]["objects"]
     page.get_by_role("button", name="Take away").click()
-    digest(page)  # the command comes with it
+    whole(page)  # the command comes with it
     page.get_by_role("menuitem", name="Copy as command").click()
     clipboard = "navigator.clipboard.readText()"
     page.wait_for_function(f"async () => (await {clipboard}).startsWith('mapfold ')")

@@ -61,7 +61,7 @@ def test_the_map_is_that_of_state_as_known_then_and_as_known_now(
     check(page, mapfold, log, 100, "--known-at", "end")
     go(page, 447)
     check(page, mapfold, log, 447)
-    expect(page.locator("ol.places")).to_contain_text("den")
+    expect(page.locator("table.rooms")).to_contain_text("den")
 
 
 def test_the_link_says_what_is_known_and_why_answers_so(

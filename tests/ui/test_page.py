@@ -80,8 +80,9 @@ def hostile(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 def test_hostile_names_are_text_everywhere(hostile: UiServer, visit: Visit, pictures: Path) -> None:
     page = visit(hostile, "#panel=why")
-    expect(page.locator("ol.places > li")).to_have_count(len(HOSTILE))
-    expect(page.locator("ol.places")).to_contain_text(HOSTILE[1][:39])
+    expect(page.locator("table.rooms tbody tr")).to_have_count(len(HOSTILE))
+    expect(page.locator("table.rooms")).to_contain_text(HOSTILE[1][:29])
+    expect(page.locator("table.objects tbody tr")).to_have_count(len(HOSTILE))
     page.screenshot(path=pictures / "hostile.png")
     page.get_by_label("Search places").fill("script")
     expect(page.get_by_role("option").first).to_contain_text("<script>")
@@ -137,6 +138,7 @@ def test_a_log_without_events_says_so(mapfold: Commands, visit: Visit, tmp_path:
     with showing(mapfold, log) as server:
         page = visit(server, wait=False)
         expect(page.locator(".no-map")).to_contain_text("no events yet")
+        expect(page.locator(".no-map")).to_contain_text(f"mapfold import {log} FILE")
         for panel in ("Compare", "Find", "Lost", "Correct", "Why"):
             page.get_by_role("tab", name=panel).click()
         page.keyboard.press("ArrowRight")
@@ -207,6 +209,7 @@ def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, scheme: str) 
     page = visit(sample, "#at=349", color_scheme=scheme)
     states = {
         "overview": lambda: None,
+        "merges": lambda: page.get_by_text("of places").click(),
         "merge": lambda: page.get_by_role("button", name="p0 ← p7").click(),
         "compare": lambda: page.get_by_role("tab", name="Compare").click(),
         "settings": lambda: page.get_by_text("Two settings").click(),
@@ -242,7 +245,7 @@ def test_everything_is_reached_with_the_keyboard(sample: UiServer, visit: Visit)
                 " || document.activeElement.innerText || document.activeElement.id"
             )
         )
-    wanted = {"Live", "Take away", "Help", "Zoom in", "Why", "Play", "Next merge", "Moment"}
+    wanted = {"digest", "Take away", "Help", "Zoom in", "Why", "Play", "Next merge", "Moment"}
     assert wanted <= reached
     page.keyboard.press("?")
     expect(page.get_by_role("dialog")).to_be_visible()

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.support.ui_page import UiServer
-from tests.ui.browser import digest
+from tests.ui.browser import whole
 from tests.ui.conftest import Visit
 
 STATES = {
@@ -35,7 +35,7 @@ def test_pictures(sample: UiServer, visit: Visit, pictures: Path, size: str, sch
         page.goto("about:blank")
         page.goto(origin + address)
         page.wait_for_selector("html[data-painted]")
-        digest(page)
+        whole(page)
         _settled(page, state)
         page.screenshot(path=pictures / f"{state}-{size}-{scheme}.png")
         assert page.evaluate("() => document.documentElement.scrollWidth") <= width

@@ -51,6 +51,7 @@ def test_why_draws_the_bridge_of_a_merge_before_and_after(
 ) -> None:
     page = visit(sample, "#at=349&panel=why")
     plain = pixels(page)
+    page.get_by_text("of places").click()
     page.get_by_role("button", name="p0 ← p7").click()
     expect(page.locator(".summary")).to_have_text("p0 absorbed p7")
     minis = page.locator(".mini canvas")
@@ -63,6 +64,19 @@ def test_why_draws_the_bridge_of_a_merge_before_and_after(
     other_pixels(page, plain)
     said = mapfold("merges", SAMPLE, *WIDE, "--show", "2").out
     assert words(page.locator(".lines").inner_text()) == words(said)
+
+
+def test_find_says_what_it_needs_and_runs_an_example_by_a_click(
+    sample: UiServer, visit: Visit
+) -> None:
+    page = visit(sample, "#at=0&panel=find")
+    page.get_by_role("button", name="Find", exact=True).click()
+    expect(page.locator("#panel .error")).to_contain_text("click an example")
+    expect(page.locator("#condition")).to_be_focused()
+    page.get_by_role("button", name="object_count() >= 10").click()
+    expect(page.locator(".summary")).to_contain_text("Became true by event")
+    expect(page.locator("#condition")).to_have_value("object_count() >= 10")
+    assert moment(page) > 0
 
 
 def test_comparing_two_moments_says_and_draws_what_changed(

@@ -29,6 +29,7 @@ from projections.surfaces.serve.http import add_openapi, only, read_body
 from .comparisons import (
     WHATIF_OPTIONS,
     bisect_answer,
+    changes_answer,
     conditions_answer,
     diff_answer,
     merges_answer,
@@ -40,7 +41,7 @@ from .editor import Editor, corrections_answer, read_edit
 from .live_watch import MOST_STREAMS, LiveWatch
 from .localizing import MOST_BYTES, question_answer
 from .log_map import LogMap
-from .map_answers import digest_answer, history_answer, walls_answer
+from .map_answers import digest_answer, history_answer, overview_answer, walls_answer
 from .question_threads import GoOn, UiService
 from .requests import assignments_of, encoded, refusal
 from .search import find_answer, keyframe_answer, search_answer
@@ -155,12 +156,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             content = await _answer(service, request, work)
             return Response(content, media_type="application/json")
 
-    answers(
-        "digest",
-        "The digest of the map at W, and types and regions of places",
-        digest_answer,
-        *_AT_W,
-    )
+    answers("overview", "The rooms of the map at W, and what is odd", overview_answer, *_AT_W)
+    answers("digest", "The digest of the map at W", digest_answer, *_AT_W)
     answers("walls", "The walls of an occupancy map of the log", walls_answer, "number")
     answers(
         "why",
@@ -180,6 +177,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         "known_at",
         *_SETTINGS,
     )
+    moments = ("since", "until", "known_at")
+    answers("changes", "What changed in the building for sure", changes_answer, *moments)
     answers(
         "bisect",
         "The event that made a condition true",
@@ -201,7 +200,7 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W
     )
 
-    answers("pictures", "Crops of an object or a keyframe", pictures_answer, "what", *_AT_W)
+    answers("pictures", "Crops of an object or a keyframe", pictures_answer, "what", "top", *_AT_W)
 
     async def apart(
         request: Request, work: Callable[[Offset, GoOn], bytes], *, folds: bool = True

@@ -1,5 +1,5 @@
-"""Answers that compare: two moments, the map under other settings or without a command and the
-log's own, and the event that made a condition true.
+"""Answers that compare: two moments, and what changed between them in the building; the map under
+other settings or without a command and the log's own; and the event that made a condition true.
 """
 
 from collections.abc import Callable
@@ -44,6 +44,25 @@ def diff_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         "known_at": known_at,
         "lines": lines_of(difference_text(found, most=MOST_LINES), found.short_ids),
         "command": command_line(shown.opened, "diff", *words, *settings),
+    }
+
+
+def changes_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """What ``mapfold changes --json`` answers: what changed for sure ``since`` (a W, a day or a run
+    from its start; default: the start of the last run) ``until`` W, a day or the end of a run."""
+    timeline = shown.timeline
+    end = timeline.moment(text_of(query, "until", "end"), is_end=True)
+    since = query.get("since")
+    start = None if since is None else timeline.moment(since, is_end=False)
+    known_at = shown.point(text_of(query, "known_at", str(end)))
+    found = timeline.changes(start, end, known_at=known_at)
+    words = ["--since", str(found.since), "--until", str(end)]
+    if known_at != end:
+        words += ["--known-at", str(known_at)]
+    return {
+        **found.document(),
+        "known_at": known_at,
+        "command": command_line(shown.opened, "changes", *words, *shown.opened.words()),
     }
 
 

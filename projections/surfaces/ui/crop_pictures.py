@@ -20,7 +20,7 @@ from projections.map.records import ObservationRecord
 from projections.map.view import MapView
 
 from .log_map import LogMap
-from .requests import AskedPoint, text_of
+from .requests import AskedPoint, number_of, text_of
 
 MOST_PICTURES: Final = 24
 MOST_BYTES: Final = 4_000_000
@@ -45,7 +45,8 @@ def pictures_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         seen = [view.observations[number] for number in of_it][:MOST_PICTURES]
     else:
         raise QuestionError(f"what is {what[:80]!r}; write object:ID or keyframe:RUN/ID")
-    return {**asked.document(), "pictures": _pictures(shown, view, seen)}
+    most = min(number_of(query, "top", MOST_PICTURES), MOST_PICTURES)
+    return {**asked.document(), "pictures": _pictures(shown, view, seen, most)}
 
 
 def _by_run(view: MapView, seen: list[ObservationRecord]) -> list[ObservationRecord]:
@@ -57,10 +58,12 @@ def _by_run(view: MapView, seen: list[ObservationRecord]) -> list[ObservationRec
 
 
 def _pictures(
-    shown: LogMap, view: MapView, seen: Iterable[ObservationRecord]
+    shown: LogMap, view: MapView, seen: Iterable[ObservationRecord], most: int
 ) -> list[dict[str, Any]]:
     found, size = list[dict[str, Any]](), 0
     for each in seen:
+        if len(found) == most:
+            break
         keyframe = view.keyframes[each.keyframe]
         jpeg = shown.crops.jpeg(each.det_id, keyframe.offset)
         if jpeg is None or size + len(jpeg) > MOST_BYTES:
@@ -80,6 +83,4 @@ def _pictures(
                 "jpeg": b64encode(jpeg).decode("ascii"),
             }
         )
-        if len(found) == MOST_PICTURES:
-            break
     return found

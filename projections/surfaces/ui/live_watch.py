@@ -5,12 +5,14 @@ databases' tails is queried only if a database is named.
 """
 
 import asyncio
+import contextlib
 import json
 import threading
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Final, Self
 
 from eventsrc.base.errors import MapfoldError
+from eventsrc.log.format import list_growing
 
 from .question_threads import UiService
 
@@ -34,7 +36,7 @@ class LiveWatch:
         self._sinks: list[dict[str, Any]] | None = None
         self._fault: str | None = None
         self._closing = threading.Event()
-        self._streams = 0
+        self._streams, self._growing = 0, False
         self._threads = [threading.Thread(target=self._look, name="look")]
         if tails is not None:
             self._threads.append(threading.Thread(target=self._ask_tails, name="tails"))
@@ -64,6 +66,7 @@ class LiveWatch:
         heard = ("through", "state", "events", "problems", "losses", "rejected", "loading")
         found = {name: log[name] for name in heard}
         found["lag"] = max(log["events"], log["loading"]["events"]) - log["through"]
+        found["growing"] = self._growing
         if self._tails is not None:
             found["sinks"], found["database_problem"] = self._sinks, self._fault
         return found
@@ -89,6 +92,9 @@ class LiveWatch:
 
     def _look(self) -> None:
         while not self._closing.wait(LOOK_S):
+            with contextlib.suppress(OSError):  # a log that is gone is among the problems
+                last = list_growing(self._service.opened.log)[-1:]
+                self._growing = any(not segment.sealed for segment in last)
             looked = self._service.refresh()
             while not self._closing.is_set():
                 try:

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, MapfoldError
-from eventsrc.base.text import counted
+from eventsrc.base.text import command_line, counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import Event, LogReader, Unreadable
 from eventsrc.log.format import list_growing
@@ -28,7 +26,6 @@ from projections.fold.settings import Settings
 from projections.history import LogTimeline, Progress
 from projections.history.timeline import SettingsChoice
 from projections.localize.evaluate.truth import Truth
-from projections.map.state_output import camera_advice
 
 from .log_events import MOST_REPORTS, LogEvents
 
@@ -204,7 +201,11 @@ class LogMap:
                 f" not the {left_out:,} after them"
             )
         if self.through == 0 and not found:
-            return ["the log has no events yet; this page shows them as they are recorded"]
+            record, read = (
+                f"`{command_line(name, self.opened.log)}" for name in ("record", "import")
+            )
+            how = f"{record}` records a robot, {read} FILE` reads a file"
+            return [f"the log has no events yet; this page shows them as they are recorded: {how}"]
         history = self.timeline.history
         if self.through and not history.keyframes:
             found.append(
@@ -215,18 +216,7 @@ class LogMap:
                 f"none of the {counted(len(history.keyframes), 'keyframe')} has a pose, so there"
                 " are no places and there is nothing to draw"
             )
-        if unstated := self._without_camera():
-            where = f"for {counted(unstated, 'keyframe')}"
-            found.append(camera_advice(where, self.timeline.settings, self.opened.log))
         return found
-
-    def _without_camera(self) -> int:
-        """The number of keyframes whose camera nothing states, if positions depend on it."""
-        if not self.timeline.settings.wants_camera:
-            return 0
-        tables = self.timeline.history.tables
-        seen = np.unique(tables.column("observation", "keyframe"))
-        return int(np.count_nonzero(tables.column("keyframe", "camera")[seen] == 0))
 
     @property
     def key(self) -> str:

@@ -1,4 +1,4 @@
-"""Answers about the map at a moment: its history as arrays, its digest, its walls.
+"""Answers about the map at a moment: its history as arrays, its rooms, its digest, its walls.
 
 From the arrays the page computes the map at any offset. They are made of the columns of a
 `History`; nothing is folded here. Ordinals of keyframes, places and objects are those of the fold:
@@ -14,12 +14,16 @@ from typing import Any, Final
 import numpy as np
 from starlette.datastructures import QueryParams
 
+from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import Offset
+from projections.ask.room_and_path import rooms
 from projections.fold.exact import UM_PER_M, mean_m
 from projections.fold.map_errors import QuestionError
+from projections.fold.settings import Settings
 from projections.history.names import keyframe_name
 from projections.map.digest import map_digest
 from projections.map.place_regions import place_regions, wall_segments
+from projections.map.state_output import LEAST_POSES, state_camera
 from projections.map.view import MapView
 from projections.store.columns import NONE, Array
 from projections.store.history import History
@@ -28,7 +32,7 @@ from projections.store.tables import Tables
 
 from .log_events import LogEvents, event_columns
 from .log_map import LogMap
-from .requests import AskedPoint, number_of, packed_arrays, text_of
+from .requests import AskedPoint, command_line, number_of, packed_arrays, text_of
 
 _UM2_PER_M2: Final = float(UM_PER_M) ** 2
 _INT32_MAX: Final = 2**31 - 1
@@ -62,36 +66,79 @@ def history_answer(shown: LogMap, query: QueryParams, refold_s: float) -> bytes:
 
 
 def digest_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
-    """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``, and
-    the type and the region of each place that has one."""
+    """The digest at W under the commands known at W or at ``known_at``, as in ``state --at W``."""
     asked = AskedPoint.of(shown, query)
-    view = asked.known.at(asked.end)
     return {
         **asked.document(),
-        "digest": map_digest(view),
-        "types": _types(view),
-        "regions": [
-            {"place_id": view.place_id(place), **region.document()}
-            for place, region in place_regions(view).items()
-        ],
+        "digest": map_digest(asked.known.at(asked.end)),
         "command": asked.command("state", "--digest"),
     }
 
 
-def _types(view: MapView) -> list[dict[str, Any]]:
-    """For each place with evidence of its type: the type (None where unsure), its probability, and
-    the likeliest types."""
-    found = ((place.place_id, view.type_of(place.ordinal)) for place in view.places.values())
-    return [
-        {
-            "place_id": place_id,
-            "type": each.type,
-            "probability": each.probability,
-            "candidates": each.candidates,
-        }
-        for place_id, each in found
-        if each is not None
-    ]
+def overview_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The rooms of the map at W as `projections.ask` lists them, each with the likeliest types and,
+    where walls are known, its region; and what is ``odd`` about the map, as sentences with the
+    command that helps."""
+    asked = AskedPoint.of(shown, query)
+    view = asked.known.at(asked.end)
+    ordinals = {record.place_id: place for place, record in view.places.items()}
+    regions = view.once(place_regions)
+    listed = list[dict[str, Any]]()
+    for each in rooms(view):
+        place = ordinals[each.place_id]
+        kind, region = view.type_of(place), regions.get(place)
+        listed.append(
+            {
+                **each.document(),
+                "candidates": [] if kind is None else kind.candidates,
+                "region": None if region is None else region.document()["region"],
+            }
+        )
+    command = asked.command("state")
+    return {
+        **asked.document(),
+        "rooms": listed,
+        "odd": _odd(shown, view),
+        "crops": shown.crops.are_kept,
+        "command": command,
+    }
+
+
+def _odd(shown: LogMap, view: MapView) -> list[dict[str, str]]:
+    """What stands out, ``says``, and the ``command`` that helps."""
+    settings, found = view.settings, list[dict[str, str]]()
+
+    def help_by(says: str, command: str) -> None:
+        found.append({"says": says, "command": command})
+
+    counts = view.counts()
+    if unstated := counts.get("without_camera", 0):
+        camera = settings.camera.constants
+        help_by(
+            f"No camera is stated for {counted(unstated, 'keyframe')}: boxes are read as if of"
+            f" {camera.hfov_deg:g}° and {camera.width_px:g} × {camera.height_px:g} pixels.",
+            visible(state_camera(shown.opened.log)),
+        )
+    if counts["poses"] >= LEAST_POSES and counts["places"] == 1:
+        is_full = settings.places == "rooms"
+        change = f"rooms.drive_m={settings.rooms.drive_m / 2:g}" if is_full else "preset=full"
+        help_by(
+            "All is one place. If that is more than one room, other settings tell them apart.",
+            command_line(shown.opened, "whatif", "--set", change),
+        )
+    if settings.places == "rooms" and counts["poses"] and not view.maps:
+        help_by(
+            "No walls are known: places have neither outlines nor areas.",
+            command_line(shown.opened, "import", "--map", "map.yaml"),
+        )
+    names = settings.changed_from(Settings())
+    is_calibrated = any(name.startswith(("evidence.", "localizer.")) for name in names)
+    if settings.fusion == "evidence" and counts["objects"] and not is_calibrated:
+        help_by(
+            "Nothing is calibrated: constants of other robots decide what is one object.",
+            command_line(shown.opened, "calibrate", "--write"),
+        )
+    return found
 
 
 def walls_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:

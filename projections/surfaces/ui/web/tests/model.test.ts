@@ -115,7 +115,7 @@ describe("names", () => {
   });
   it("searches places, also by their type of room, and keyframes", () => {
     const map = mapAt(history, history.through);
-    const types = new Map([[history.placeIds[map.places[1]], { place_id: "", type: "kitchen", probability: 0.9, candidates: [] }]]);
+    const types = new Map([[history.placeIds[map.places[1]], { type: "kitchen" }]]);
     const found = (typed: string) => searchLocally(history, map, types, typed).map(({ thing }) => thing);
     expect(found("p0")[0]).toEqual({ kind: "place", id: "r_p0" });
     expect(found("Kitchen")).toEqual([{ kind: "place", id: history.placeIds[map.places[1]] }]);

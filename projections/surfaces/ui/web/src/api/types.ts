@@ -43,14 +43,6 @@ export interface Answer {
   command?: string;
 }
 
-/** What kind of room a place is; `type` is null where the probability is below a half. */
-export interface PlaceType {
-  place_id: string;
-  type: string | null;
-  probability: number;
-  candidates: [string, number][];
-}
-
 /** An Object that `mapfold find --json` answers with; docs/find.md has all of it. */
 export interface FoundObject {
   object_id: string;
@@ -86,13 +78,53 @@ export type Geometry =
   | { type: "Polygon"; coordinates: number[][][] }
   | { type: "MultiPolygon"; coordinates: number[][][][] };
 
-/** What the server knows about the map at W: its digest, and of places their types and, where walls are known, their free floor. */
+/** A place as `ask` lists it. `type` is null where its probability, that of the first candidate, is below a half; `region` is the free floor where walls are known. */
+export interface Room {
+  place_id: string;
+  name: string | null;
+  type: string | null;
+  type_probability: number | null;
+  candidates: [string, number][];
+  floor: string | null;
+  area_m2: number | null;
+  region: Geometry | null;
+  objects: number;
+  unconfirmed: number;
+  last_visited: { iso: string };
+}
+
+/** What the server knows about the map at W: its rooms, and what is odd about it. */
 export interface MapFacts {
   at: number;
   known_at: number;
-  digest: string;
-  types: PlaceType[];
-  regions: { place_id: string; region: Geometry; area_m2: number }[];
+  rooms: Room[];
+  odd: { says: string; command: string }[];
+  /** Whether the log keeps pictures. */
+  crops: boolean;
+}
+
+/** What became of an Object between two moments, for sure. */
+export interface MapChange {
+  kind: "moved" | "missing" | "new" | "back";
+  object_id: string;
+  class_name: string;
+  place_id: string | null;
+  place_name: string | null;
+  place_type: string | null;
+  from: [number, number] | null;
+  to: [number, number] | null;
+  moved_m: number | null;
+  seen: { iso: string; offset: number };
+  sentence: string;
+}
+
+export interface MapChanges {
+  since: number;
+  until: number;
+  counts: Record<MapChange["kind"], number>;
+  unsure: number;
+  changes: MapChange[];
+  command: string;
 }
 
 /** The crop of a detection, a JPEG in base64; `picture` is the size of the whole picture, where that is known. */

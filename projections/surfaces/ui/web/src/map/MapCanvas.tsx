@@ -27,12 +27,18 @@ export const painted = new Set<() => void>();
 let moved = false;
 
 /** The view that shows the whole map. */
+/** What the counts at the top left cover: a column, on a phone a row. */
+const FACTS_WIDE_PX = 212;
+const FACTS_HIGH_PX = 44;
+const NARROW_PX = 520;
+
 export function fitView() {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
-  const bounds = store.bounds.value;
+  const bounds = store.drawnBounds.value;
   if (canvas === null || bounds === null || canvas.clientWidth === 0) return;
   moved = false;
-  store.view.value = fitted(bounds, canvas.clientWidth, canvas.clientHeight);
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  store.view.value = width <= NARROW_PX ? fitted(bounds, width, height, 0, FACTS_HIGH_PX) : fitted(bounds, width, height, FACTS_WIDE_PX);
 }
 
 /** Zooms about the middle, or moves by pixels. */
@@ -119,7 +125,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
   });
   observer.observe(canvas);
   const stopFitting = effect(() => {
-    if (side === "main" && store.bounds.value !== null && !moved) queueMicrotask(fitView);
+    if (side === "main" && store.drawnBounds.value !== null && !moved) queueMicrotask(fitView);
   });
   const stop = effect(() => {
     for (const each of inputs(side)) void each.value;

@@ -1,6 +1,6 @@
 /** All that a picture of a map is made of. */
 
-import type { PlaceType } from "../api/types";
+import type { Room } from "../api/types";
 import type { History } from "../history/types";
 import type { MapDifference } from "../model/compare";
 import type { MapState } from "../model/map_at";
@@ -39,7 +39,7 @@ export interface Scene {
   layers: Record<LayerName, boolean>;
   walls: readonly Segment[];
   /** By id of a place; empty until the server has sent them for this W. */
-  types: ReadonlyMap<string, PlaceType>;
+  types: ReadonlyMap<string, Pick<Room, "type">>;
   selection: Thing | null;
   hovered: Thing | null;
   /** Objects that the search found. */

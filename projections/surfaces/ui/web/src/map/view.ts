@@ -17,15 +17,18 @@ export const screenY = (view: View, y: number) => view.y - y * view.k;
 export const mapX = (view: View, x: number) => (x - view.x) / view.k;
 export const mapY = (view: View, y: number) => (view.y - y) / view.k;
 
-/** The view in which the bounds fill a canvas, leaving margins in pixels. */
-export function fitted(bounds: Bounds, width: number, height: number, margin = 40, top = 26): View {
-  const w = Math.max(bounds.x1 - bounds.x0, 0.5) + 1.2;
-  const h = Math.max(bounds.y1 - bounds.y0, 0.5) + 1.2;
-  const k = Math.max(1e-3, Math.min((width - 2 * margin) / w, (height - top - 2 * margin) / h));
+/** The share of a canvas that a map fills in the direction in which it is larger. */
+const FILLED = 0.95;
+
+/** The view in which the bounds fill a canvas below `top` pixels, beside what covers `left` of it where there is room. */
+export function fitted(bounds: Bounds, width: number, height: number, left = 0, top = 0): View {
+  const [w, h] = [Math.max(bounds.x1 - bounds.x0, 1.5), Math.max(bounds.y1 - bounds.y0, 1.5)];
+  const k = Math.max(1e-3, FILLED * Math.min(width / w, (height - top) / h));
+  const from = left + k * w <= FILLED * width ? left : 0;
   return {
     k,
-    x: width / 2 - (k * (bounds.x0 + bounds.x1)) / 2,
-    y: (height + top) / 2 + (k * (bounds.y0 + bounds.y1)) / 2,
+    x: (from + width) / 2 - (k * (bounds.x0 + bounds.x1)) / 2,
+    y: (top + height) / 2 + (k * (bounds.y0 + bounds.y1)) / 2,
   };
 }
 

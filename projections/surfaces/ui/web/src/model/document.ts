@@ -1,6 +1,6 @@
 /** The map at W as JSON. */
 
-import type { MapFacts, PlaceType } from "../api/types";
+import type { MapFacts, Room } from "../api/types";
 import { floorOfPlace } from "./floors";
 import type { History } from "../history/types";
 import { placeNow } from "./compare";
@@ -9,8 +9,7 @@ import { keyframeId } from "./names";
 
 /** `facts` are those of the same W, null while the server has not sent them. */
 export function stateDocument(history: History, map: MapState, facts: MapFacts | null) {
-  const types = new Map(facts?.types.map((each) => [each.place_id, each]));
-  const regions = new Map(facts?.regions.map(({ place_id, ...region }) => [place_id, region]));
+  const rooms = new Map(facts?.rooms.map((each) => [each.place_id, each]));
   const place = (number: number) => (number < 0 ? null : history.placeIds[number]);
   const [ox, oy] = history.origin;
   const { keyframes, changes, floors } = history;
@@ -23,8 +22,7 @@ export function stateDocument(history: History, map: MapState, facts: MapFacts |
       name: map.name[each],
       keyframes: map.size[each],
       ...(floors.length > 0 && { floor: floors[floorOfPlace(history, each)] ?? null }),
-      ...typeOf(types.get(history.placeIds[each])),
-      ...regions.get(history.placeIds[each]),
+      ...knownOf(rooms.get(history.placeIds[each])),
       centroid_x: map.x[each] + ox,
       centroid_y: map.y[each] + oy,
     })),
@@ -51,6 +49,8 @@ export function stateDocument(history: History, map: MapState, facts: MapFacts |
   };
 }
 
-function typeOf(found: PlaceType | undefined) {
-  return found === undefined ? {} : { type: found.type, type_probability: found.probability };
+function knownOf(room: Room | undefined) {
+  if (room === undefined) return {};
+  const { type, type_probability, region, area_m2 } = room;
+  return { ...(type_probability !== null && { type, type_probability }), ...(region !== null && { region, area_m2 }) };
 }

@@ -1,7 +1,7 @@
 /** Finds things by what a person types: places and keyframes in the history that the page has; the
  * answers of the server about Objects and what is not in the map now. */
 
-import type { FoundObject, NamedThing, PlaceType } from "../api/types";
+import type { FoundObject, NamedThing, Room } from "../api/types";
 import type { History } from "../history/types";
 import type { Thing } from "../state/store";
 import type { MapState } from "./map_at";
@@ -17,13 +17,13 @@ export interface Hit {
 
 const MOST_PLACES = 12;
 
-export function searchLocally(history: History, map: MapState, types: ReadonlyMap<string, PlaceType>, typed: string): Hit[] {
+export function searchLocally(history: History, map: MapState, types: ReadonlyMap<string, Pick<Room, "type">>, typed: string): Hit[] {
   const wanted = typed.trim().toLowerCase();
   if (wanted === "") return [];
   return [...places(history, map, types, wanted), ...keyframes(history, map, typed.trim())];
 }
 
-function places(history: History, map: MapState, types: ReadonlyMap<string, PlaceType>, wanted: string): Hit[] {
+function places(history: History, map: MapState, types: ReadonlyMap<string, Pick<Room, "type">>, wanted: string): Hit[] {
   const hits: { hit: Hit; rank: number }[] = [];
   history.placeIds.forEach((id, place) => {
     const names = [map.name[place], map.standsAs[place] === place ? types.get(id)?.type : null].filter((each) => typeof each === "string");

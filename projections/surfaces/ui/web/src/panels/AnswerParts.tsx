@@ -1,9 +1,10 @@
 /** Parts that several panels are made of: states of an answer, steps, links to things. */
 
 import type { ComponentChildren } from "preact";
-import type { Ref, Step } from "../api/types";
+import type { MapChange, Ref, Step } from "../api/types";
+import type { History } from "../history/types";
 import { bringIntoView } from "../map/MapCanvas";
-import { isolated, label } from "../model/names";
+import { findPlace, isolated, label, shortPlace } from "../model/names";
 import { positionOf, select, showEvent } from "../state/actions";
 import type { Asked } from "../state/answers";
 import { showNotice } from "../state/pointer";
@@ -71,6 +72,45 @@ export function Steps({ steps }: { steps: readonly Step[] }) {
       ))}
     </ol>
   );
+}
+
+const CHANGES = {
+  moved: ["→", "moved"],
+  missing: ["×", "missing"],
+  new: ["+", "new"],
+  back: ["↺", "back"],
+} as const;
+
+/** What became of an object, in a line; `changes` has the whole sentence. */
+export function ChangeLine({ change, history }: { change: MapChange; history: History }) {
+  const [sign, says] = CHANGES[change.kind];
+  const place = change.place_id === null ? -1 : findPlace(history, change.place_id);
+  const where = change.place_name ?? change.place_type ?? (place < 0 ? "in no place" : shortPlace(history, place));
+  return (
+    <li title={label(change.sentence, 300)}>
+      <span class={`sign-${change.kind}`} aria-hidden="true">{sign}</span>
+      <p>
+        <ThingLink thing={{ kind: "object", id: change.object_id }}>{label(change.class_name, 28)}</ThingLink> {says}
+        {change.moved_m !== null && ` ${change.moved_m.toFixed(1)} m`}, <span class="dim"><bdi>{label(where, 28)}</bdi>, {shortTime(change.seen.iso, history)}</span>
+      </p>
+    </li>
+  );
+}
+
+const sameDay = new WeakMap<History, boolean>();
+
+/** `13:05` where all of the log is of one day, else `24 Mar 13:05`. */
+export function shortTime(iso: string, history: History): string {
+  let one = sameDay.get(history);
+  if (one === undefined) {
+    const { stamp } = history.keyframes;
+    one = stamp.every((each) => Math.floor(each / 86_400) === Math.floor(stamp[0] / 86_400));
+    sameDay.set(history, one);
+  }
+  const clock = iso.slice(11, 16);
+  if (one) return clock;
+  const date = new Date(iso);
+  return `${date.getUTCDate()} ${date.toLocaleString("en", { month: "short", timeZone: "UTC" })} ${clock}`;
 }
 
 /** A sentence in which the things it names can be clicked. */

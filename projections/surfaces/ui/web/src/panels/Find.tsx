@@ -52,7 +52,12 @@ export function Find() {
   }, [answer.value]);
   const ask = async () => {
     const history = store.history.value;
-    if (history === null || text.value.trim() === "") return;
+    if (history === null) return;
+    if (text.value.trim() === "") {
+      problem.value = { message: "Write a condition, or click an example below.", column: null };
+      document.getElementById("condition")?.focus();
+      return;
+    }
     setBusy(true);
     try {
       const found = await getJson<Search>(address("/api/bisect", { condition: text.value, scan: every.value ? "1" : null, to: history.through, known_at: history.knownAt }), leaving.signal);
@@ -88,7 +93,7 @@ export function Find() {
           </label>
         </div>
       </form>
-      {answer.value === null ? <Examples functions={functions} /> : <Found found={answer.value} />}
+      {answer.value === null ? <Examples functions={functions} run={(example) => { text.value = example; void ask(); }} /> : <Found found={answer.value} />}
     </section>
   );
 }
@@ -234,7 +239,7 @@ function readings({ before, after }: Turn): string {
     .join(", ");
 }
 
-function Examples({ functions }: { functions: readonly ConditionFunction[] }) {
+function Examples({ functions, run }: { functions: readonly ConditionFunction[]; run: (example: string) => void }) {
   const history = store.history.value;
   if (history === null) return null;
   const place = history.placeIds[0];
@@ -250,7 +255,7 @@ function Examples({ functions }: { functions: readonly ConditionFunction[] }) {
       <ul class="examples">
         {examples.map((each) => (
           <li key={each}>
-            <button type="button" class="link" onClick={() => (text.value = each)}>
+            <button type="button" class="link" title="Find the event that made it true" onClick={() => run(each)}>
               <code>{each}</code>
             </button>
           </li>

@@ -19,6 +19,8 @@ interface LiveNews {
   through: number;
   state: string;
   events: number;
+  /** Whether the last segment is open for more. */
+  growing: boolean;
   lag: number;
   losses?: number | { count: number } | null;
   rejected?: number | null;
@@ -28,6 +30,8 @@ interface LiveNews {
 }
 
 const news = signal<LiveNews | null>(null);
+/** Whether events came while the page was open. */
+const grew = signal(false);
 const AGAIN_MS = 1500;
 
 export function keepLive() {
@@ -70,6 +74,7 @@ function hear(heard: LiveNews) {
   const before = store.history.value;
   const problems = JSON.stringify(heard.problems ?? []);
   const known = JSON.stringify(store.log.value?.problems ?? []);
+  grew.value ||= news.value !== null && heard.through > news.value.through;
   news.value = heard;
   if (before === null || heard.through !== before.through || heard.state !== before.state || problems !== known) void grow();
 }
@@ -92,10 +97,12 @@ export function LiveState() {
           {parts.join(", ")}
         </span>
       )}
-      <button type="button" class={on ? "button live-on" : "button quiet"} aria-pressed={on} title={on ? "The page follows the log; a click keeps this moment (L)" : "Follow the end of the log (L)"} onClick={() => goLive(!on)}>
-        <i class="lamp" aria-hidden="true" />
-        Live
-      </button>
+      {((heard?.growing ?? false) || grew.value) && (
+        <button type="button" class={on ? "button live-on" : "button quiet"} aria-pressed={on} title={on ? "The page follows the log; a click keeps this moment (L)" : "Follow the end of the log (L)"} onClick={() => goLive(!on)}>
+          <i class="lamp" aria-hidden="true" />
+          Live
+        </button>
+      )}
     </div>
   );
 }

@@ -2,7 +2,7 @@
 
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
-import type { PlaceType, Step } from "../api/types";
+import type { Room, Step } from "../api/types";
 import type { History } from "../history/types";
 import type { MapState } from "../model/map_at";
 import { floorName, floorOfObject, floorOfPlace, floorsOf } from "../model/floors";
@@ -141,7 +141,7 @@ function placeFacts(thing: store.Thing, history: History, map: MapState): Fact[]
   const inside = map.objects.filter((object) => placeNow(history, map, map.objectRow[object]) === place);
   const next = map.edges.filter(({ a, b }) => a === place || b === place);
   return [
-    ["type", typeText(store.types.value.get(thing.id))],
+    ["type", typeText(store.rooms.value.get(thing.id))],
     ...floorFact(history, floorOfPlace(history, place)),
     ["keyframes", map.size[place].toLocaleString("en")],
     ["centre", `(${map.x[place].toFixed(2)}, ${map.y[place].toFixed(2)}) m`],
@@ -151,10 +151,11 @@ function placeFacts(thing: store.Thing, history: History, map: MapState): Fact[]
 }
 
 /** What kind of room it is; the likeliest ones where that is unsure. */
-function typeText(found: PlaceType | undefined): string {
-  if (found === undefined) return store.mapFactsNow.value === null ? "…" : "unknown";
+function typeText(found: Room | undefined): string {
+  if (found === undefined) return "…";
+  if (found.type_probability === null) return "unknown";
   const percent = (share: number) => `${Math.round(share * 100)} %`;
-  if (found.type !== null) return `${found.type} ${percent(found.probability)}`;
+  if (found.type !== null) return `${found.type} ${percent(found.type_probability)}`;
   return `unsure: ${found.candidates.map(([type, share]) => `${type} ${percent(share)}`).join(", ")}`;
 }
 

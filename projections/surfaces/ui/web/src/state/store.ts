@@ -1,7 +1,7 @@
 /** What the page shows, as signals. Panels and the canvas read them; actions.ts changes them. */
 
 import { computed, signal } from "@preact/signals";
-import type { LogInfo, MapFacts, PlaceType } from "../api/types";
+import type { LogInfo, MapFacts, Room } from "../api/types";
 import type { History } from "../history/types";
 import { type Shown, firstFloor, floorsOf, onFloor } from "../model/floors";
 import { findPlace } from "../model/names";
@@ -58,7 +58,7 @@ export const mapFactsNow = computed(() => {
   const fits = mapFacts.value?.at === at.value && mapFacts.value.known_at === now && wantedKnownAt.value === shownKnownAt.value;
   return fits ? mapFacts.value : null;
 });
-export const types = computed<ReadonlyMap<string, PlaceType>>(() => new Map(mapFactsNow.value?.types.map((each) => [each.place_id, each])));
+export const rooms = computed<ReadonlyMap<string, Room>>(() => new Map(mapFactsNow.value?.rooms.map((each) => [each.place_id, each])));
 /** The command line that gives the map last asked about, and its W. */
 export const stateCommand = signal<{ at: number; command: string } | null>(null);
 /** W when dragging and playing have rested: what the server is asked about. */
@@ -145,14 +145,35 @@ export const bounds = computed<Bounds | null>(() => {
   }
   return found;
 });
+/** How far beyond drives and walls objects are shown at first, metres: farther ones are errors. */
+const BESIDE_M = 3;
+/** Those of all that the map shows at its end, also objects. */
+export const drawnBounds = computed<Bounds | null>(() => {
+  const [all, of] = [bounds.value, history.value];
+  if (all === null || of === null) return null;
+  const found = { ...all };
+  const { object, confirmed, x, y } = of.changes;
+  const seen = new Uint8Array(of.objectIds.length);
+  for (let row = object.length - 1; row >= 0; row--) {
+    if (seen[object[row]] === 1) continue;
+    seen[object[row]] = 1;
+    if (confirmed[row] === 0) continue;
+    found.x0 = Math.min(found.x0, Math.max(x[row], all.x0 - BESIDE_M));
+    found.x1 = Math.max(found.x1, Math.min(x[row], all.x1 + BESIDE_M));
+    found.y0 = Math.min(found.y0, Math.max(y[row], all.y0 - BESIDE_M));
+    found.y1 = Math.max(found.y1, Math.min(y[row], all.y1 + BESIDE_M));
+  }
+  return found;
+});
 const grid = computed<Grid | null>(() => (bounds.value === null ? null : gridOf(bounds.value)));
 
 const NO_FLOORS: ReadonlyMap<number, Float32Array[]> = new Map();
 /** The free floor of places as the server last sent it, and the places that stood then. */
 const sentFloors = computed(() => {
   const [facts, of] = [mapFacts.value, history.value];
-  if (facts === null || of === null || facts.regions.length === 0) return null;
-  const floors = new Map(facts.regions.map(({ place_id, region }) => [findPlace(of, place_id), ringsOf(region, of.origin)]));
+  if (facts === null || of === null) return null;
+  const floors = new Map(facts.rooms.flatMap(({ place_id, region }) => (region === null ? [] : [[findPlace(of, place_id), ringsOf(region, of.origin)]])));
+  if (floors.size === 0) return null;
   return { floors, places: mapAt(of, Math.min(facts.at, of.through)).places.join() };
 });
 /** While W moves, the last ones stay as long as the same places stand. */

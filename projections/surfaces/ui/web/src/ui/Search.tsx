@@ -52,7 +52,7 @@ export function Search() {
       open.value = true;
       active.value = 0;
       remark.value = value.trim() === "" ? null : "…";
-      hits.value = history === null || map === null ? [] : searchLocally(history, map, store.types.value, value);
+      hits.value = history === null || map === null ? [] : searchLocally(history, map, store.rooms.value, value);
     });
     if (value.trim() !== "") timer.current = window.setTimeout(() => void askServer(value), ASK_AFTER_MS);
   };
@@ -154,7 +154,7 @@ async function askServer(value: string) {
     getJson<{ found: NamedThing[] }>(address("/api/search", { q: value, ...moment }), left),
   ]);
   if (left.aborted) return;
-  const local = searchLocally(history, map, store.types.value, value);
+  const local = searchLocally(history, map, store.rooms.value, value);
   const answers = objects.status === "fulfilled" ? objects.value.answers.map((each) => foundHit(history, each)) : [];
   const unfound = named.status === "rejected" ? [] : named.value.found.filter(({ kind, stands }) => kind !== "object" || !stands || answers.length === 0);
   const others = unfound.map((each) => namedHit(history, map, each));
