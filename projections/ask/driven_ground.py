@@ -6,20 +6,25 @@ other with no wall in between. So a way goes where robots went, and a robot can 
 
 The *goal* of an Object is a pose that faces it, `clearance_m` or more from all walls where those
 are known. A pose from which the Object was seen where it stands now comes first, then another
-driven one, then free floor of an occupancy map, both with a free line of sight; within each the one
-whose distance is nearest to that from which the Object is seen usually, a metre counting as much as
-`_A_METRE` radians off the middle of the picture; of equal ones the earliest. Of the poses that saw
-it those of an earlier run than the last, those where another Object stands and those with a wall in
-the line of sight, for estimates err, count as `_WORSE` radians more for each of these.
+driven one, then free floor of an occupancy map, both with a free line of sight.
+
+Of the poses that saw it the best one has most others that saw it around it, for one detection may
+be of a thing beside it, and is some `_BEST_M` away. It counts against a pose how few those are (up
+to 1, `_flaws`), each metre that it is nearer or farther (`_A_METRE`) or off the ground of the last
+run (`_OFF_LAST`), that a later run saw the Object too (`_EARLIER`), that another Object stands
+there and that a wall is in the line of sight, for estimates err (`_BLOCKED` each). Of the others
+the best one is as far away as the Object is seen from usually. Of equal ones the earliest.
 """
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
@@ -31,21 +36,28 @@ from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 CLEARANCE_M: Final = 0.3
+Floats = NDArray[np.float64]
 Spot = tuple[float, float]
 """Metres in the map frame."""
 
 _CELL_M: Final = 0.25
 _BESIDE_M: Final = 0.75
 STEP_M: Final = 5.0
-_BEST_M: Final = 1.2
-_A_METRE: Final = 0.3
-_WORSE: Final = 1.0
+_BEST_M: Final = 2.5
+_A_METRE: Final = 0.2
+_EARLIER: Final = 0.3
+_OFF_LAST: Final = 0.5
+_BLOCKED: Final = 1.0
+_AROUND_M: Final = 0.7
+_MANY: Final = 2.0
 _STANDS_M: Final = 0.4
 """So near to its estimate an Object stands in the way of a robot."""
 _LEAST_M, _MOST_M = 0.5, 4.0
 _RINGS: Final = (1.2, 1.0, 1.4, 0.8, 1.6, 2.0, 0.6, 2.5)
 _TURNS: Final = 16
 _Floor = str | None
+_Candidate = tuple[Spot, _Floor, KeyframeRecord | None, float]
+"""A spot on a floor, the keyframe that was there, and by how much it is worse than the best."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +129,9 @@ class DrivenGround:
                 for floor in floors:
                     self._standing.setdefault((floor, *_stand(each.spot)), []).append(each)
         last: dict[int, tuple[int, int]] = {}
-        posed = [k for k in view.keyframes if k.pose is not None]
-        for keyframe in sorted(posed, key=lambda k: (k.run, k.keyframe_id)):
+        self._floors = {floor: number for number, floor in enumerate(every_floor)}
+        self._posed = [k for k in view.keyframes if k.pose is not None]
+        for keyframe in sorted(self._posed, key=lambda k: (k.run, k.keyframe_id)):
             node = self._node(keyframe)
             before = last.get(keyframe.run)
             if before is not None and before[0] != node:
@@ -187,21 +200,20 @@ class DrivenGround:
         """The goal of an Object, which some keyframes saw. Raises MisuseError for none."""
         since = found.relocations[-1].offset if found.relocations else 0
         seen = [k for k in seen_by if k.pose is not None and k.offset >= since]
-        last = max((k.run for k in seen), default=None)
         distances = sorted(math.dist(_spot(keyframe), found.spot) for keyframe in seen)
-        usual = distances[len(distances) // 2] if distances else _BEST_M
+        usual = distances[len(distances) // 2] if distances else _RINGS[0]
         for ground, candidates in (
-            ("seen", self._seen(seen)),
+            ("seen", self._seen(found, seen)),
             ("driven", self._driven()),
             ("free", self._around(found)),
         ):
             best: tuple[float, int] | None = None
             goal: GoalPose | None = None
-            for number, (spot, floor, keyframe) in enumerate(candidates):
+            for number, (spot, floor, keyframe, worse) in enumerate(candidates):
                 distance = math.dist(spot, found.spot)
                 is_seen = ground == "seen"
-                worse = self._worse(found, keyframe, last) if is_seen and keyframe else 0.0
-                rank = round(worse + abs(distance - usual) * _A_METRE, 2), number
+                off = abs(distance - (_BEST_M if is_seen else usual))
+                rank = round(worse + off * _A_METRE, 3), number
                 if distance < _LEAST_M or (best is not None and rank >= best):
                     continue
                 if not self._is_clear(floor, spot, clearance_m):
@@ -224,15 +236,38 @@ class DrivenGround:
             f" {clearance_m:g} m from walls; give a smaller --clearance"
         )
 
-    def _worse(self, found: ObjectRecord, keyframe: KeyframeRecord, last: int | None) -> float:
-        """Radians by which a pose that saw an Object is worse than the best one."""
-        spot = _spot(keyframe)
-        flaws = (
-            keyframe.run != last,
-            self._is_taken(keyframe.floor, spot, found),
-            not self.is_free(keyframe.floor, spot, found.spot),
-        )
-        return _off_centre(keyframe, found.spot) + _WORSE * sum(flaws)
+    def _seen(self, found: ObjectRecord, seen: Sequence[KeyframeRecord]) -> Iterator[_Candidate]:
+        """Poses that saw an Object where it stands now."""
+        last = max((keyframe.run for keyframe in seen), default=None)
+        flaws = self._flaws(seen)
+        for keyframe in sorted(seen, key=lambda k: k.ordinal):
+            spot = _spot(keyframe)
+            blocked = int(self._is_taken(keyframe.floor, spot, found))
+            blocked += not self.is_free(keyframe.floor, spot, found.spot)
+            worse = flaws[self._of[self._square(keyframe)]] + _BLOCKED * blocked
+            yield spot, keyframe.floor, keyframe, worse + _EARLIER * (keyframe.run != last)
+
+    def _flaws(self, seen: Sequence[KeyframeRecord]) -> dict[int, float]:
+        """By node of poses that saw an Object: how few of them are around it, and how far the last
+        run was."""
+        saw = self._places(seen)
+        flaws = dict[int, float]()
+        for node in {self._of[self._square(keyframe)] for keyframe in seen}:
+            place = *self.spots[node], self._floors[self.nodes[node].floor]
+            around = np.exp(_apart(saw, place) ** 2 / (-2 * _AROUND_M**2)).sum()
+            off = _apart(self._last, place).min(initial=1.0)
+            flaws[node] = math.exp(-float(around) / _MANY) + _OFF_LAST * float(off)
+        return flaws
+
+    @cached_property
+    def _last(self) -> Floats:
+        """Where the last run was."""
+        last = max(keyframe.run for keyframe in self._posed)
+        return self._places([keyframe for keyframe in self._posed if keyframe.run == last])
+
+    def _places(self, keyframes: Iterable[KeyframeRecord]) -> Floats:
+        """x, y and the number of the floor of each keyframe."""
+        return np.array([(*_spot(each), self._floors[each.floor]) for each in keyframes])
 
     def _is_taken(self, floor: _Floor, spot: Spot, found: ObjectRecord) -> bool:
         """Whether another Object than ``found`` stands at a spot of a floor."""
@@ -249,18 +284,11 @@ class DrivenGround:
         grid = self._grids.get(floor)
         return grid is None or grid.is_free_line(_um(a), _um(b))
 
-    def _seen(
-        self, seen: Iterable[KeyframeRecord]
-    ) -> Iterator[tuple[Spot, _Floor, KeyframeRecord]]:
-        """Poses that saw an Object where it stands now."""
-        for keyframe in sorted(seen, key=lambda k: k.ordinal):
-            yield _spot(keyframe), keyframe.floor, keyframe
-
-    def _driven(self) -> Iterator[tuple[Spot, _Floor, KeyframeRecord]]:
+    def _driven(self) -> Iterator[_Candidate]:
         for spot, keyframe in zip(self.spots, self.nodes, strict=True):
-            yield spot, keyframe.floor, keyframe
+            yield spot, keyframe.floor, keyframe, 0.0
 
-    def _around(self, found: ObjectRecord) -> Iterator[tuple[Spot, _Floor, None]]:
+    def _around(self, found: ObjectRecord) -> Iterator[_Candidate]:
         """Free floor around an Object."""
         for floor, grid in self._grids.items():
             for radius in _RINGS:
@@ -272,7 +300,7 @@ class DrivenGround:
                     rows, columns = grid.walls.shape
                     inside = 0 <= row < rows and 0 <= column < columns
                     if inside and grid.source.cells[row, column] < MIN_WALL:
-                        yield spot, floor, None
+                        yield spot, floor, None, 0.0
 
     def _is_clear(self, floor: _Floor, spot: Spot, clearance_m: float) -> bool:
         """Whether all known walls are so far from a spot."""
@@ -341,12 +369,11 @@ def _stand(spot: Spot) -> tuple[int, int]:
     return math.floor(spot[0] / _STANDS_M), math.floor(spot[1] / _STANDS_M)
 
 
-def _off_centre(keyframe: KeyframeRecord, spot: Spot) -> float:
-    """Radians between where a keyframe looked and a spot."""
-    if keyframe.pose is None:
-        return 0.0
-    off = keyframe.pose.yaw_rad - _bearing(_spot(keyframe), spot)
-    return abs(math.remainder(off, 2 * math.pi))
+def _apart(places: Floats, place: tuple[float, float, int]) -> Floats:
+    """The distances of places from one, infinite from one on another floor."""
+    x, y, floor = place
+    apart: Floats = np.hypot(places[:, 0] - x, places[:, 1] - y)
+    return np.where(places[:, 2] == floor, apart, math.inf)
 
 
 def _bearing(spot: Spot, to: Spot) -> float:

@@ -103,7 +103,7 @@ class Building:
             if not each.confirmed or each.missing_in is not None or number is None:
                 continue
             try:
-                goal = ground.goal(each)
+                goal = ground.goal(each, view.sightings(each))
             except MisuseError:
                 continue
             goals += 1

@@ -1,0 +1,63 @@
+"""Which of the poses that saw a thing is its goal."""
+
+import math
+
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
+from projections.ask.driven_ground import DrivenGround, GoalPose
+from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, Pose, RunOrdinal
+from projections.fold.settings import Settings
+from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
+from projections.map.view import MapView
+
+OFTEN = [(3.0 + 0.1 * step, 0.0) for step in range(4)]
+"""Spots beside each other, with the thing at the origin."""
+
+
+def goal_of(*runs: list[tuple[float, float]], other: tuple[float, float] | None = None) -> GoalPose:
+    """The goal of a thing at the origin that was seen from the spots of some runs; another thing
+    may stand somewhere."""
+    view = MapView(Settings(), keep_embeddings=False)
+    for run, spots in enumerate(runs):
+        for x, y in spots:
+            number = len(view.keyframes)
+            pose = Pose(round(x * 1e6), round(y * 1e6), math.atan2(-y, -x))
+            view.keyframes.append(
+                KeyframeRecord(
+                    *(
+                        KeyframeOrdinal(number),
+                        Offset(number),
+                        RunOrdinal(run),
+                        RunId(f"run-{run}"),
+                    ),
+                    *(KeyframeId(number), float(number), pose, view.survivors),
+                )
+            )
+    thing = ObjectRecord(ObjectOrdinal(0), "o0", "oven", confirmed=True)
+    thing.estimate = EstimatedPosition(0, 0, 1, 0, 1, 2)
+    view.objects[thing.ordinal] = thing
+    if other is not None:
+        x_um, y_um = (round(each * 1e6) for each in other)
+        stands = ObjectRecord(ObjectOrdinal(1), "o1", "chair", confirmed=True)
+        stands.estimate = EstimatedPosition(x_um, y_um, 1, 0, 1, 2)
+        view.objects[stands.ordinal] = stands
+    return DrivenGround(view).goal(thing, view.keyframes)
+
+
+def test_a_goal_is_where_the_thing_was_seen_most() -> None:
+    once = (0.0, 3.1)
+    goal = goal_of([once, *OFTEN])
+    assert goal.y == 0.0
+    assert goal_of([once]).y == 3.1
+    assert goal.distance_m < 3.2  # the nearest of these to 2.5 m
+
+
+def test_a_goal_is_on_the_ground_of_the_last_run() -> None:
+    before, now = [(-x, y) for x, y in OFTEN], OFTEN
+    assert goal_of(before, now).x > 0.0
+    assert goal_of(now, before).x < 0.0
+
+
+def test_a_goal_is_not_where_another_thing_stands() -> None:
+    beside = [(-x - 0.3, y) for x, y in OFTEN]
+    assert goal_of([*OFTEN, *beside]).x > 0.0
+    assert goal_of([*OFTEN, *beside], other=(3.1, 0.0)).x < 0.0
