@@ -26,6 +26,8 @@ MAX_MAP_BYTES = 32 * 1024 * 1024
 """Bound of an event's JSON; noise of ``MAX_MAP_CELLS`` cells takes 22 MB."""
 UNKNOWN = 255
 OCCUPIED = 100
+SCANS = "scans"
+"""The source of maps that the fold makes of the robots' own range scans."""
 MIN_WALL = 65
 """Percent from which a cell counts as occupied, the default of map servers."""
 

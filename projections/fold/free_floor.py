@@ -3,7 +3,8 @@
 Floor is counted in the blocks of cells on which `OccupancyGrid` computes its regions. A block is
 floor if it has a free cell and no wall. A way goes from block to block, a step across a side has
 length 3, one across a corner 4 (Borgefors 1986): so it is at most 8 % longer or shorter than the
-straight line where that is free. It never goes through walls.
+straight line where that is free. It never goes through walls, nor, on a map made of scans, over
+unknown ground: there that is all around, without a wall between.
 
 Regions of the map are parted by narrow places. Of two ways the one through fewer narrow places is
 the nearer, whatever their lengths: a robot that was on both sides of a door owns the floor up to
@@ -25,7 +26,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope.occupancy_map import MIN_WALL, OccupancyMap
+from eventsrc.envelope.occupancy_map import MIN_WALL, SCANS, OccupancyMap
 
 from .exact import metres_to_um
 from .occupancy import NOWHERE, OccupancyGrid, Point, pooled
@@ -55,6 +56,8 @@ class FreeFloor:
         self.shape: tuple[int, int] = (labels.shape[0], labels.shape[1])
         known = pooled(grid.source.cells < MIN_WALL, grid.block)
         self.is_floor = np.pad(known, 1).ravel() & (labels.ravel() != NOWHERE)
+        if grid.source.source == SCANS and grid.source.map_id is None:
+            labels[~self.is_floor.reshape(self.shape)] = NOWHERE
         self._labels = labels.ravel()
         self._label_of: list[int] = self._labels.tolist()
         self._floor_bytes = self.is_floor.tobytes()
@@ -78,7 +81,7 @@ class FreeFloor:
         return _SIDE * um // self.side_um
 
     def label(self, block: Block) -> int:
-        """The region of a block, `NOWHERE` for a wall."""
+        """The region of a block, `NOWHERE` for a wall and for what no way goes over."""
         return self._label_of[block]
 
     def stand(self, at: Point, seen_from: Point) -> Block | None:
@@ -118,22 +121,23 @@ class FreeFloor:
     def nearest(self, start: Block, sources: Mapping[Block, int]) -> tuple[int, int] | None:
         """The nearest source in the region of a block, and the length of the way there; ``sources``
         are numbers by block."""
-        label, ways, known = self._label_of[start], [(0, start)], set[Block]()
+        labels, label = self._label_of, self._label_of[start]
+        ways, lengths = [(0, start)], {start: 0}
         found, limit = None, _FAR
         while ways:
             length, block = heapq.heappop(ways)
             if length > limit:
                 break
-            if block in known:
+            if length > lengths[block]:
                 continue
-            known.add(block)
             source = sources.get(block)
             if source is not None:
                 found, limit = source if found is None else min(found, source), length
             for step, more in self._steps:
-                to = block + step
-                if self._label_of[to] == label and to not in known:
-                    heapq.heappush(ways, (length + more, to))
+                to, further = block + step, length + more
+                if labels[to] == label and further < lengths.get(to, limit + 1):
+                    lengths[to] = further
+                    heapq.heappush(ways, (further, to))
         return None if found is None else (found, limit)
 
     def by_straight_way(

@@ -77,7 +77,8 @@ def clearance(walls: Walls, cap: int) -> NDArray[np.int32]:
 
 
 def regions(walls: Walls, cell_m: float) -> Labels:
-    """The region of each cell, numbered from 0 by their widest cell; `NOWHERE` for walls."""
+    """The region of each cell, numbered from 0 in the order of their first cells; `NOWHERE` for
+    walls."""
     cap = max(2, math.ceil(CAP_M / cell_m))
     wide = np.zeros((walls.shape[0] + 2, walls.shape[1] + 2), np.int32)  # a border of wall
     wide[1:-1, 1:-1] = clearance(walls, cap)

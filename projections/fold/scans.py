@@ -1,17 +1,20 @@
 """Walls from the robots' own range scans, where no map of the floor is given.
 
 1.  A floor's grid has cells of `CELL_UM` with odds from -`MOST` to `MOST`; 0 is unknown. A beam
-    adds `HIT` to the cell that it ends in, and `PASSED` to each that it crosses before, once a
-    scan; it is followed for `REACH_M`. A beam without an end crosses cells only.
+    adds `HIT` to the cell that it ends in, and `PASSED` to each before whose middle is nearer to
+    it than to its neighbours, but at most `WIDEST` off; it is followed for `REACH_M`. A beam
+    without an end crosses cells only.
 2.  A cell is wall from `WALL` on, free below 0.
 3.  A map is made of the grid when a quarter more cells are known than at the last one, and when
     twice as many scans were cast: so all maps cost a few times what the last one does.
 
-The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, positions on a beam multiples
-of 2⁻¹⁶ cells: integers from there on. A scan that would make a side of the grid longer than
+The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, ends of beams multiples of
+2⁻¹⁶ cells, and for the cells crossed the sensor is at one of `_PARTS`² points of its cell: integers
+from there on. A scan that would make a side of the grid longer than
 `MOST_CELLS` is left out, so that no map has more cells than one may have.
 """
 
+import math
 from functools import lru_cache
 from typing import Final, TypeAlias
 
@@ -19,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import NO_RETURN_MM, UNKNOWN_MM, StatedScan
-from eventsrc.envelope.occupancy_map import OCCUPIED, UNKNOWN, OccupancyMap
+from eventsrc.envelope.occupancy_map import OCCUPIED, SCANS, UNKNOWN, OccupancyMap
 
 from . import State, part, prefixed
 from .deltas import Pose
@@ -41,6 +44,10 @@ _STEPS: Final = REACH_M * UM_PER_M // CELL_UM
 _HALF: Final = _STEPS + 2
 """Cells from the sensor's to the border of the window that a scan changes."""
 _GROWN_BY: Final = 64
+_PARTS: Final = 4
+_SECTORS: Final = 1 << 11
+WIDEST: Final = 4
+"""Sectors: at `REACH_M` one cell."""
 
 Odds: TypeAlias = NDArray[np.int8]
 
@@ -51,6 +58,22 @@ def _directions() -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     parts = [cos_sin(number * (_TURN / _DIRECTIONS)) for number in range(_DIRECTIONS)]
     scaled = np.rint(np.array(parts) * (1 << _BITS)).astype(np.int32)
     return scaled[:, 0].copy(), scaled[:, 1].copy()
+
+
+@lru_cache(maxsize=_PARTS * _PARTS)
+def _around(x: int, y: int) -> tuple[NDArray[np.intp], NDArray[np.int16]]:
+    """Sector and distance (mm) of the middles of a window's cells from a sensor in its middle
+    cell, in one of the parts of that."""
+    side = np.arange(-_HALF, _HALF + 1) * 2 * _PARTS + _PARTS
+    dx, dy = side - (2 * x + 1), (side - (2 * y + 1))[:, None]
+    each = _DIRECTIONS // _SECTORS
+    cosines, sines = (part[::each].astype(np.int64) for part in _directions())
+    roughly = np.rint(np.arctan2(dy, dx) * (_SECTORS / _TURN)).astype(np.int64)
+    near = (roughly + np.array([-1, 0, 1])[:, None, None]) & (_SECTORS - 1)
+    off = np.abs(dx * sines[near] - dy * cosines[near])  # exact, which the arc tangent is not
+    nearest = np.take_along_axis(near, off.argmin(axis=0)[None], axis=0)[0]
+    far = np.sqrt((dx * dx + dy * dy) * CELL_MM**2) / (2 * _PARTS)
+    return nearest.astype(np.intp), np.minimum(far, 1000 * REACH_M).astype(np.int16)
 
 
 class ScannedFloor:
@@ -80,16 +103,17 @@ class ScannedFloor:
             ((at - first * CELL_UM) << _BITS) // CELL_UM
             for at, first in ((x_um, left), (y_um, below))
         )
-        touched = np.zeros((2 * _HALF + 1, 2 * _HALF + 1), np.int8)
-        most = min(REACH_M, scan.range_max) * 1000
-        steps = np.where(ranges == NO_RETURN_MM, int(most), ranges) // CELL_MM
-        steps = np.minimum(steps, _STEPS).astype(np.int32)
-        along = np.arange(_STEPS, dtype=np.int32)
-        crossed = along < steps[:, None]
-        columns = (ax + cosines[:, None] * along) >> _BITS
-        rows = (ay + sines[:, None] * along) >> _BITS
+        most = int(min(REACH_M, scan.range_max) * 1000)
+        seen = np.minimum(np.where(ranges == NO_RETURN_MM, most, ranges), REACH_M * 1000)
+        half = math.ceil(min(abs(scan.angle_step) * (_SECTORS / _TURN) / 2, WIDEST))
+        beside = np.array(sorted(range(-half, half + 1), key=abs, reverse=True))[:, None]
+        free_mm = np.zeros(_SECTORS, np.int16)  # of the beam nearest to each
+        sectors = (numbers * _SECTORS + _DIRECTIONS // 2) // _DIRECTIONS
+        free_mm[(sectors + beside) & (_SECTORS - 1)] = seen - CELL_MM
+        parts = (at * _PARTS // CELL_UM % _PARTS for at in (x_um, y_um))
+        sector, far_mm = _around(*parts)
+        touched = PASSED * (far_mm <= free_mm.take(sector, mode="wrap")).view(np.int8)
         flat = touched.ravel()
-        flat[(rows * touched.shape[1] + columns)[crossed]] = PASSED
         ends = (ranges != UNKNOWN_MM) & (ranges < REACH_M * 1000) & (ranges != NO_RETURN_MM)
         far = ranges[ends].astype(np.int64)
         columns = (ax + cosines[ends] * far // CELL_MM) >> _BITS
@@ -121,7 +145,7 @@ class ScannedFloor:
         right, down = left - self.column, below - self.row
         window = self.odds[down : down + touched.shape[0], right : right + touched.shape[1]]
         self.news += int(np.count_nonzero((window == 0) & (touched != 0)))
-        np.clip(window + touched, -MOST, MOST, out=window)
+        window[:] = np.clip(window + touched, -MOST, MOST)  # quicker than into the window
         self.scans += 1
 
     def is_due(self) -> bool:
@@ -140,7 +164,7 @@ class ScannedFloor:
         cells = np.where(odds >= WALL, OCCUPIED, np.where(odds < 0, 0, UNKNOWN)).astype(np.uint8)
         x, y = self.column + int(columns[0]), self.row + int(rows[0])
         origin = x * CELL_UM / UM_PER_M, y * CELL_UM / UM_PER_M, 0.0
-        return OccupancyMap(None, CELL_UM / UM_PER_M, origin, "scans", cells, floor)
+        return OccupancyMap(None, CELL_UM / UM_PER_M, origin, SCANS, cells, floor)
 
 
 _NUMBERS: Final = ("column", "row", "scans", "scans_at_map", "news", "known")

@@ -10,11 +10,13 @@ import pytest
 from eventsrc.envelope.commands import CorrectPoses, RigidTransform
 from eventsrc.envelope.ingest import Accepted, Rejected, ingest
 from eventsrc.envelope.model import NO_RETURN_MM, Offset, StatedScan
-from eventsrc.envelope.occupancy_map import MAX_MAP_CELLS, OccupancyMap
+from eventsrc.envelope.occupancy_map import MAX_MAP_CELLS, SCANS, UNKNOWN, OccupancyMap
 from projections.fold import scans
 from projections.fold.corrections import NO_CORRECTIONS
 from projections.fold.deltas import MapGiven, Pose
 from projections.fold.exact import UM_PER_M
+from projections.fold.free_floor import FreeFloor
+from projections.fold.occupancy import NOWHERE, OccupancyGrid
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.view import MapView
@@ -87,8 +89,8 @@ def test_the_walls_of_a_room_are_where_the_beams_end_and_inside_is_free() -> Non
 
 def test_a_cell_that_beams_pass_later_is_no_wall_any_more() -> None:
     grid = scans.ScannedFloor()
-    near = StatedScan(**scan([1000] * 8))
-    far = StatedScan(**scan([5000] * 8))
+    near = StatedScan(**scan([1000] * 360))
+    far = StatedScan(**scan([5000] * 360))
     for _ in range(3):
         grid.cast(Pose(0, 0, 0.0), near)
     at = 10 - grid.column, -grid.row
@@ -117,6 +119,31 @@ def test_of_scans_that_say_nothing_no_map_is_made_however_many_there_are() -> No
     folded = Folded.start(ROOMS).extend(blind)
     assert not folded.all(MapGiven)
     assert folded.extend(drive(40, run_id="sees")).all(MapGiven)
+
+
+def test_no_way_on_a_map_of_scans_goes_over_unknown_ground() -> None:
+    cells = np.zeros((8, 30), np.uint8)
+    cells[:, 10:20] = UNKNOWN
+    for source, is_way in ((SCANS, False), ("map.yaml", True)):
+        floor = FreeFloor(OccupancyGrid(OccupancyMap(None, 0.1, (0.0, 0.0, 0.0), source, cells)))
+        start, end, unknown = (
+            floor.block_at((x, 450_000)) for x in (250_000, 2_550_000, 1_500_000)
+        )
+        assert start is not None
+        assert end is not None
+        assert unknown is not None
+        assert (floor.nearest(start, {end: 7}) is not None) == is_way
+        assert floor.nearest(start, {end: 7, start + 2: 9}) == (9, 6)
+        assert (floor.label(unknown) != NOWHERE) == is_way
+
+
+def test_the_middles_of_cells_around_the_sensor_are_by_direction_and_distance() -> None:
+    sector, far_mm = scans._around(1, 3)
+    middle = len(sector) // 2
+    assert far_mm[middle, middle + 10] == math.isqrt(round(1012.5**2 + 37.5**2))
+    assert sector[middle, middle + 10] == 2048 - round(2048 * 37.5 / 1012.5 / 2 / math.pi)
+    assert abs(sector[middle + 10, middle] - 512) <= 8
+    assert sector[middle, middle - 10] == 1036
 
 
 def test_the_sensor_may_stand_and_look_elsewhere_on_the_robot() -> None:
