@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.property.test_align import HERE, in_frame
+from tests.property.test_align import HERE, in_frame, jumped
 from tests.support.commands import Commands
 from tests.support.logs import simulated
 from tests.support.thorough import stride
@@ -76,6 +76,23 @@ def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> Non
     part = log_of(mapfold, "part", lines("a", HERE), few)
     said = mapfold("align", part, "--write", "--yes", code=3)
     assert "sim-7-b into the frame of sim-7-a: cannot tell: " in said.out
+
+
+@pytest.mark.slow
+def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
+    bad = "".join(json.dumps(each | {"camera": CAMERA}) + "\n" for each in jumped("a", 200))
+    log = log_of(mapfold, "log", bad, lines("b", HERE))
+    said = mapfold("align", log, "--jumps", code=3)
+    assert said.out.startswith("sim-7-a: a step of ")
+    assert "from there to the end moved by (" in said.out
+    assert "nothing is written; --write records" in said.err
+    told = mapfold("align", log, "--jumps", "--run", "sim-7-a", "--write", "--json").json
+    (step,) = told["steps"]
+    assert (step["jumped"], step["run"], step["last"]) == (True, "sim-7-a", None)
+    assert "its frame jumped: " in mapfold("edits", log).out
+    assert "no frame jumped" in mapfold("align", log, "--jumps").out
+    said = mapfold("align", log, "--jumps", "--to", "sim-7-a", code=2)
+    assert "--jumps takes neither --to nor --picture" in said.err
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """The transform between two runs' frames: found whatever the frames, refused between buildings, its
-matching the best one."""
+matching the best one; and jumps within a run."""
 
 import math
+from collections.abc import Callable
 from functools import cache
 from itertools import combinations
 from typing import Any
@@ -12,9 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.model import KeyframeId
+from projections.fold.evidence import EvidenceConstants
+from projections.fold.looks import LookRatios
 from projections.fold.settings import CameraSettings, Settings
+from projections.localize.align import matching
 from projections.localize.align.alignment import align, decision_text
 from projections.localize.align.framed_things import FramedThings, things_of_map
+from projections.localize.align.jumps import LargeStep, find_jumps
 from projections.localize.align.matching import Comparison, _best_matching, moved
 from tests.support.folds import Folded
 from tests.support.logs import simulated
@@ -94,6 +100,51 @@ def test_looks_of_different_spaces_are_refused() -> None:
         align(things("a"), other)
 
 
+def test_ratios_of_pairs_are_those_of_their_looks() -> None:
+    """Against a recount look by look; the likely pairs are those of the largest ratios."""
+    first, second = things("a"), things("b")
+    both, table = Comparison(first, second), LookRatios(EvidenceConstants())
+    labels, counts = np.unique([*first.classes, *second.classes], return_counts=True)
+    shares = dict(zip(labels, counts / counts.sum(), strict=True))
+    different = (first.different + second.different) / 2
+
+    def ratio(i: int, j: int, angle: float) -> float:
+        agree = first.classes[i] == second.classes[j]
+        rows, columns = np.flatnonzero(first.owners == i), np.flatnonzero(second.owners == j)
+        likeness = (first.looks[rows] @ second.looks[columns].T - different) / (1 - different)
+        sides = np.cos(first.sides[rows][:, None] - second.sides[columns] - angle)
+        one, labels_agree = np.ones((1, 1), bool), np.full((1, 1), agree)
+        found = table.ratios(np.maximum(likeness, 0.0), sides, one, labels_agree).clip(-6.0, 6.0)
+        by_label = math.log(0.85 / shares[first.classes[i]]) if agree else math.log(0.15)
+        return float(found.mean() * min(math.sqrt(found.size), 3.0) + by_label / 2)
+
+    count = len(first.xy), len(second.xy)
+    for number in range(0, count[0] * count[1], 7):
+        i, j = divmod(number, count[1])
+        found = both.ratios_at(0.7, np.array([i]), np.array([j]))
+        assert found[0] == pytest.approx(ratio(i, j, 0.7), abs=0.02)  # looks are in float32
+    firsts, seconds, by_turn = both.likely_pairs(of_each=3, most=500)
+    best = np.array(
+        [
+            [max(ratio(i, j, math.tau * t / 16) for t in range(16)) for j in range(count[1])]
+            for i in range(0, count[0], 5)
+        ]
+    )
+    chosen = set(zip(firsts.tolist(), seconds.tolist(), strict=True))
+    for row, i in zip(best, range(0, count[0], 5), strict=True):
+        j = int(row.argmax())
+        assert row[j] <= 0.1 or (i, j) in chosen
+    assert (np.diff(by_turn.max(0)) <= 0).all()
+
+
+def test_of_a_very_large_map_fewer_looks_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching, "_MOST_COMPARED", 2 * len(things("a").xy))
+    found = align(things("a"), things("b"))
+    assert found is not None
+    assert found.verdict == "sure"
+    assert found.is_one_frame
+
+
 def test_a_score_is_the_sum_over_pairs_of_its_parts() -> None:
     """Against a recount pair by pair, without a tree and without arrays of pairs."""
     first, second = things("a"), things("b")
@@ -110,6 +161,59 @@ def test_a_score_is_the_sum_over_pairs_of_its_parts() -> None:
         by_chance = 2 * math.pi * math.sqrt(np.linalg.det(spread)) * first.density
         by_looks = float(both.ratios_at(transform[2], np.array([i]), np.array([j]))[0])
         assert value == pytest.approx(by_looks - chi2 / 2 - math.log(by_chance))
+
+
+SHIFT: Frame = (6.0, 0.0, 0.2)
+"""Every point of the house moves by 3 m or more."""
+
+
+def jumped(run: str, start: int, back: int | None = None) -> list[dict[str, Any]]:
+    """A run whose frame is another from one keyframe on, and right again from a later one on."""
+    seen = simulated(7, run).envelopes
+    return [
+        in_frame(each, SHIFT) if start <= n < (len(seen) if back is None else back) else each
+        for n, each in enumerate(seen)
+    ]
+
+
+def steps(documents: list[dict[str, Any]]) -> list[LargeStep]:
+    """The large steps of a run that is alone in its log."""
+
+    def part(is_in: Callable[[KeyframeId], bool]) -> FramedThings | None:
+        some = [each for each in documents if is_in(each["keyframe_id"])]
+        return things_of_map(Folded.start(EVIDENCE).extend(some).view)
+
+    return list(
+        find_jumps(
+            Folded.start(EVIDENCE).extend(documents).view.keyframes,
+            lambda stretch: part(stretch.has),
+            lambda stretch: part(lambda each: not stretch.has(each)),
+        )
+    )
+
+
+def test_a_run_that_drives_on_has_no_large_step() -> None:
+    assert steps(simulated().envelopes) == []
+
+
+@pytest.mark.parametrize("back", [None, pytest.param(320, marks=pytest.mark.slow)])
+def test_the_tail_behind_a_jump_is_brought_back(back: int | None) -> None:
+    documents = jumped("a", 200, back)
+    first, *others = steps(documents)
+    assert first.is_jump
+    assert first.stretch.first == documents[200]["keyframe_id"]
+    assert first.stretch.last == (None if back is None else documents[back - 1]["keyframe_id"])
+    assert first.found is not None
+    here = np.array([(e["map_x"], e["map_y"]) for e in documents[200:back]])
+    there = np.array([(e["map_x"], e["map_y"]) for e in simulated().envelopes[200:back]])
+    assert np.hypot(*(moved(here, first.found.transform) - there).T).max() < 0.5
+    assert not any(each.is_jump for each in others)  # the run is back in its frame
+
+
+def test_a_robot_that_was_carried_did_not_jump() -> None:
+    """Its frame is right before and after; only the way between is missing."""
+    documents = [*simulated().envelopes[:150], *simulated().envelopes[250:]]
+    assert not any(each.is_jump for each in steps(documents))
 
 
 PAIRS = st.dictionaries(

@@ -69,7 +69,8 @@ LIKELY: Final = Gate(20.0, 0.4, 0.75, 0.6)
 class Alignment:
     """The best transform of the second map into the first one's frame, metres and radians.
 
-    ``pairs`` are the Objects that are one thing: their ids in both maps and the value of each.
+    ``pairs`` are the Objects that are one thing: their ids in both maps and the value of each;
+    ``classes`` what each is in the first one.
     ``second`` is the score of the best other transform's pairs. Of ``expected`` things, which the
     first robot looked at, ``matched`` are matched. ``se_m`` is the predicted standard error over
     the second map's keyframes, ``se_rad`` that of the angle, ``shift_m`` how far they are moved
@@ -78,6 +79,7 @@ class Alignment:
 
     transform: Transform
     pairs: tuple[tuple[str, str, float], ...]
+    classes: tuple[str, ...]
     score: float
     second: float
     expected: int
@@ -105,6 +107,12 @@ class Alignment:
             and self.second <= gate.second * self.score
             and self.se_m <= gate.se_m
         )
+
+    def best_pairs(self, number: int) -> list[str]:
+        """The pairs of the highest value in words."""
+        named = zip(self.classes, self.pairs, strict=True)
+        best = sorted(named, key=lambda each: -each[1][2])[:number]
+        return [f"{visible(kind)} {one} = {other}" for kind, (one, other, _) in best]
 
     def document(self) -> dict[str, Any]:
         """The alignment as JSON."""
@@ -185,6 +193,7 @@ def _judged(both: Comparison, best: MatchedPairs, refined: list[MatchedPairs]) -
                 best.firsts.tolist(), best.seconds.tolist(), best.values.tolist(), strict=True
             )
         ),
+        tuple(first.classes[best.firsts].tolist()),
         best.score,
         runner_up,
         int(expected.sum()),
@@ -217,18 +226,23 @@ def decision_text(found: Alignment | None) -> str:
 
 def _candidates(both: Comparison) -> list[Transform]:
     """The likeliest transforms, most votes first; at most `_MOST`."""
-    firsts, seconds = _likely_pairs(both.ratios.max(0))
-    voted = _votes(both, firsts, seconds)
+    voted = _votes(both, *both.likely_pairs(_OF_EACH, _MOST_PAIRS))
     if voted is None:
         return []
     x, y, angle, weight, length = voted
     place = np.column_stack((x / _CELL_M, y / _CELL_M, (angle % math.tau) / math.tau * _SECTORS))
     cells, sums = _cells(place, weight)
+    order = np.argsort(place[:, 0], kind="stable")
+    x, y, angle, weight, length, place = (
+        each[order] for each in (x, y, angle, weight, length, place)
+    )
     sector = math.tau / _SECTORS
     found: list[tuple[float, float, float]] = []
     for cell in cells[np.argsort(-sums, kind="stable")][: 8 * _MOST]:
-        turned = np.abs(_wrapped(angle - cell[2] * sector))
-        near = (np.abs(place[:, :2] - cell[:2]) < 2.0).all(1) & (turned < 1.2 * sector)
+        begin, end = np.searchsorted(place[:, 0], (cell[0] - 2.0, cell[0] + 2.0))
+        turned = np.abs(_wrapped(angle[begin:end] - cell[2] * sector))
+        aside = np.abs(place[begin:end, 1] - cell[1])
+        near = begin + np.flatnonzero((aside < 2.0) & (turned < 1.2 * sector))
         by = weight[near]
         at = float(np.average(x[near], weights=by)), float(np.average(y[near], weights=by))
         by = by * length[near]
@@ -245,21 +259,8 @@ def _candidates(both: Comparison) -> list[Transform]:
     ]
 
 
-def _likely_pairs(best: Floats) -> tuple[Indices, Indices]:
-    """The pairs of things that look most alike, a few of each thing."""
-    chosen = np.zeros(best.shape, np.bool_)
-    most = min(_OF_EACH, *best.shape)
-    by_row = np.argsort(-best, 1, kind="stable")[:, :most]
-    by_column = np.argsort(-best, 0, kind="stable")[:most]
-    np.put_along_axis(chosen, by_row, values=True, axis=1)
-    np.put_along_axis(chosen, by_column, values=True, axis=0)
-    firsts, seconds = np.nonzero(chosen & (best > 0.0))
-    order = np.argsort(-best[firsts, seconds], kind="stable")[:_MOST_PAIRS]
-    return firsts[order], seconds[order]
-
-
 def _votes(
-    both: Comparison, firsts: Indices, seconds: Indices
+    both: Comparison, firsts: Indices, seconds: Indices, by_turn: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats] | None:
     """Where the second map's middle comes to lie (x, y), the angle, the weight and the length of
     each vote."""
@@ -276,7 +277,7 @@ def _votes(
     chi2 = (length - other) ** 2 / variance
     angle = np.arctan2(here[:, 1], here[:, 0]) - np.arctan2(there[:, 1], there[:, 0])
     turn = np.rint((angle % math.tau) / math.tau * TURNS).astype(np.intp) % TURNS
-    ratios = np.minimum(*(both.ratios[turn, firsts[each], seconds[each]] for each in (a, b)))
+    ratios = np.minimum(by_turn[turn, a], by_turn[turn, b])
     fits = (chi2 < _MOST_CHI2) & (ratios > 0.0) & (np.sqrt(variance) < 0.5 * length)
     if not fits.any():
         return None

@@ -2,15 +2,16 @@
 from where, and which points the robot looked at."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope.model import Offset, RunId
+from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.exact import UNIT
@@ -72,15 +73,24 @@ def map_of_runs(
     corrections: Corrections,
     settings: Settings,
     without: Collection[RunId],
+    without_ranges: Mapping[RunId, tuple[tuple[KeyframeId, KeyframeId], ...]] = MappingProxyType(
+        {}
+    ),
 ) -> MapView:
-    """The map of the first ``end`` events by evidence, without some runs: where the runs of a log
-    have different frames, one map of all of them has everything twice."""
-    forgotten = corrections.forgotten_runs.union(without)
+    """The map of the first ``end`` events by evidence, without some runs and some ranges of
+    keyframes: where runs have different frames, one map of all of them has everything twice."""
+    ranges = dict(corrections.forgotten_ranges)
+    for run, more in without_ranges.items():
+        ranges[run] = (*ranges.get(run, ()), *more)
     return fold_log(
         reader,
         settings.with_assignments(["fusion=evidence"]),
         end,
-        corrections=msgspec.structs.replace(corrections, forgotten_runs=forgotten),
+        corrections=msgspec.structs.replace(
+            corrections,
+            forgotten_runs=corrections.forgotten_runs.union(without),
+            forgotten_ranges=ranges,
+        ),
     )[1]
 
 

@@ -10,7 +10,7 @@ the best matching.
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from projections.fold.evidence import EvidenceConstants
 from projections.fold.looks import LookRatios
 
-from .framed_things import FramedThings
+from .framed_things import EXEMPLARS, FramedThings
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -30,6 +30,11 @@ Transform = tuple[float, float, float]
 
 TURNS: Final = 16
 """The number of angles between the two frames at which looks are compared."""
+_TURNS: Final = [math.tau * turn / TURNS for turn in range(TURNS)]
+_LOOKED_INTO: Final = 4
+"""So many times more pairs than are asked for are compared look by look."""
+_MOST_COMPARED: Final = 10_000
+"""The most looks of a map that are compared, unless it has more things."""
 SLACK_M: Final = 0.2
 """Standard error of the distance of one thing's two positions beside their covariances: drift, and
 the middle of a box is not that of the thing."""
@@ -42,6 +47,7 @@ _MOST_RATIO: Final = 6.0
 _LABEL_WEIGHT: Final = 0.5
 _SAME_LABEL: Final = 0.85
 """The probability that one thing has the same label in both maps."""
+_OTHER_LABEL: Final = _LABEL_WEIGHT * math.log(1.0 - _SAME_LABEL)
 _CAUCHY: Final = 4.0
 """The χ² at which a pair counts half."""
 _ROUNDS: Final = 6
@@ -84,21 +90,96 @@ def rotation(angle: float) -> Floats:
     return np.array(((cos, -sin), (sin, cos)))
 
 
+class _Looks(NamedTuple):
+    """The looks of n things that are compared, and from which ``sides`` they are; ``rows`` (n, k)
+    are those of each, of which it has ``counts`` (n,), the rest -1."""
+
+    looks: NDArray[np.float32]
+    sides: Floats
+    rows: Indices
+    counts: Indices
+
+    @classmethod
+    def of(cls, things: FramedThings) -> Self:
+        """Fewer of each thing where a map has very many."""
+        most = max(1, min(EXEMPLARS, _MOST_COMPARED // len(things.xy)))
+        every = np.bincount(things.owners)
+        counts = np.minimum(every, most)
+        at = np.arange(most)
+        steps = np.rint(at * ((every - 1) / np.maximum(counts - 1, 1))[:, None]).astype(np.intp)
+        is_there = at < counts[:, None]
+        chosen = (steps + (np.cumsum(every) - every)[:, None])[is_there]
+        rows = np.full(is_there.shape, -1)
+        rows[is_there] = np.arange(len(chosen))
+        return cls(things.looks[chosen].astype(np.float32), things.sides[chosen], rows, counts)
+
+
 class Comparison:
-    """Two maps' things, with the ratios of all pairs by looks and label."""
+    """Two maps' things, with the likeness of all pairs of their looks."""
 
     def __init__(self, first: FramedThings, second: FramedThings) -> None:
         self.first, self.second = first, second
         self._tree, self._looked_at = cKDTree(first.xy), cKDTree(first.looked_at)
-        self.ratios = _look_ratios(first, second) + _label_ratios(first, second)
-        """(`TURNS`, n, m): under a turn by 2π t / `TURNS`."""
+        self._table, self._other_run = LookRatios(EvidenceConstants()), np.ones((1, 1), np.bool_)
+        self._looks = _Looks.of(first), _Looks.of(second)
+        different = (first.different + second.different) / 2.0
+        cosines = self._looks[0].looks @ self._looks[1].looks.T
+        cosines -= np.float32(different)
+        cosines /= np.float32(1.0 - different)
+        self._likeness = np.maximum(cosines, np.float32(0.0), out=cosines)
+        both = np.concatenate((first.classes, second.classes))
+        _, labels, counts = np.unique(both, return_inverse=True, return_counts=True)
+        self._labels = labels[: len(first.xy)], labels[len(first.xy) :]
+        shares = counts[self._labels[0]] / counts.sum()
+        self._agreement = _LABEL_WEIGHT * np.log(_SAME_LABEL / shares)
 
     def ratios_at(self, angle: float, firsts: Indices, seconds: Indices) -> Floats:
-        """The ratios of pairs under a turn, interpolated."""
-        turn, share = divmod((angle % math.tau) / math.tau * TURNS, 1.0)
-        below, above = int(turn) % TURNS, (int(turn) + 1) % TURNS
-        one = self.ratios[below, firsts, seconds]
-        found: Floats = (1.0 - share) * one + share * self.ratios[above, firsts, seconds]
+        """The log-likelihood ratios (k,) by looks and label that pairs are one thing, if the
+        second map is turned by an angle."""
+        one, other = self._looks
+        rows, columns = one.rows[firsts][:, :, None], other.rows[seconds][:, None]
+        agree = self._labels[0][firsts] == self._labels[1][seconds]
+        ratios = self._table.ratios(
+            self._likeness[rows, columns],
+            np.cos(one.sides[rows] - other.sides[columns] - angle),
+            self._other_run,
+            agree[:, None, None],
+        )
+        ratios = np.minimum(np.maximum(ratios, -_MOST_RATIO), _MOST_RATIO)
+        sums = np.where((rows >= 0) & (columns >= 0), ratios, 0.0).sum((1, 2))
+        return self._of_things(sums / (one.counts[firsts] * other.counts[seconds]), firsts, seconds)
+
+    def likely_pairs(self, of_each: int, most: int) -> tuple[Indices, Indices, Floats]:
+        """The pairs of things that look most alike at the angle that suits them best, a few of each
+        thing, best first, and their ratios (`TURNS`, k): under a turn by 2π t / `TURNS`."""
+        rough = self._rough_ratios()
+        firsts, seconds = _best_of_each(rough, of_each * _LOOKED_INTO)
+        ratios = np.array([self.ratios_at(turn, firsts, seconds) for turn in _TURNS])
+        rough[:] = -np.inf
+        rough[firsts, seconds] = ratios.max(0)
+        chosen = np.zeros(rough.shape, np.bool_)
+        chosen[_best_of_each(rough, of_each)] = True
+        of_pair = np.flatnonzero(chosen[firsts, seconds] & (ratios.max(0) > 0.0))
+        best = of_pair[np.argsort(-ratios.max(0)[of_pair], kind="stable")[:most]]
+        return firsts[best], seconds[best], ratios[:, best]
+
+    def _rough_ratios(self) -> Floats:
+        """The ratios (n, m) of all pairs by their mean likeness, seen from the side."""
+        one, other = self._looks
+        means = np.add.reduceat(self._likeness, one.rows[:, 0], 0)
+        means = np.add.reduceat(means, other.rows[:, 0], 1)
+        means /= one.counts[:, None] * other.counts[None]
+        agree = self._labels[0][:, None] == self._labels[1][None]
+        ratios = self._table.ratios(means, np.zeros((1, 1)), self._other_run, agree)
+        firsts, seconds = np.ogrid[: agree.shape[0], : agree.shape[1]]
+        return self._of_things(ratios, firsts, seconds)
+
+    def _of_things(self, means: Floats, firsts: Indices, seconds: Indices) -> Floats:
+        """The ratios of pairs of things by the mean ratios of their looks."""
+        number = self._looks[0].counts[firsts] * self._looks[1].counts[seconds]
+        agree = self._labels[0][firsts] == self._labels[1][seconds]
+        by_label = np.where(agree, self._agreement[firsts], _OTHER_LABEL)
+        found: Floats = means * np.minimum(np.sqrt(number), _MOST_LOOKS) + by_label
         return found
 
     def matching(self, transform: Transform, slack_m: float = SLACK_M) -> MatchedPairs:
@@ -112,8 +193,11 @@ class Comparison:
         spread = self._spread(transform, firsts, seconds, slack_m)
         chi2 = _chi2(apart, spread)
         chance = 2.0 * math.pi * np.sqrt(np.linalg.det(spread)) * self.first.density
-        values = self.ratios_at(transform[2], firsts, seconds) - 0.5 * chi2 - np.log(chance)
-        good = (chi2 < _GATE) & (values > 0.0)
+        values = -0.5 * chi2 - np.log(chance)
+        near_enough = np.flatnonzero(chi2 < _GATE)
+        firsts, seconds, values = (each[near_enough] for each in (firsts, seconds, values))
+        values += self.ratios_at(transform[2], firsts, seconds)
+        good = values > 0.0
         return _best_matching(transform, firsts[good], seconds[good], values[good])
 
     def refined(self, transform: Transform) -> MatchedPairs:
@@ -218,35 +302,13 @@ def _best_matching(
     return MatchedPairs(transform, firsts[at], seconds[at], values[at])
 
 
-def _look_ratios(first: FramedThings, second: FramedThings) -> Floats:
-    different = (first.different + second.different) / 2.0
-    cosines = first.looks @ second.looks.T
-    likeness = np.maximum((cosines - different) / (1.0 - different), 0.0)
-    agree = first.classes[first.owners][:, None] == second.classes[second.owners][None]
-    apart = first.sides[:, None] - second.sides[None]
-    cos, sin = np.cos(apart), np.sin(apart)
-    counts = [np.bincount(each.owners) for each in (first, second)]
-    number = counts[0][:, None] * counts[1][None]
-    weights = np.minimum(np.sqrt(number), _MOST_LOOKS) / number
-    begins = [np.cumsum(count) - count for count in counts]
-    table, other_run = LookRatios(EvidenceConstants()), np.ones((1, 1), np.bool_)
-    found = np.empty((TURNS, len(first.xy), len(second.xy)))
-    for turn in range(TURNS):
-        angle = math.tau * turn / TURNS
-        sides = cos * math.cos(angle) + sin * math.sin(angle)
-        ratios = table.ratios(likeness, sides, other_run, agree)
-        ratios = np.minimum(np.maximum(ratios, -_MOST_RATIO), _MOST_RATIO)
-        sums = np.add.reduceat(np.add.reduceat(ratios, begins[0], 0), begins[1], 1)
-        found[turn] = sums * weights
-    return found
-
-
-def _label_ratios(first: FramedThings, second: FramedThings) -> Floats:
-    """(n, m): an agreement on a rare label counts more."""
-    labels, counts = np.unique(np.concatenate((first.classes, second.classes)), return_counts=True)
-    shares = counts[np.searchsorted(labels, first.classes)] / counts.sum()
-    agree = first.classes[:, None] == second.classes[None]
-    found: Floats = _LABEL_WEIGHT * np.where(
-        agree, np.log(_SAME_LABEL / shares)[:, None], math.log(1.0 - _SAME_LABEL)
-    )
-    return found
+def _best_of_each(table: Floats, number: int) -> tuple[Indices, Indices]:
+    """The best pairs of each row and each column, by row."""
+    chosen = np.zeros(table.shape, np.bool_)
+    most = min(number, *table.shape)
+    by_row = np.argsort(-table, 1, kind="stable")[:, :most]
+    by_column = np.argsort(-table, 0, kind="stable")[:most]
+    np.put_along_axis(chosen, by_row, values=True, axis=1)
+    np.put_along_axis(chosen, by_column, values=True, axis=0)
+    firsts, seconds = np.nonzero(chosen)
+    return firsts, seconds

@@ -26,10 +26,26 @@ from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
     from projections.localize.align.alignment import Alignment
+    from projections.localize.align.jumps import LargeStep
 
 _NAMED = 5
 """Pairs that the reason of a command names."""
 _EVERYWHERE = Span(None, None)
+_NO_JUMP = "no step is larger than the robot's usual ones: no frame jumped"
+
+
+@dataclass(frozen=True, slots=True)
+class _Proposal:
+    """What was found for keyframes of some runs: a transform to record, for a ``reason``, or
+    none."""
+
+    runs: list[RunId]
+    span: Span
+    verdict: str
+    transform: tuple[float, float, float] | None
+    text: str
+    reason: str
+    document: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,16 +64,61 @@ class _Frames(CachedLog):
         ),
     ] = None
 
-    def maps(self, opened: OpenLog) -> tuple[MapView, MapView, str, list[RunId]]:
+    def pair(self, picture: Path | None) -> _Proposal:
+        """A run in the frame of another, or all of them in that of another log. Raises MisuseError
+        for a run that the log does not have."""
+        from projections.localize.align.alignment import align as align_things
+        from projections.localize.align.alignment import decision_text
+        from projections.localize.align.framed_things import things_of_map
+
+        with self.opened() as opened:
+            frame, moved, target, runs = self._maps(opened)
+        first, second = things_of_map(frame), things_of_map(moved)
+        if first is None or second is None:
+            bare = visible(target) if first is None else ", ".join(map(visible, runs))
+            raise MapfoldError(
+                f"{bare}: no object has both an embedding and a position, by which maps are"
+                " compared"
+            )
+        found = align_things(first, second)
+        title = f"{', '.join(map(visible, runs))} into the frame of {visible(target)}"
+        if picture is not None and found is not None:
+            from projections.adapters.drawing.merge_picture import draw_alignment
+
+            draw_alignment(frame, moved, found, picture, title)
+        is_to_move = found is not None and not found.is_one_frame
+        text = f"{title}: {decision_text(found)}{_pair_lines(found)}"
+        about = {"runs": runs, "to": target}
+        reason = f"aligned to {target}"
+        return _proposed(runs, _EVERYWHERE, found, is_to_move, text, reason, about)
+
+    def jumps(self) -> list[_Proposal]:
+        """What is behind the large steps of the runs."""
+        from projections.localize.align.jumps import jumps_of_run
+
+        with self.opened() as opened:
+            reader, end, _, corrections, settings = opened
+            view = self._view(opened)
+            runs = [run.run_id for run in view.runs]
+            return [
+                _of_step(run, step)
+                for run in (runs if self.run is None else [self._known(runs, self.run)])
+                for step in jumps_of_run(reader, end, corrections, settings, view, run)
+            ]
+
+    def _view(self, opened: OpenLog) -> MapView:
+        reader, end, _, corrections, settings = opened
+        return map_after(
+            reader, settings, end, corrections=corrections, note=say, cache=not self.no_cache
+        )
+
+    def _maps(self, opened: OpenLog) -> tuple[MapView, MapView, str, list[RunId]]:
         """The map of the frame, the map to move, what the frame is called, the runs to move.
         Raises MisuseError for a run that the log does not have."""
         from projections.localize.align.framed_things import map_of_runs
 
         reader, end, _, corrections, settings = opened
-        view = map_after(
-            reader, settings, end, corrections=corrections, note=say, cache=not self.no_cache
-        )
-        runs = [run.run_id for run in view.runs]
+        runs = [run.run_id for run in self._view(opened).runs]
         target = runs[0] if self.to is None and runs else self.to
         if target in runs:
             moved = [self._moved(runs, RunId(target))]
@@ -102,8 +163,14 @@ def _runs(runs: list[RunId]) -> str:
 def align(
     *,
     frames: _Frames,
+    jumps: Annotated[
+        bool,
+        typer.Option(
+            "--jumps", help="Find where a run's frame jumped: localisation was lost and set wrong."
+        ),
+    ] = False,
     write: Annotated[
-        bool, typer.Option("--write", help="Record the correction of the run's poses.")
+        bool, typer.Option("--write", help="Record the correction of the poses.")
     ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", help="With --write: record also what is only likely.")
@@ -123,94 +190,104 @@ def align(
     Both runs are mapped alone, by evidence, and their objects compared by looks and distances. A
     transform is sure, likely, or not found: with few things in common right and wrong look alike.
 
-    Exit 3 when none is found, or --write would need --yes.
+    Exit 3 when none is found, or --write would need --yes; with --jumps when one is not corrected.
     """
     check_picture(picture)
+    if jumps and (picture is not None or frames.to is not None):
+        raise MisuseError("--jumps takes neither --to nor --picture: a jump is within a run")
     try:
-        from projections.localize.align.alignment import align as align_things
-        from projections.localize.align.alignment import decision_text
-        from projections.localize.align.framed_things import things_of_map
+        proposals = frames.jumps() if jumps else [frames.pair(picture)]
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold align needs {error.name}, which is not installed; pip install"
             " 'mapfold[align]'"
         ) from None
-    with frames.opened() as opened:
-        frame, moved, target, runs = frames.maps(opened)
-    first, second = things_of_map(frame), things_of_map(moved)
-    if first is None or second is None:
-        bare = visible(target) if first is None else ", ".join(map(visible, runs))
-        raise MapfoldError(
-            f"{bare}: no object has both an embedding and a position, by which maps are compared"
-        )
-    found = align_things(first, second)
-    title = f"{', '.join(map(visible, runs))} into the frame of {visible(target)}"
-    if picture is not None and found is not None:
-        from projections.adapters.drawing.merge_picture import draw_alignment
-
-        draw_alignment(frame, moved, found, picture, title)
-    is_usable = found is not None and found.verdict in ("sure", "likely" if yes else "sure")
-    made = []
-    if write and is_usable and found is not None and not found.is_one_frame:
-        reason = f"aligned to {target}: {_evidence(frame, found)}"
-        who = user_at_host() if issued_by is None else issued_by
-        made = [
-            _record(frames, zenoh, run, found, Stamp(uuid.uuid4().hex, who, reason)) for run in runs
-        ]
-    if json_:
-        emit(_document(found, target, runs, made))
+    who = user_at_host() if issued_by is None else issued_by
+    wanted = ("sure", "likely" if yes else "sure")
+    made, left = [], [each for each in proposals if each.transform is not None]
+    if write:
+        usable = [each for each in left if each.verdict in wanted]
+        left = [each for each in left if each.verdict not in wanted]
+        made = [_record(frames, zenoh, run, each, who) for each in usable for run in each.runs]
+    recorded = [recorded_document(each) for each in made]
+    if json_ and jumps:
+        emit({"steps": [each.document for each in proposals], "recorded": recorded})
+    elif json_:
+        emit({**proposals[0].document, "recorded": recorded})
     else:
-        display(f"{title}: {decision_text(found)}{_pair_lines(frame, found)}")
+        display("\n".join(each.text for each in proposals) or _NO_JUMP)
         for each in made:
             display(recorded_text(each))
-        if found is not None and found.verdict != "unknown" and not made and not found.is_one_frame:
-            also = " --yes" if found.verdict == "likely" else ""
-            say(f"nothing is written; --write{also} records the correction of its poses")
-    finish(findings=found is None or found.verdict == "unknown" or (write and not is_usable))
+        if left:
+            also = " --yes" if all(each.verdict == "likely" for each in left) else ""
+            what = "what is not sure is not" if made else "nothing is"
+            say(f"{what} written; --write{also} records the correction of its poses")
+    is_unknown = not jumps and any(each.verdict == "unknown" for each in proposals)
+    finish(findings=is_unknown or (bool(left) and (write or jumps)))
 
 
-def _record(
-    frames: _Frames, zenoh: ZenohClient, run: RunId, found: "Alignment", stamp: Stamp
-) -> Made:
+def _proposed(
+    runs: list[RunId],
+    span: Span,
+    found: "Alignment | None",
+    is_to_move: bool,
+    text: str,
+    reason: str,
+    about: dict[str, Any],
+) -> _Proposal:
+    numbers: dict[str, Any] = {"verdict": "unknown", "common": 0}
+    if found is None or found.verdict == "unknown":
+        document = about | (numbers if found is None else found.document())
+        return _Proposal(runs, span, "unknown", None, text, "", document)
+    transform = found.transform if is_to_move else None
+    reason = f"{reason}: {_evidence(found)}"
+    document = about | found.document()
+    return _Proposal(runs, span, found.verdict, transform, text, reason, document)
+
+
+def _of_step(run: RunId, step: "LargeStep") -> _Proposal:
+    """A large step of a run, and whether a jump of the frame explains it."""
+    from projections.localize.align.alignment import decision_text
+
+    first, last = step.stretch
+    to = "the end" if last is None else str(last)
+    title = f"{visible(run)}: a step of {step.step_m:.1f} m to keyframe {first}; from there to {to}"
+    found = step.found
+    is_told = found is not None and found.verdict != "unknown"
+    text = f"{title} {decision_text(found)}"
+    if is_told and not step.is_jump:
+        text = f"{title} no other frame explains it"
+    elif step.is_jump:
+        text += _pair_lines(found)
+    about = {"run": run, "first": first, "last": last, "step_m": step.step_m}
+    about["jumped"] = step.is_jump
+    span = Span(first, last)
+    return _proposed([run], span, found, step.is_jump, text, "its frame jumped", about)
+
+
+def _record(frames: _Frames, zenoh: ZenohClient, run: RunId, proposal: _Proposal, who: str) -> Made:
+    dx, dy, dyaw = proposal.transform or (0.0, 0.0, 0.0)
     return record_command(
         frames.log,
-        lambda current, stamp: by_transform(current, stamp, run, _EVERYWHERE, *found.transform),
-        stamp,
+        lambda current, stamp: by_transform(current, stamp, run, proposal.span, dx, dy, dyaw),
+        Stamp(uuid.uuid4().hex, who, proposal.reason),
         frames.settings,
         zenoh.session,
         say,
     )
 
 
-def _evidence(frame: MapView, found: "Alignment") -> str:
+def _evidence(found: "Alignment") -> str:
     """The best pairs, by the observations that founded the Objects, and the numbers."""
-    best = sorted(found.pairs, key=lambda pair: -pair[2])[:_NAMED]
-    classes = _classes(frame)
-    named = ", ".join(f"{classes[one]} {one} = {other}" for one, other, _ in best)
     return (
         f"{counted(len(found.pairs), 'common thing')}, score {found.score:.0f}, next best"
-        f" {found.second:.0f}, ± {found.se_m:.2f} m; {named}"
+        f" {found.second:.0f}, ± {found.se_m:.2f} m; {', '.join(found.best_pairs(_NAMED))}"
     )
 
 
-def _pair_lines(frame: MapView, found: "Alignment | None") -> str:
+def _pair_lines(found: "Alignment | None") -> str:
     if found is None or found.verdict == "unknown":
         return ""
-    classes = _classes(frame)
-    best = sorted(found.pairs, key=lambda pair: -pair[2])
-    lines = [f"  {visible(classes[one])}  {one} = {other}" for one, other, _ in best[:_NAMED]]
-    more = len(best) - len(lines)
-    return "\n" + "\n".join([*lines, f"  and {more:,} more"] if more else lines)
-
-
-def _classes(frame: MapView) -> dict[str, str]:
-    return {each.object_id: each.class_name for each in frame.objects.values()}
-
-
-def _document(
-    found: "Alignment | None", target: str, runs: list[RunId], made: list[Made]
-) -> dict[str, Any]:
-    result: dict[str, Any] = {"verdict": "unknown", "common": 0}
-    if found is not None:
-        result = found.document()
-    return {"runs": runs, "to": target, **result, "recorded": [recorded_document(m) for m in made]}
+    best, more = found.best_pairs(_NAMED), len(found.pairs) - _NAMED
+    lines = [f"\n  {line}" for line in best]
+    return "".join([*lines, f"\n  and {more:,} more"] if more > 0 else lines)

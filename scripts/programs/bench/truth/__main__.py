@@ -2,7 +2,7 @@
 
 scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profile P…]
     [--moved FRACTION] [--calibrated] [--no-embeddings] [--places [--walls] | --types | --bags |
-    --ask | --align]
+    --ask | --align | --jumps]
     [--limit N] [--seed N] [--set NAME=VALUE…]
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --lost [--quick] …
@@ -28,13 +28,15 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
+
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings
 from projections.map.view import MapView
 
 from . import tables
-from .aligning import AlignRow, align_rows, align_table
+from .aligning import AlignRow, JumpRow, align_rows, align_table, jump_rows, jump_table
 from .asking import AskedRow, Building, asked_row, asked_table
 from .bags import BagRow, bag_row, bags_table
 from .calibrating import calibrated_settings, calibration_table
@@ -93,10 +95,17 @@ def main() -> None:
             _write(options.json, lost)
             return
         if options.align:
-            aligned = align_rows(list(cases), options.seed)
+            aligned = list(align_rows(cases, options.seed))
             print(f"{options.half} half, {options.moved:g} of the movable things moved")
             print(align_table(aligned))
             _write(options.json, aligned)
+            return
+        if options.jumps:
+            chance = np.random.default_rng(options.seed)
+            jumps = [row for case in cases for row in jump_rows(case, chance)]
+            print(f"{options.half} half, jumps of 2 to 8 m")
+            print(jump_table(jumps))
+            _write(options.json, jumps)
             return
         if options.ask:
             asked = [_asked_row(generator, case, options) for case in cases]
@@ -154,7 +163,9 @@ def _world(case: Case) -> str:
 
 def _write(
     path: Path | None,
-    rows: Sequence[tables.Row | PlacesRow | TypesRow | BagRow | AskedRow | AlignRow | LostRow],
+    rows: Sequence[
+        tables.Row | PlacesRow | TypesRow | BagRow | AskedRow | AlignRow | JumpRow | LostRow
+    ],
 ) -> None:
     if path is not None:
         document = [dataclasses.asdict(row) for row in rows]
@@ -242,6 +253,9 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument(
         "--align", action="store_true", help="runs in frames of their own find each other, instead"
+    )
+    parser.add_argument(
+        "--jumps", action="store_true", help="frames that jump in the middle of a run, instead"
     )
     parser.add_argument("--lost", action="store_true", help="robots that turn on the spot, instead")
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
