@@ -35,6 +35,12 @@ def house() -> Map:
     return fold(SAMPLE, settings=ROOMS)
 
 
+@pytest.fixture(scope="module")
+def known() -> Map:
+    """The map by the settings of its log, which knows rooms; tests may only read it."""
+    return fold(ROOT / "logs" / "sample")
+
+
 @pytest.fixture
 def mapfold(tmp_path: Path) -> Commands:
     return Commands.in_folder(tmp_path)
@@ -61,8 +67,7 @@ def test_mapfold_lists_nothing_that_is_not_ours() -> None:
     assert dir(public) == sorted(public.__all__)
 
 
-def test_what_is_found_says_what_it_is_in_one_line(house: Map) -> None:
-    known = fold(ROOT / "logs" / "sample")
+def test_what_is_found_says_what_it_is_in_one_line(known: Map) -> None:
     oven = known.find("oven").answers[0]
     with Timeline(SAMPLE, ROOMS, cache=False) as timeline, open_log(SAMPLE) as log:
         shown = [
@@ -82,14 +87,13 @@ def test_what_is_found_says_what_it_is_in_one_line(house: Map) -> None:
         _ = known.places[1].colour
 
 
-def test_what_changed_since_a_moment_is_that_of_the_timeline() -> None:
-    sample = ROOT / "logs" / "sample"
-    by_map = fold(sample).changes(since=200)
-    with Timeline(sample, cache=False) as timeline:
+def test_what_changed_since_a_moment_is_that_of_the_timeline(known: Map) -> None:
+    by_map = known.changes(since=200)
+    with Timeline(ROOT / "logs" / "sample", cache=False) as timeline:
         assert by_map == timeline.changes("200")
         assert timeline.at().changes(timeline.at(200)).since == 200
     with pytest.raises(MisuseError, match="give an earlier map"):
-        Map(fold(sample).view).changes()
+        Map(known.view).changes()
 
 
 def test_tables_and_graphs_are_those_of_the_state(
@@ -106,12 +110,13 @@ def test_tables_and_graphs_are_those_of_the_state(
         house.objects.to_pandas()
 
 
-def test_a_notebook_keeps_at_most_60_kb_of_a_large_map() -> None:
+def test_a_notebook_keeps_at_most_60_kb_of_a_large_map(
+    known: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Hundreds of places with long names, and drives that fill the picture."""
-    view = fold(ROOT / "logs" / "sample").view
-    for place in view.places.values():
-        place.name = "<&>" * 250
-    shown = Map(view)._repr_html_()
+    for place in known.view.places.values():
+        monkeypatch.setattr(place, "name", "<&>" * 250)
+    shown = Map(known.view)._repr_html_()
     assert len(shown.encode()) <= 60_000
     assert "<img" in shown
     assert "more places" in shown

@@ -26,6 +26,7 @@ from projections.surfaces.python import Map, fold
 from tests.support.commands import Commands
 from tests.support.evidence_drives import long_drive
 from tests.support.logs import SAMPLE, write_log
+from tests.support.thorough import stride
 
 FULL = Settings(places="rooms", fusion="evidence")
 
@@ -90,12 +91,13 @@ def test_the_databases_have_the_walls_and_python_gives_the_same(
     mapfold: Commands, one_database: Targets, house: Map
 ) -> None:
     mapfold("replay", SAMPLE, "--db", one_database.graph_url)
-    for (command, *rest), found in (
+    asked = (
         (("find", "sinks", "--from", "1,1"), house.find("sinks", start=(1, 1))),
         (("find", "oven", "--goal", "json"), house.goal("oven")),
         (("room", "kitchen"), house.room("kitchen")),
         (("path", "1,1", "oven"), house.path((1, 1), "oven")),
-    ):
+    )
+    for (command, *rest), found in asked[:: stride(3)]:
         live = mapfold(command, *rest, "--json", "--db", one_database.graph_url).json
         assert live == same(found.document())
         assert live == mapfold(command, SAMPLE, *rest, "--json").json

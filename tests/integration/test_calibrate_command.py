@@ -176,7 +176,7 @@ def test_the_camera_of_the_settings_serves_where_envelopes_state_none(tmp_path: 
     assert "beyond the picture of 640 × 400 pixels: give the camera" in wrong
 
 
-@pytest.mark.seconds
+@pytest.mark.slow
 def test_a_camera_that_nothing_states_is_estimated_and_recorded(tmp_path: Path) -> None:
     write_room(tmp_path / "log", count=COUNT, camera=False)
     mapfold = Commands.in_folder(tmp_path)

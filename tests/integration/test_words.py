@@ -19,7 +19,6 @@ from projections.surfaces.python import fold
 from projections.surfaces.serve import Answerer, Pools
 from projections.surfaces.serve.asked import FindQuery
 from projections.surfaces.text_encoders import ELSEWHERE, words_of
-from tests.support.agents import tool
 from tests.support.commands import Commands
 from tests.support.logs import SAMPLE
 from tests.support.models import text_tower
@@ -152,6 +151,7 @@ def test_said_once_it_holds_for_every_surface(said: Commands, one_database: Targ
     assert by_log["answers"][0]["class_name"] == "potted plant"
     assert json.loads(json.dumps(fold(log).find(word).document())) == by_log
     from projections.surfaces.mcp.cited_maps import LogMaps
+    from tests.support.agents import tool
 
     with LogMaps(log, lambda known: known.settings or Settings()) as maps:
         from projections.surfaces.mcp.agent_server import create_server
