@@ -16,8 +16,7 @@ The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationA
 (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
 ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
 after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
-names only things that deltas before it have introduced. A MapGiven is alone, or
-precedes those of places.
+names only things that deltas before it have introduced. A MapGiven is alone or precedes places.
 
 A fold makes some ten deltas a keyframe: a msgspec struct takes a third of the time of a frozen
 dataclass, and with ``gc=False`` the garbage collector does not traverse a history of them.
@@ -39,8 +38,10 @@ KeyframeOrdinal = NewType("KeyframeOrdinal", int)
 ObservationOrdinal = NewType("ObservationOrdinal", int)
 PlaceOrdinal = NewType("PlaceOrdinal", int)
 ObjectOrdinal = NewType("ObjectOrdinal", int)
-SkipKind: TypeAlias = Literal["duplicate", "conflict", "det_id_reused", "forgotten", "dropped"]
-"""Why an envelope, or an observation of it, is left out of the map; see `EventSkipped`."""
+SkipKind: TypeAlias = Literal[
+    "duplicate", "conflict", "det_id_reused", "forgotten", "dropped", "scan_too_far"
+]
+"""Why an envelope, or an observation or scan of it, is left out of the map; see `EventSkipped`."""
 FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np.float64], int]
 """Ordinal, det_id, class name, unit vector as of `exact.Units`, its squared norm."""
 
@@ -121,12 +122,12 @@ class ObservationAdded(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 class EventSkipped(msgspec.Struct, frozen=True, gc=False):
-    """An envelope, or a detection of it, that changes nothing.
+    """An envelope, or a detection or scan of it, that changes nothing.
 
     ``kind`` is ``duplicate`` (same keyframe, same content), ``conflict`` (other content: the first
     one stands), ``forgotten`` (a correction leaves the keyframe out), ``det_id_reused`` (an earlier
-    keyframe has the det_id) or ``dropped`` (a correction leaves the detection out). The last two
-    are of one detection, ``det_id``; the rest of the keyframe is folded.
+    keyframe has the ``det_id``), ``dropped`` (a correction leaves this one out) or ``scan_too_far``
+    (`scans`). For these three the rest of the keyframe is folded.
     """
 
     offset: Offset

@@ -26,12 +26,13 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from eventsrc.envelope.model import Envelope, Offset, StatedScan
+from eventsrc.envelope.model import Envelope, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
 from .deltas import (
     Delta,
+    EventSkipped,
     MapGiven,
     ObjectEstimated,
     ObjectRelocated,
@@ -210,11 +211,11 @@ class CurrentMap:
         return delta
 
     def scan(
-        self, offset: Offset, number: int, pose: Pose, scan: StatedScan | None
-    ) -> MapGiven | None:
-        """Cast a scan taken on the floor of this number; returns the delta of a map that is made of
-        it and those before. It is left out where a map is given."""
-        name = self._floors.names[number]
+        self, offset: Offset, number: int, pose: Pose, envelope: Envelope
+    ) -> MapGiven | EventSkipped | None:
+        """Cast the scan of an envelope on the floor of this number; returns the delta of a map that
+        is made of it and those before. It is left out where a map is given, or too far away."""
+        name, scan = self._floors.names[number], envelope.scan
         if scan is None or (number and name is None):
             return None
         in_force = map_in_force(self.given, name, is_first=not number)
@@ -222,7 +223,9 @@ class CurrentMap:
             self._scans.forget(number)
             return None
         made = self._scans.add(number, name if number else None, pose, scan)
-        if made is None:
+        if made is False:
+            return EventSkipped(offset, "scan_too_far", envelope.run_id, envelope.keyframe_id)
+        if made is True:
             return None
         delta = self.given[made.floor] = MapGiven(offset, made, scanned=True)
         self._grounds.pop(number, None)

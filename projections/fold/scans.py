@@ -85,15 +85,15 @@ class ScannedFloor:
         self.scans = self.scans_at_map = 0
         self.news = self.known = 0
 
-    def cast(self, pose: Pose, scan: StatedScan) -> None:
-        """Add a scan taken at a pose of the robot."""
+    def cast(self, pose: Pose, scan: StatedScan) -> bool:
+        """Add a scan taken at a pose of the robot; False if it is left out, too far away."""
         yaw = small_angle(pose.yaw_rad)
         cos, sin = cos_sin(yaw)
         x_um = pose.x_um + metres_to_um(cos * scan.x - sin * scan.y)
         y_um = pose.y_um + metres_to_um(sin * scan.x + cos * scan.y)
         column, row = x_um // CELL_UM, y_um // CELL_UM
         if not self._has_room(column, row):
-            return
+            return False
         ranges = scan.ranges()
         angles = (yaw + scan.yaw + scan.angle_min) + np.arange(len(ranges)) * scan.angle_step
         numbers = np.rint(angles * (_DIRECTIONS / _TURN)).astype(np.int64) & (_DIRECTIONS - 1)
@@ -120,6 +120,7 @@ class ScannedFloor:
         rows = (ay + sines[ends] * far // CELL_MM) >> _BITS
         flat[rows * touched.shape[1] + columns] = HIT
         self._add(left, below, touched)
+        return True
 
     def _has_room(self, column: int, row: int) -> bool:
         """Make the grid large enough for a scan from a cell; False if that is too large."""
@@ -178,11 +179,11 @@ class Scans:
 
     def add(
         self, number: int, floor: str | None, pose: Pose, scan: StatedScan
-    ) -> OccupancyMap | None:
-        """Cast a scan; returns a new map if one is due."""
+    ) -> OccupancyMap | bool:
+        """Cast a scan; returns a new map if one is due, False if the scan is left out."""
         grid = self._floors.setdefault(number, ScannedFloor())
-        grid.cast(pose, scan)
-        return grid.map(floor) if grid.is_due() else None
+        is_cast = grid.cast(pose, scan)
+        return grid.map(floor) if grid.is_due() else is_cast
 
     def forget(self, number: int) -> None:
         """Drop the grid of a floor."""

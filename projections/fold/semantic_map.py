@@ -113,9 +113,9 @@ class SemanticMap:
         self.next_offset = Offset(offset + 1)
         return self._in_force(self.current_map.fold(offset, given))
 
-    def _in_force(self, given: MapGiven | None) -> list[Delta]:
-        if given is None:
-            return []
+    def _in_force(self, given: MapGiven | EventSkipped | None) -> list[Delta]:
+        if not isinstance(given, MapGiven):
+            return [] if given is None else [given]
         self._use_walls()
         self.standing.use_other_map()
         return [given]
@@ -186,7 +186,7 @@ class SemanticMap:
             accepted, units = self.reembedded.applied(accepted, units)
         fusible = self._observe(offset, keyframe, accepted, units, deltas)
         if pose is not None:
-            deltas += self._in_force(self.current_map.scan(offset, ground, pose, envelope.scan))
+            deltas += self._in_force(self.current_map.scan(offset, ground, pose, envelope))
             pose = self.floors.laid_out(pose, ground)
             for seen in fusible if self._named.group_of else ():
                 self.floors.keep_to_floor(self._named, seen[1], "object", ground)

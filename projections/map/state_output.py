@@ -243,11 +243,13 @@ def _counts(view: MapView) -> str:
         "foreign_embeddings": "{} of another embedding space",
         "forgotten": "{} forgotten",
         "dropped": "{} dropped",
+        "scan_too_far": "{} left out, too far from the first",
     }
     things = {
         "det_ids_reused": "observation",
         "foreign_embeddings": "observation",
         "dropped": "detection",
+        "scan_too_far": "scan",
     }
     for key, phrase in rare.items():
         if counts.get(key):

@@ -27,7 +27,7 @@ from . import records
 from .confirmed import confirm
 
 _T = TypeVar("_T")
-_BY_CORRECTION: tuple[SkipKind, ...] = ("forgotten", "dropped")
+_RARELY: tuple[SkipKind, ...] = ("forgotten", "dropped", "scan_too_far")
 
 
 class MapView:
@@ -338,7 +338,8 @@ class MapView:
 
     def counts(self) -> dict[str, int]:
         """Counts by name; the eight in capitals are of the graph's edges by label. What corrections
-        leave out and pictures of a camera that nothing states come at the end, if they count."""
+        leave out, scans too far away and pictures of a camera that nothing states come at the end,
+        if they count."""
         posed, fused, foreign = self._sums()
         unstated = self.without_camera() if self.settings.wants_camera else 0
         placed = sum(p.keyframe_count for p in self.places.values())
@@ -367,7 +368,7 @@ class MapView:
             "floors": len(self.floors),
             "buildings": int(bool(self.all_places or self.floors)),
             "PART_OF": len(self.places) + len(self.floors),
-            **{kind: self.skipped[kind] for kind in _BY_CORRECTION if kind in self.skipped},
+            **{kind: self.skipped[kind] for kind in _RARELY if kind in self.skipped},
             **({"without_camera": unstated} if unstated else {}),
         }
 

@@ -19,6 +19,7 @@ from projections.fold.free_floor import FreeFloor
 from projections.fold.occupancy import NOWHERE, OccupancyGrid
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
+from projections.map.state_output import state_text
 from projections.map.view import MapView
 from projections.store.history import History
 from projections.store.stored_view import StoredView
@@ -214,6 +215,10 @@ def test_a_scan_far_away_is_left_out_rather_than_filling_the_memory() -> None:
     shape = grid.odds.shape
     grid.cast(Pose(10**13, -(10**13), 0.0), one)
     assert (grid.odds.shape, grid.scans) == (shape, 1)
+    far = envelope(99, 10.0**6, 0.0, map_yaw=0.0, scan=scan([1000] * 8))
+    folded = Folded.start(ROOMS).extend([*drive(3), far])
+    assert folded.view.counts()["scan_too_far"] == 1
+    assert "1 scan left out, too far from the first" in state_text(folded.view, None)
 
 
 def test_the_largest_map_of_scans_has_no_more_cells_than_a_map_may_have() -> None:
