@@ -51,8 +51,8 @@ PLAIN_DIMENSION: Final = 1_900
 """Dimension up to which a row fits one page of 8 kB and can be kept out of TOAST."""
 EXACT_ROWS: Final = 50_000
 """Rows up to which the table is searched exactly."""
-INDEX_DIMENSION: Final = 2_000
-"""pgvector's limit for an HNSW index on ``vector``."""
+INDEX_DIMENSION: Final = 4_000
+"""pgvector's limit for an HNSW index on ``halfvec``."""
 SAFE_PARALLEL: Final = (0, 8, 2)
 """The first version of pgvector whose parallel build is safe."""
 _MARK: Final = "mapfold"
@@ -331,16 +331,21 @@ def build_hnsw(connection: Connection, *, threshold: int = EXACT_ROWS) -> HnswRe
     if dimension > INDEX_DIMENSION:
         return HnswReport(False, f"{dimension:,} dimensions are beyond HNSW's {INDEX_DIMENSION}")
     started = time.monotonic()
-    opclass = sql.Identifier(_extension_schema(connection), "vector_cosine_ops")
+    schema = _extension_schema(connection)
+    statement = statements("vectors")["hnsw"].format(
+        halfvec=sql.Identifier(schema, "halfvec"),
+        dimension=sql.Literal(dimension),
+        opclass=sql.Identifier(schema, "halfvec_cosine_ops"),
+    )
     with connection.transaction():
         _prepare(connection, rows, dimension)
-        connection.execute(statements("vectors")["hnsw"].format(opclass=opclass))
+        connection.execute(statement)
     return HnswReport(True, f"HNSW index over {counted(rows, 'row')}", time.monotonic() - started)
 
 
 def _prepare(connection: Connection, rows: int, dimension: int) -> None:
     # A vector and its neighbour lists (m = 16) in memory, and a quarter on top.
-    need = int(rows * (4 * dimension + 800) * 1.25) // _MEGABYTE + 64
+    need = int(rows * (2 * dimension + 800) * 1.25) // _MEGABYTE + 64
     memory = sql.Literal(f"{min(need, _MAX_MEMORY_MB)}MB")
     connection.execute(sql.SQL("SET LOCAL maintenance_work_mem = {}").format(memory))
     version = extension_version(connection, "vector") or "0"

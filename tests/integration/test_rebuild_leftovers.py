@@ -98,7 +98,7 @@ def test_an_error_after_the_swap_says_that_the_new_map_is_in_place(
     log: Path, one_database: Targets, pg: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pg.execute("CREATE TABLE public.taken (n int)")
-    pg.execute("CREATE INDEX detection_embeddings_hnsw ON public.taken (n)")
+    pg.execute("CREATE INDEX detection_embeddings_halves ON public.taken (n)")
     for_any_table = partial(build_hnsw, threshold=1)
     monkeypatch.setattr(sys.modules["projections.postgres.shadows"], "build_hnsw", for_any_table)
     with pytest.raises(DatabaseError, match="already exists; the new map is in place"):

@@ -19,6 +19,7 @@ from projections.postgres.check import check
 from projections.postgres.connection import Targets
 from projections.postgres.queries.candidate_search import CandidateReader, relocalize
 from projections.postgres.status import projection_status
+from projections.postgres.vector_sink import build_hnsw
 from tests.support.commands import Commands
 from tests.support.envelopes import detection
 from tests.support.logs import WEIRD, walk, write_log
@@ -80,10 +81,25 @@ def test_candidates_are_those_of_exact_search(targets: Targets, view: MapView) -
         assert (nothing.matches, dict(nothing.places)) == ((), {})
 
 
-def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disabled(
-    targets: Targets, view: MapView
-) -> None:
-    """A plan that the server has cached would search the index nevertheless."""
+def test_what_the_index_finds_is_compared_by_whole_vectors(targets: Targets, view: MapView) -> None:
+    with CandidateReader(targets) as reader:
+        vectors = reader._vectors
+        assert build_hnsw(vectors, threshold=1).built
+        vectors.execute("SET enable_seqscan = off")  # where the index can be used, it is
+        for crops in questions():
+            assert_equal(reader.candidates(crops), ExactIndex(view).search(crops))
+        vectors.execute("SELECT pg_stat_force_next_flush()")
+        (searches,) = vectors.execute(
+            "SELECT idx_scan FROM pg_stat_user_indexes"
+            " WHERE indexrelname = 'detection_embeddings_halves'"
+        ).fetchone() or (0,)
+        assert searches
+        with pytest.raises(QuestionError, match="expected 3 dimensions"):
+            reader.candidates(read_question([detection("cup", [1.0, 0.0, 0.0])]).crops)
+
+
+def test_the_server_plans_a_question_a_few_times_only(targets: Targets, view: MapView) -> None:
+    """Also when the index is disabled, which a plan that was kept obeys."""
     crops = next(questions())[:1]
     expected = ExactIndex(view).search(crops)
     with CandidateReader(targets) as reader:
@@ -103,7 +119,7 @@ def test_the_server_plans_a_question_a_few_times_only_until_the_index_is_disable
         reader.disable_index()
         for _ in range(3):
             assert_equal(reader.candidates(crops), expected)
-        assert plans() == (kept, made + 3)
+        assert plans() == (kept + 3, made)
 
 
 def test_the_library_call_answers_and_refuses_another_embedding_space(

@@ -146,7 +146,9 @@ class CandidateSearch:
         values: dict[str, Any] = {"observation": LABEL_IDS["Observation"]}
         values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
         with _query_errors(self._targets.vector_url):
-            statement = _statement("near_and_graph" if one else "near", len(crops), neighbours)
+            size = max((len(crop.vector) for crop in crops if crop.vector is not None), default=1)
+            name = "near_and_graph" if one else "near"
+            statement = _statement(name, len(crops), neighbours, size)
             values |= self._known.parameters
             rows = self._vectors.execute(statement, values, binary=True).fetchall()
         near, origin = self._near(rows)
@@ -239,9 +241,9 @@ class CandidateSearch:
 
 
 @lru_cache(maxsize=128)
-def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
-    """The text of a statement. In those that search, ``crops`` is the number of crops and
-    ``neighbours`` that of observations for each.
+def _statement(name: str, crops: int = 0, neighbours: int = 0, dimension: int = 1) -> bytes:
+    """The text of a statement. In those that search, ``crops`` is the number of crops, all of one
+    ``dimension``, and ``neighbours`` that of observations for each.
 
     Without comments and line breaks: psycopg reads a short statement once, a long one for every
     question.
@@ -255,7 +257,12 @@ def _statement(name: str, crops: int = 0, neighbours: int = 0) -> bytes:
     run = statements("relocalize")
     composed = run[name].format(
         questions=questions,
-        neighbours=sql.Literal(neighbours),
+        nearest=run["nearest"].format(
+            indexed=run["indexed"],
+            dimension=sql.Literal(dimension),
+            candidates=sql.Literal(max(_CANDIDATES, neighbours)),
+            neighbours=sql.Literal(neighbours),
+        ),
         of_vectors=run["of_vectors"].format(cosines=run["cosines"]),
         of_graph=run["of_graph"].format(
             settings=run["settings"], maps=run["maps"], edges=run["edges"], **tables()
@@ -287,8 +294,8 @@ def _query_errors(url: str) -> Iterator[None]:
             ) from None
 
 
-_EF_SEARCH = max(150, NEIGHBOURS)
-"""At 300,000 observations 0.981 of the ten nearest are found, with 100 0.976, as quickly."""
+_CANDIDATES = max(150, NEIGHBOURS)
+"""As many are found by the index, in its `ef_search`, and compared by their whole vectors."""
 
 
 def relocalize(
@@ -342,7 +349,8 @@ def prepare_vectors(connection: Connection) -> None:
             f" the extension vector is created; run `{advised('replay')}`"
         ) from None
     connection.execute("SELECT '[1]'::vector")  # loads the library, whose settings come next
-    connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_EF_SEARCH)))
+    connection.execute("SET jit = off")  # compiling the exact search takes longer than the other
+    connection.execute(sql.SQL("SET hnsw.ef_search = {}").format(sql.Literal(_CANDIDATES)))
 
 
 class CandidateReader:
@@ -383,8 +391,6 @@ class CandidateReader:
     def disable_index(self) -> None:
         """From now on search exactly, without the HNSW index: slow."""
         self._vectors.execute("SET enable_indexscan = off")
-        # plans made before would still use the index
-        self._vectors.execute("SET plan_cache_mode = force_custom_plan")
 
     def close(self) -> None:
         """Close the connections. May be called twice."""

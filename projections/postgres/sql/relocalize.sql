@@ -92,17 +92,33 @@ observes AS MATERIALIZED (
     WHERE start_id = ANY(ARRAY(SELECT keyframe FROM has))
 )
 
+-- name: indexed
+-- Whether there is an index of halves, and it may be used.
+(SELECT current_setting('enable_indexscan')::boolean AND EXISTS (
+    SELECT 1 FROM pg_catalog.pg_index
+    WHERE indexrelid = to_regclass('public.detection_embeddings_halves')
+      AND indrelid = to_regclass('public.detection_embeddings')))
+
+-- name: nearest
+-- The observations nearest to `question.wanted`: of those that the index finds, by vectors of half
+-- precision, or of all. One of the two sub-selects is never run.
+SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, camera, embedding_model,
+       embedding <=> question.wanted AS distance
+FROM (
+    (SELECT * FROM public.detection_embeddings WHERE {indexed}
+     ORDER BY embedding::halfvec({dimension}) <=> question.wanted::halfvec({dimension}) LIMIT {candidates})
+    UNION ALL
+    (SELECT * FROM public.detection_embeddings WHERE NOT {indexed}
+     ORDER BY embedding <=> question.wanted LIMIT {neighbours})
+) AS found ORDER BY distance LIMIT {neighbours}
+
 -- name: near
 -- The nearest observations of each crop, from the vectors' database; at least one row, of nulls if there
 -- is no observation. Their number is a constant: with a parameter the server would plan every question
 -- anew, because a plan for any number is dearer.
 WITH question (crop, wanted) AS ({questions})
 SELECT {of_vectors}, question.crop, 1 - near.distance, {observed}
-FROM question LEFT JOIN LATERAL (
-    SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, camera, embedding_model,
-           embedding <=> question.wanted AS distance
-    FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
-) AS near ON true
+FROM question LEFT JOIN LATERAL ({nearest}) AS near ON true
 
 -- name: described
 -- These observations, from the vectors' database; at least one row.
@@ -133,11 +149,7 @@ SELECT {of_graph}
 -- Both in one round trip and one snapshot, when they share a database.
 WITH question (crop, wanted) AS ({questions}), found AS MATERIALIZED (
     SELECT question.crop, 1 - near.distance AS similarity, {observed}
-    FROM question LEFT JOIN LATERAL (
-        SELECT det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw, camera, embedding_model,
-               embedding <=> question.wanted AS distance
-        FROM public.detection_embeddings ORDER BY embedding <=> question.wanted LIMIT {neighbours}
-    ) AS near ON true
+    FROM question LEFT JOIN LATERAL ({nearest}) AS near ON true
 ), {followed}
 SELECT {of_vectors}, crop, similarity, det_pk, det_id, run_id, class_name, bbox, map_x, map_y, map_yaw,
        camera, embedding_model, {of_graph}

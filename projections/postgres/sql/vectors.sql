@@ -88,10 +88,11 @@ SET LOCAL default_statistics_target = 20
 ANALYZE {schema}.detection_embeddings (det_pk, det_id, run_id)
 
 -- name: hnsw
--- Crops of look-alikes form tight clusters, which pgvector's default ef_construction of 64 leaves badly
--- joined: a search then misses whole clusters, however wide it is (docs/relocalization.md).
-CREATE INDEX detection_embeddings_hnsw ON public.detection_embeddings
-USING hnsw (embedding {opclass}) WITH (m = 16, ef_construction = 200)
+-- Of half precision: half the size, and what it finds is compared by the whole vectors. Crops of
+-- look-alikes form tight clusters, which pgvector's default ef_construction of 64 leaves badly joined: a
+-- search then misses whole clusters, however wide it is (docs/relocalization.md).
+CREATE INDEX detection_embeddings_halves ON public.detection_embeddings
+USING hnsw ((embedding::{halfvec}({dimension})) {opclass}) WITH (m = 16, ef_construction = 200)
 
 -- name: extension_schema
 SELECT nspname FROM pg_extension JOIN pg_namespace n ON n.oid = extnamespace WHERE extname = 'vector'
