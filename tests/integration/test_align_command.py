@@ -72,10 +72,27 @@ def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> Non
     assert "correct-poses" not in mapfold("edits", log).out
     mapfold("align", log, "--write", "--yes")
     assert mapfold("edits", log).out.count("correct-poses") == 1
-    few = "".join(lines("b", FRAME).splitlines(keepends=True)[:12])
+    few = "".join(lines("b", FRAME).splitlines(keepends=True)[:6])
     part = log_of(mapfold, "part", lines("a", HERE), few)
     said = mapfold("align", part, "--write", "--yes", code=3)
     assert "sim-7-b into the frame of sim-7-a: cannot tell: " in said.out
+
+
+@pytest.mark.slow
+def test_all_runs_are_brought_into_the_frame_of_the_first(mapfold: Commands) -> None:
+    third = lines("b", (-3.0, 9.0, -0.8)).replace("sim-7-b", "third")
+    other = lines("a", HERE, seed=3)[: len(lines("a", HERE, seed=3)) // 9]
+    few = other[: other.rindex("\n") + 1]
+    log = log_of(mapfold, "log", lines("a", HERE), lines("b", FRAME), third, few)
+    said = mapfold("align", log, code=3)
+    assert "sim-7-b into the frame of sim-7-a: moved by (" in said.out
+    assert "third into the frame of sim-7-a: moved by (" in said.out
+    assert "sim-3-a: cannot tell: too little in common with every other run" in said.out
+    told = mapfold("align", log, "--write", "--json", code=3).json
+    assert [each["verdict"] for each in told["runs"]] == ["sure", "sure", "unknown"]
+    assert (told["contradictions"], len(told["recorded"])) == ([], 2)
+    again = mapfold("align", log, code=3).out
+    assert again.count("already in one frame") == 2
 
 
 @pytest.mark.slow

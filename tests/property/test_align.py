@@ -3,6 +3,7 @@ matching the best one; and jumps within a run."""
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 from typing import Any
@@ -78,6 +79,28 @@ def test_another_house_is_not_surely_this_one(seed: int) -> None:
     found = align(things("a"), things("a", seed=seed))
     assert found is None or found.verdict != "sure"
     assert "but not surely" in decision_text(found) or "cannot tell: " in decision_text(found)
+
+
+def test_of_floors_that_look_alike_none_is_taken() -> None:
+    """A building with the same furniture on two floors, which a map has side by side."""
+    floor, aside = things("a"), np.array([60.0, 0.0])
+    both = replace(
+        floor,
+        object_ids=(*floor.object_ids, *(f"{each}_above" for each in floor.object_ids)),
+        classes=np.tile(floor.classes, 2),
+        xy=np.concatenate((floor.xy, floor.xy + aside)),
+        covariance=np.tile(floor.covariance, (2, 1, 1)),
+        looks=np.tile(floor.looks, (2, 1)),
+        sides=np.tile(floor.sides, 2),
+        owners=np.concatenate((floor.owners, floor.owners + len(floor.xy))),
+        seen=np.tile(floor.seen, 2),
+        looked_at=np.concatenate((floor.looked_at, floor.looked_at + aside)),
+    )
+    found = align(both, things("b"))
+    assert found is not None
+    assert found.verdict == "unknown"
+    assert found.is_ambiguous
+    assert "but another transform has" in decision_text(found)
 
 
 def test_nothing_in_common_is_said() -> None:

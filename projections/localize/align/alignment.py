@@ -74,7 +74,7 @@ class Alignment:
     ``second`` is the score of the best other transform's pairs. Of ``expected`` things, which the
     first robot looked at, ``matched`` are matched. ``se_m`` is the predicted standard error over
     the second map's keyframes, ``se_rad`` that of the angle, ``shift_m`` how far they are moved
-    (root mean square).
+    (root mean square). ``information`` is the inverse covariance (3, 3) of the transform.
     """
 
     transform: Transform
@@ -87,11 +87,17 @@ class Alignment:
     se_m: float
     se_rad: float
     shift_m: float
+    information: Floats
 
     @property
     def is_one_frame(self) -> bool:
         """Whether the maps are in one frame already: the transform moves less than its error."""
         return self.verdict != "unknown" and self.shift_m <= 2.0 * self.se_m
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether another transform, as of a place that looks alike, is nearly as good."""
+        return self.score >= LIKELY.score and self.second > LIKELY.second * self.score
 
     @property
     def verdict(self) -> Verdict:
@@ -181,7 +187,8 @@ def _judged(both: Comparison, best: MatchedPairs, refined: list[MatchedPairs]) -
     expected = both.is_expected(best.transform)
     matched = np.zeros(len(expected), np.bool_)
     matched[best.seconds] = True
-    covariance = np.linalg.inv(both.information(best))
+    information = both.information(best)
+    covariance = np.linalg.inv(information)
     slopes = jacobians(second.poses[:, :2] @ rotation(best.transform[2]).T)
     errors = np.einsum("nij,jk,nik->n", slopes, covariance, slopes)
     shifts = moved(second.poses[:, :2], best.transform) - second.poses[:, :2]
@@ -201,6 +208,7 @@ def _judged(both: Comparison, best: MatchedPairs, refined: list[MatchedPairs]) -
         math.sqrt(float(errors.mean())),
         math.sqrt(float(covariance[2, 2])),
         math.sqrt(float((shifts * shifts).sum(1).mean())),
+        information,
     )
 
 
@@ -208,6 +216,11 @@ def decision_text(found: Alignment | None) -> str:
     """One line on whether a transform was found."""
     if found is None or found.verdict == "unknown":
         number = 0 if found is None else len(found.pairs)
+        if found is not None and found.is_ambiguous:
+            return (
+                f"cannot tell: {counted(number, 'common thing')} with score {found.score:.0f}, but"
+                f" another transform has {found.second:.0f}; some places look alike"
+            )
         return (
             f"cannot tell: {counted(number, 'common thing')}; {USUALLY_ENOUGH} are usually enough"
         )

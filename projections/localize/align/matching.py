@@ -9,6 +9,7 @@ the best matching.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, maximum_flow
 from scipy.spatial import cKDTree
 
 from projections.fold.evidence import EvidenceConstants
@@ -267,6 +268,20 @@ def jacobians(turned: Floats) -> Floats:
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
     slopes[:, 0, 2], slopes[:, 1, 2] = -turned[:, 1], turned[:, 0]
     return slopes
+
+
+def least_cut(
+    count: int,
+    edges: Sequence[tuple[int, int]],
+    weights: Sequence[float],
+    ends: tuple[int, int],
+) -> float:
+    """The least sum of weights, in whole numbers, of edges that keep two of ``count`` nodes
+    connected."""
+    both = np.array([*edges, *((other, one) for one, other in edges)]).reshape(-1, 2)
+    flows = np.tile(np.rint(weights).astype(np.int32), 2)
+    graph = coo_array((flows, (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+    return float(maximum_flow(graph, *ends).flow_value)
 
 
 def _chi2(apart: Floats, spread: Floats) -> Floats:

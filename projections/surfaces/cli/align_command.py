@@ -27,9 +27,12 @@ from .terminal import display, emit, finish, say
 if TYPE_CHECKING:
     from projections.localize.align.alignment import Alignment
     from projections.localize.align.jumps import LargeStep
+    from projections.localize.align.several import Contradiction
 
 _NAMED = 5
 """Pairs that the reason of a command names."""
+_SEVERAL = 3
+"""Runs of a log that are all aligned, where none is named."""
 _EVERYWHERE = Span(None, None)
 _NO_JUMP = "no step is larger than the robot's usual ones: no frame jumped"
 
@@ -105,6 +108,51 @@ class _Frames(CachedLog):
                 for run in (runs if self.run is None else [self._known(runs, self.run)])
                 for step in jumps_of_run(reader, end, corrections, settings, view, run)
             ]
+
+    def all_runs(self) -> tuple[list[_Proposal], list["Contradiction"]] | None:
+        """Every run in the frame of the first that it can be joined with, and the pairs that
+        contradict the others; None for a log of less than three runs."""
+        from projections.localize.align.framed_things import map_of_runs, things_of_map
+        from projections.localize.align.several import align_runs
+
+        with self.opened() as opened:
+            reader, end, _, corrections, settings = opened
+            runs = [run.run_id for run in self._view(opened).runs]
+            if len(runs) < _SEVERAL:
+                return None
+            maps = {
+                run: map_of_runs(reader, end, corrections, settings, set(runs) - {run})
+                for run in runs
+            }
+        made = {run: things_of_map(each) for run, each in maps.items()}
+        placed, against = align_runs({run: each for run, each in made.items() if each is not None})
+        proposals = [
+            _Proposal(
+                [each.run],
+                _EVERYWHERE,
+                each.verdict,
+                None if each.is_one_frame or each.verdict == "unknown" else each.transform,
+                str(each),
+                f"aligned to {each.frame} by {counted(each.pairs, 'pair')} of runs",
+                each.document(),
+            )
+            for each in placed
+        ]
+        joined = {each.run for each in placed} | {each.frame for each in placed}
+        proposals += [
+            _Proposal(
+                [run],
+                _EVERYWHERE,
+                "unknown",
+                None,
+                f"{visible(run)}: cannot tell: too little in common with every other run",
+                "",
+                {"run": run, "verdict": "unknown"},
+            )
+            for run in runs
+            if run not in joined
+        ]
+        return proposals, against
 
     def _view(self, opened: OpenLog) -> MapView:
         reader, end, _, corrections, settings = opened
@@ -187,8 +235,9 @@ def align(
 ) -> None:
     """Find the rigid transform that brings a run into the frame of another, or of another log.
 
-    Both runs are mapped alone, by evidence, and their objects compared by looks and distances. A
-    transform is sure, likely, or not found: with few things in common right and wrong look alike.
+    Without --run and --to all runs of a log are aligned, by every pair of them. Each run is mapped
+    alone, by evidence, and objects are compared by looks and distances. A transform is sure,
+    likely, or not found: with few things in common right and wrong look alike.
 
     Exit 3 when none is found, or --write would need --yes; with --jumps when one is not corrected.
     """
@@ -196,7 +245,11 @@ def align(
     if jumps and (picture is not None or frames.to is not None):
         raise MisuseError("--jumps takes neither --to nor --picture: a jump is within a run")
     try:
-        proposals = frames.jumps() if jumps else [frames.pair(picture)]
+        several = None if jumps or frames.run or frames.to or picture else frames.all_runs()
+        if several is not None:
+            proposals = several[0]
+        else:
+            proposals = frames.jumps() if jumps else [frames.pair(picture)]
     except ModuleNotFoundError as error:
         raise MisuseError(
             f"mapfold align needs {error.name}, which is not installed; pip install"
@@ -210,12 +263,16 @@ def align(
         left = [each for each in left if each.verdict not in wanted]
         made = [_record(frames, zenoh, run, each, who) for each in usable for run in each.runs]
     recorded = [recorded_document(each) for each in made]
-    if json_ and jumps:
-        emit({"steps": [each.document for each in proposals], "recorded": recorded})
+    documents = [each.document for each in proposals]
+    if json_ and several is not None:
+        against = [each._asdict() for each in several[1]]
+        emit({"runs": documents, "contradictions": against, "recorded": recorded})
     elif json_:
-        emit({**proposals[0].document, "recorded": recorded})
+        emit(({"steps": documents} if jumps else documents[0]) | {"recorded": recorded})
     else:
-        display("\n".join(each.text for each in proposals) or _NO_JUMP)
+        contradictions = map(str, several[1]) if several is not None else ()
+        lines = [*(each.text for each in proposals), *contradictions]
+        display("\n".join(lines) or _NO_JUMP)
         for each in made:
             display(recorded_text(each))
         if left:

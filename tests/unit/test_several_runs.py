@@ -1,0 +1,88 @@
+"""Several runs in one frame, by pairs whose transforms are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from eventsrc.envelope.model import RunId
+from projections.localize.align.alignment import Alignment
+from projections.localize.align.matching import Transform
+from projections.localize.align.several import (
+    Contradiction,
+    Pair,
+    PlacedRun,
+    _composed,
+    _inverse,
+    placed_runs,
+)
+
+FRAMES: list[Transform] = [(0.0, 0.0, 0.0), (4.0, -9.0, 2.5), (-20.0, 3.0, -1.0), (7.0, 7.0, 0.4)]
+RUNS = [RunId(name) for name in "abcd"]
+POSES = [np.array([(0.0, 0.0, 0.0), (8.0, 1.0, 0.5), (3.0, 6.0, 2.0)])] * 4
+
+
+def pair(one: int, other: int, score: float = 100.0, off: Transform = (0.0, 0.0, 0.0)) -> Pair:
+    """The pair of two of the runs, its transform off by one before it."""
+    true = _composed(_inverse(FRAMES[one]), FRAMES[other])
+    information = np.diag((400.0, 400.0, 4000.0))
+    found = Alignment(
+        _composed(true, off), (), (), score, 0.0, 20, 20, 0.08, 0.02, 9.0, information
+    )
+    return Pair(one, other, found)
+
+
+def placed(*pairs: Pair, count: int = 4) -> tuple[dict[RunId, PlacedRun], list[Contradiction]]:
+    found, against = placed_runs(RUNS[:count], POSES[:count], pairs)
+    return {each.run: each for each in found}, against
+
+
+def test_all_runs_get_the_frame_of_the_first() -> None:
+    """And with more pairs surer than by the pairs that lead there."""
+    chain, _ = placed(pair(0, 1), pair(1, 2), pair(2, 3))
+    every = [pair(i, j) for i in range(4) for j in range(i + 1, 4)]
+    full, against = placed(*every)
+    assert not against
+    for found in (chain, full):
+        assert list(found) == RUNS[1:]
+        for number, each in enumerate(found.values(), start=1):
+            assert each.frame == "a"
+            assert each.verdict == "sure"
+            assert each.transform == pytest.approx(FRAMES[number])
+    assert full[RunId("d")].se_m < 0.6 * chain[RunId("d")].se_m
+
+
+def test_errors_are_shared_by_a_circle_of_pairs() -> None:
+    found, against = placed(pair(0, 1), pair(1, 2), pair(0, 2, off=(0.3, 0.0, 0.0)), count=3)
+    assert not against
+    apart = [math.dist(found[RUNS[n]].transform[:2], FRAMES[n][:2]) for n in (1, 2)]
+    assert 0.05 < apart[0] < 0.15 < apart[1] < 0.25
+
+
+def test_a_pair_that_contradicts_the_others_is_named() -> None:
+    """Even if its score is the largest: the others agree with each other."""
+    good = [pair(i, j) for i in range(4) for j in range(i + 1, 4) if (i, j) != (1, 2)]
+    found, (against,) = placed(*good, pair(1, 2, 120.0, (5.0, 0.0, 0.0)))
+    assert (against.one, against.other, against.score, against.against) == ("b", "c", 120.0, 200.0)
+    assert str(against) == "b and c contradict the other pairs: score 120 against 200"
+    for number, each in enumerate(found.values(), start=1):
+        assert each.transform == pytest.approx(FRAMES[number])
+        assert each.verdict == "likely"  # not sure: 120 is more than half of 200
+    found, _ = placed(*good, pair(1, 2, 45.0, (5.0, 0.0, 0.0)))
+    assert {each.verdict for each in found.values()} == {"sure"}
+
+
+def test_of_three_pairs_that_contradict_none_is_taken() -> None:
+    found, (against,) = placed(pair(0, 1), pair(1, 2), pair(0, 2, 90.0, (5.0, 0.0, 0.0)), count=3)
+    assert (against.one, against.other) == ("a", "c")
+    assert [each.verdict for each in found.values()] == ["unknown", "unknown"]
+    assert "cannot tell" in str(found[RUNS[1]])
+
+
+def test_runs_of_other_buildings_have_frames_of_their_own() -> None:
+    found, _ = placed(pair(0, 2), pair(1, 3, 30.0))
+    assert {run: (each.frame, each.verdict) for run, each in found.items()} == {
+        "c": ("a", "sure"),
+        "d": ("b", "likely"),
+    }
+    assert placed(count=2) == ({}, [])
