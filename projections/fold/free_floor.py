@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from eventsrc.envelope.occupancy_map import MIN_WALL, SCANS, OccupancyMap
 
 from .exact import metres_to_um
-from .occupancy import NOWHERE, OccupancyGrid, Point, pooled
+from .map_regions import NOWHERE
+from .occupancy import OccupancyGrid, Point, pooled
 
 MOST_DOORS: Final = 2
 REACH_M: Final = 4.0

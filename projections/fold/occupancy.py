@@ -13,25 +13,10 @@ region around it.
 Unknown cells and everything outside the grid are no walls. Nor are small ones, such as legs of
 furniture.
 
-*Regions* are areas in which a robot can drive without passing a narrow place:
-
-1.  A cell's *clearance* is the distance of its middle to that of the nearest wall cell, as an exact
-    squared number of cells, up to a cap. Beyond it all is wide.
-2.  The grid is flooded from the widest cells down (a watershed; Beucher and Lantuéjoul 1979), those
-    of one clearance row by row. A cell that touches no region begins one, whose *width* is its
-    clearance. One that touches a region joins it: that of its neighbour with the largest clearance,
-    ties to the right, the left, above, below, then the corners.
-3.  Where a cell touches several regions, its own clearance is that of the passage between them.
-    A region becomes one with the widest of them if the passage is at least `PASSAGE` of that
-    region's own width, or if the region is narrower than `MIN_WIDTH_M` and so no room. Else the
-    passage is a *narrow place*, and the two stay apart.
-
-So there is no fixed width of doors: a door of 0.9 m parts a room from a corridor of 1.2 m, a
-passage of two metres parts two halls, and a corridor is one region from end to end.
+*Regions* are areas without a narrow place inside (`map_regions`).
 """
 
 import math
-from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -40,138 +25,7 @@ from numpy.typing import NDArray
 from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED, OccupancyMap
 
 from .exact import UM_PER_M, cos_sin, distance_um, metres_to_um
-
-Walls = NDArray[np.bool_]
-"""Shape (rows, columns), true where a cell is wall."""
-Labels = NDArray[np.int32]
-
-PASSAGE: Final = (7, 8)
-"""A passage of this share of a region's width is no narrow place; docs/places.md says what it was
-chosen on."""
-CAP_M: Final = 2.0
-MIN_WIDTH_M: Final = 0.4
-NOWHERE: Final = -1
-"""The region of wall cells."""
-
-
-def clearance(walls: Walls, cap: int) -> NDArray[np.int32]:
-    """The squared distance of each cell to the nearest wall cell, in cells²; ``cap``² at most.
-
-    Two passes (Meijster et al. 2000): along columns, then the lowest of the parabolas of a row.
-    """
-    rows, columns = walls.shape
-    along = np.full((rows, columns), cap, np.int32)
-    along[walls] = 0
-    for row in range(1, rows):
-        np.minimum(along[row], along[row - 1] + 1, out=along[row])
-    for row in range(rows - 2, -1, -1):
-        np.minimum(along[row], along[row + 1] + 1, out=along[row])
-    squared = along * along
-    nearest = squared.copy()
-    for shift in range(1, min(cap, columns)):
-        reached = squared + shift * shift
-        np.minimum(nearest[:, shift:], reached[:, :-shift], out=nearest[:, shift:])
-        np.minimum(nearest[:, :-shift], reached[:, shift:], out=nearest[:, :-shift])
-    limited: NDArray[np.int32] = np.minimum(nearest, cap * cap)
-    return limited
-
-
-def regions(walls: Walls, cell_m: float) -> Labels:
-    """The region of each cell, numbered from 0 in the order of their first cells; `NOWHERE` for
-    walls."""
-    cap = max(2, math.ceil(CAP_M / cell_m))
-    wide = np.zeros((walls.shape[0] + 2, walls.shape[1] + 2), np.int32)  # a border of wall
-    wide[1:-1, 1:-1] = clearance(walls, cap)
-    least = math.floor((MIN_WIDTH_M / cell_m) ** 2)
-    flat, stride = wide.ravel(), wide.shape[1]
-    basins, summits = _basins(flat, stride)
-    merged = np.array(_merged(flat, stride, basins, flat[summits].tolist(), least), np.int32)
-    labels = np.full(flat.size, NOWHERE, np.int32)
-    floor = np.flatnonzero(flat)
-    own = merged[basins[floor]]
-    first = np.zeros(len(merged), np.int64)
-    first[own[::-1]] = floor[::-1]  # of equal indices the last one counts
-    kept = np.unique(own)
-    numbers = np.zeros(len(merged), np.int32)
-    numbers[kept[np.argsort(first[kept])]] = np.arange(len(kept), dtype=np.int32)
-    labels[floor] = numbers[own]
-    return labels.reshape(wide.shape)[1:-1, 1:-1]
-
-
-def _before(wide: Labels, stride: int) -> Iterator[tuple[int, Walls, Labels]]:
-    """For each neighbour of the inner cells of a grid in rows of ``stride``, in the order of rule
-    2: the step there, whether it is flooded before the cell, and its clearance."""
-    inner = slice(stride + 1, wide.size - stride - 1)
-    for step in (1, -1, stride, -stride, stride + 1, stride - 1, 1 - stride, -1 - stride):
-        beside = wide[inner.start + step : inner.stop + step]
-        yield step, (beside > wide[inner] if step > 0 else beside >= wide[inner]), beside
-
-
-def _basins(wide: Labels, stride: int) -> tuple[Labels, NDArray[np.intp]]:
-    """What each cell joins when it is flooded, if nothing ever merges: the basins' numbers, in the
-    order in which they begin, and the cells that they begin with."""
-    cells = np.arange(wide.size, dtype=np.int32)
-    widest, best = np.full(wide.size - 2 * stride - 2, -1, np.int32), cells.copy()
-    inner = best[stride + 1 : wide.size - stride - 1]
-    for step, is_before, beside in _before(wide, stride):
-        better = is_before & (beside > widest)
-        np.copyto(widest, beside, where=better)
-        np.copyto(inner, cells[stride + 1 + step : wide.size - stride - 1 + step], where=better)
-    best[wide == 0] = 0
-    while not np.array_equal(further := best[best], best):
-        best = further
-    summits = np.flatnonzero((best == cells) & (wide > 0))
-    summits = summits[np.argsort(-wide[summits], kind="stable")]
-    numbers = np.full(wide.size, NOWHERE, np.int32)
-    numbers[summits] = np.arange(len(summits))
-    return numbers[best], summits
-
-
-def _merged(wide: Labels, stride: int, basins: Labels, widths: list[int], least: int) -> list[int]:
-    """Merge basins by rule 3; returns the one that each is part of. ``widths`` are theirs.
-
-    Where a cell touches just two basins that touched before, nothing merges: their passage was
-    wider then, and the narrower of them is no narrower now.
-    """
-    inner = slice(stride + 1, wide.size - stride - 1)
-    cells, others = list[NDArray[np.intp]](), list[Labels]()
-    for step, is_before, _ in _before(wide, stride):
-        beside = basins[inner.start + step : inner.stop + step]
-        found = np.flatnonzero(is_before & (beside != basins[inner]) & (wide[inner] > 0))
-        cells.append(found + inner.start)
-        others.append(beside[found])
-    cell, other = np.concatenate(cells), np.concatenate(others).astype(np.int64)
-    touches = np.unique(cell * len(widths) + other)
-    cell, other = touches // max(len(widths), 1), touches % max(len(widths), 1)
-    order = np.argsort(-wide[cell], kind="stable")
-    cell, other = cell[order], other[order]
-    own = basins[cell].astype(np.int64)
-    pairs = np.minimum(own, other) * len(widths) + np.maximum(own, other)
-    is_news = np.zeros(len(cell), np.bool_)
-    is_news[np.unique(pairs, return_index=True)[1]] = True
-    again = cell[1:] == cell[:-1]
-    is_news[1:] |= again
-    is_news[:-1] |= again
-    touched = dict[int, list[int]]()
-    for at, beside in zip(cell[is_news].tolist(), other[is_news].tolist(), strict=True):
-        touched.setdefault(at, [int(basins[at])]).append(beside)
-    parents = list(range(len(widths)))
-
-    def root(label: int) -> int:
-        while parents[label] != label:
-            parents[label] = parents[parents[label]]
-            label = parents[label]
-        return label
-
-    numerator, denominator = (part * part for part in PASSAGE)
-    for at, labels in touched.items():
-        passage = int(wide[at])
-        first, *rest = sorted({*map(root, labels)}, key=lambda r: (-widths[r], r))
-        for each in rest:
-            if passage * denominator >= widths[each] * numerator or widths[each] < least:
-                parents[each] = first
-    return list(map(root, parents))
-
+from .map_regions import NOWHERE, Labels, Walls, clearance, clearance_cap, regions
 
 LEAST_WALL_M: Final = 0.5
 """Connected wall cells that are shorter than this in x and in y are no wall."""
@@ -184,6 +38,9 @@ SMALL_M2: Final = 110
 SMALL_SHARE: Final = 4
 """Largest region, in square metres, that counts as one room: a way in it counts as a quarter. Both
 were chosen on buildings with walls; docs/places.md has the figures."""
+CORRIDOR_M: Final = 4
+"""A larger region counts as one, too, if its floor is as near to walls as that of a corridor this
+wide: in the mean of squares a twelfth of its square."""
 _SPREAD: Final = 5
 """Depth in blocks to which the cells of a wall are of the region beside it."""
 _TURN_BITS: Final = 30
@@ -208,7 +65,8 @@ class OccupancyGrid:
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
         self.inside: Labels = regions(kept, block_m)
         """The region of each block, `NOWHERE` for those with a wall."""
-        self._small = _small_regions(self.inside, self.block * self.side_um)
+        near = clearance(kept, clearance_cap(block_m))
+        self._small = _small_regions(self.inside, near, self.block * self.side_um)
         self.regions: Labels = _spread(self.inside, _SPREAD)
 
     def cell(self, point: Point) -> tuple[int, int]:
@@ -373,11 +231,19 @@ def _without_small(walls: Walls, least: int) -> Walls:
     return kept
 
 
-def _small_regions(labels: Labels, side_um: int) -> frozenset[int]:
-    """The regions of at most ``SMALL_M2``, of blocks with sides of ``side_um``."""
-    sizes = np.bincount(labels[labels != NOWHERE]).tolist()
-    most_um2 = SMALL_M2 * UM_PER_M * UM_PER_M
-    return frozenset(r for r, size in enumerate(sizes) if size * side_um * side_um <= most_um2)
+def _small_regions(labels: Labels, near: NDArray[np.int32], side_um: int) -> frozenset[int]:
+    """The regions of at most ``SMALL_M2`` and corridors, of blocks with sides of ``side_um`` and
+    their clearance."""
+    inside = labels != NOWHERE
+    sizes = np.bincount(labels[inside]).tolist()
+    sums = np.bincount(labels[inside], near[inside]).tolist()  # exact: integers
+    most_um2, side_um2 = SMALL_M2 * UM_PER_M * UM_PER_M, side_um * side_um
+    wide_um2 = CORRIDOR_M * CORRIDOR_M * UM_PER_M * UM_PER_M
+    return frozenset(
+        region
+        for region, (size, total) in enumerate(zip(sizes, sums, strict=True))
+        if size * side_um2 <= most_um2 or 12 * int(total) * side_um2 <= size * wide_um2
+    )
 
 
 def _spread(labels: Labels, steps: int) -> Labels:

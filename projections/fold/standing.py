@@ -27,7 +27,8 @@ import numpy as np
 from . import State, packed
 from .deltas import ObjectEstimated, ObjectOrdinal, PlaceOrdinal
 from .free_floor import Block, FreeFloor
-from .occupancy import NOWHERE, Point
+from .map_regions import NOWHERE
+from .occupancy import Point
 from .pair_groups import PlaceSurvivors
 
 FloorAt: TypeAlias = Callable[[Point], tuple[int, FreeFloor, Point] | None]

@@ -23,7 +23,8 @@ from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.fold.deltas import PlaceOrdinal
 from projections.fold.exact import UM_PER_M
 from projections.fold.free_floor import FreeFloor, free_floor
-from projections.fold.occupancy import NOWHERE, occupied, pooled
+from projections.fold.map_regions import NOWHERE
+from projections.fold.occupancy import occupied, pooled
 
 from .view import MapView
 

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projections.fold.occupancy import (
+from projections.fold.map_regions import (
     MIN_WIDTH_M,
     NOWHERE,
     PASSAGE,
+    USUAL_M2,
     Labels,
     Walls,
     clearance,
@@ -46,7 +47,9 @@ def _slow_regions(walls: Walls, cell_m: float) -> Labels:
     groups: list[dict[str, object]] = []
     member: dict[tuple[int, int], set[tuple[int, int]]] = {}
     width: dict[int, int] = {}
+    usual: dict[int, int] = {}
     born: dict[int, int] = {}
+    enough = math.ceil(USUAL_M2 / cell_m**2)
     for row, column in cells:
         own = int(wide[row, column])
         steps = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -55,6 +58,7 @@ def _slow_regions(walls: Walls, cell_m: float) -> Labels:
             new = {(row, column)}
             member[row, column] = new
             width[id(new)], born[id(new)] = own, len(groups)
+            usual[id(new)] = own if enough == 1 else 0
             groups.append({"keep": new})  # so that no id is used twice
             continue
         nearest = max(beside, key=lambda rc: (wide[rc], -beside.index(rc)))
@@ -62,15 +66,23 @@ def _slow_regions(walls: Walls, cell_m: float) -> Labels:
         joined = member[nearest]
         joined.add((row, column))
         member[row, column] = joined
+        if len(joined) == enough:
+            usual[id(joined)] = own
         ordered = sorted(touched.values(), key=lambda g: (-width[id(g)], born[id(g)]))
-        main = ordered[0]
+        apart = ordered[:1]
         for other in ordered[1:]:
-            w = width[id(other)]
-            is_wide = math.sqrt(own) >= PASSAGE[0] / PASSAGE[1] * math.sqrt(w) - 1e-12
-            if is_wide or w < math.floor((MIN_WIDTH_M / cell_m) ** 2):
-                main |= other
-                for rc in other:
-                    member[rc] = main
+            for main in apart:
+                w, of_both = width[id(other)], max(usual[id(main)], usual[id(other)])
+                needed = PASSAGE[0] / PASSAGE[1] * math.sqrt(min(w, of_both))
+                is_wide = math.sqrt(own) >= needed - 1e-12
+                if is_wide or w < math.floor((MIN_WIDTH_M / cell_m) ** 2):
+                    main |= other
+                    usual[id(main)] = of_both or (own if len(main) >= enough else 0)
+                    for rc in other:
+                        member[rc] = main
+                    break
+            else:
+                apart.append(other)
     labels = np.full(walls.shape, NOWHERE, np.int32)
     numbers: dict[int, int] = {}
     for row, column in sorted(member):
@@ -128,6 +140,21 @@ def test_a_corridor_is_one_region_beside_its_rooms() -> None:
     assert len(corridor) == 1
     assert len(rooms) == 3
     assert not rooms & corridor
+
+
+def test_a_corridor_is_one_region_though_wider_at_doors_and_where_another_crosses() -> None:
+    walls = np.ones((90, 170), bool)
+    walls[1:31, 1:169] = walls[53:83, 1:169] = False  # what is behind the doors
+    for door in (20, 60, 100, 140):
+        walls[31, door : door + 12] = walls[52, door : door + 12] = False  # facing doors
+    walls[1:83, 110:128] = True
+    walls[1:83, 111:127] = False  # a corridor of 1.6 m
+    walls[32:52, 1:169] = False  # one of 2 m across
+    found = regions(walls, 0.1)
+    corridor = set(found[41, 1:169].tolist())
+    assert len(corridor) == 1
+    assert set(found[2:82, 119].tolist()) == corridor
+    assert not corridor & set(found[15, 1:105].tolist())
 
 
 def test_what_is_too_narrow_for_a_room_is_part_of_what_it_opens_to() -> None:

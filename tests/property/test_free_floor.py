@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
 from projections.fold.free_floor import MOST_DOORS, REACH_M, FreeFloor
-from projections.fold.occupancy import NOWHERE, OccupancyGrid
+from projections.fold.map_regions import NOWHERE
+from projections.fold.occupancy import OccupancyGrid
 from projections.map.place_regions import outlines
 from tests.support.thorough import examples
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
-from projections.fold.occupancy import MAX_BLOCKS, NOWHERE, OccupancyGrid
+from projections.fold.map_regions import NOWHERE
+from projections.fold.occupancy import MAX_BLOCKS, OccupancyGrid
 
 M = 1_000_000
 
@@ -45,6 +46,14 @@ def test_a_way_in_a_small_region_counts_as_a_quarter_and_through_a_door_as_none(
     assert large.straight_way_um((M, M), (2 * M, M)) == M
     assert small.straight_way_um((M, M), (2 * M, M)) == M // 4
     assert small.straight_way_um((2 * M, int(1.5 * M)), (int(4.1 * M), int(1.5 * M))) is None
+
+
+def test_a_way_in_a_long_corridor_counts_as_a_quarter_and_in_a_hall_as_large_whole() -> None:
+    for wide, share in ((3, 4), (8, 1)):
+        cells = np.zeros((wide * 10 + 2, 600))
+        cells[[0, -1], :] = cells[:, [0, -1]] = 100
+        grid = OccupancyGrid(_map(cells))
+        assert grid.straight_way_um((20 * M, M), (24 * M, M)) == 4 * M // share
 
 
 def test_a_wall_parts_what_one_region_holds() -> None:
