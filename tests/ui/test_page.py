@@ -237,7 +237,7 @@ def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, scheme: str) 
 def test_everything_is_reached_with_the_keyboard(sample: UiServer, visit: Visit) -> None:
     page = visit(sample)
     reached = set()
-    for _ in range(60):
+    for _ in range(120):
         page.keyboard.press("Tab")
         reached.add(
             page.evaluate(

@@ -55,7 +55,6 @@ export function Find() {
     if (history === null) return;
     if (text.value.trim() === "") {
       problem.value = { message: "Write a condition, or click an example below.", column: null };
-      document.getElementById("condition")?.focus();
       return;
     }
     setBusy(true);
