@@ -19,9 +19,7 @@ the best one is as far away as the Object is seen from usually. Of equal ones th
 import heapq
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +30,10 @@ from eventsrc.envelope.occupancy_map import MIN_WALL, OCCUPIED
 from projections.fold.exact import UM_PER_M, metres_to_um
 from projections.fold.free_floor import free_floor
 from projections.fold.occupancy import OccupancyGrid
-from projections.map.records import KeyframeRecord, ObjectRecord
+from projections.map.records import KeyframeRecord, ObjectRecord, Poses
 from projections.map.view import MapView
+
+from .goal_pose import GoalPose
 
 CLEARANCE_M: Final = 0.3
 Floats = NDArray[np.float64]
@@ -42,6 +42,9 @@ Spot = tuple[float, float]
 
 _CELL_M: Final = 0.25
 _BESIDE_M: Final = 0.75
+_REACH: Final = math.ceil(_BESIDE_M / _CELL_M)
+_ROUNDING: Final = 1e-9
+"""By so much numpy's distances may differ from `math.dist`, which decides."""
 STEP_M: Final = 5.0
 _BEST_M: Final = 2.5
 _A_METRE: Final = 0.2
@@ -60,99 +63,73 @@ _Candidate = tuple[Spot, _Floor, KeyframeRecord | None, float]
 """A spot on a floor, the keyframe that was there, and by how much it is worse than the best."""
 
 
-@dataclass(frozen=True, slots=True)
-class GoalPose:
-    """A pose in metres and radians from which to see a thing, ``distance_m`` away. ``ground`` says
-    what it stands on: ``seen`` that the thing was seen from there, by ``run_id`` and
-    ``keyframe_id``. ``walls_known`` is false where no occupancy map says how far walls are."""
-
-    x: float
-    y: float
-    yaw: float
-    distance_m: float
-    ground: str
-    walls_known: bool
-    floor: str | None
-    run_id: str | None
-    keyframe_id: int | None
-    frame_id: str = "map"
-
-    def __repr__(self) -> str:
-        at = f"({self.x:.2f}, {self.y:.2f}) facing {math.degrees(self.yaw):.0f}°"
-        return f"<goal at {at}, {self.distance_m:.2f} m away, {self.ground} ground>"
-
-    def document(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
-
-    def pose_stamped(self) -> str:
-        """As ``geometry_msgs/PoseStamped`` in YAML, its stamp zero, which means now."""
-        position, orientation = self._in_yaml()
-        return (
-            "header:\n  stamp: {sec: 0, nanosec: 0}\n  frame_id: map\n"
-            f"pose:\n  position: {position}\n  orientation: {orientation}\n"
-        )
-
-    def topic_pub(self) -> str:
-        """As a command line of ROS 2 that sends it to Nav2."""
-        position, orientation = self._in_yaml()
-        pose = f"{{position: {position}, orientation: {orientation}}}"
-        message = f"{{header: {{frame_id: map}}, pose: {pose}}}"
-        return f"ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '{message}'\n"
-
-    def _in_yaml(self) -> tuple[str, str]:
-        z, w = math.sin(self.yaw / 2), math.cos(self.yaw / 2)
-        return (
-            f"{{x: {self.x:.3f}, y: {self.y:.3f}, z: 0.0}}",
-            f"{{x: 0.0, y: 0.0, z: {z:.6f}, w: {w:.6f}}}",
-        )
-
-
 class DrivenGround:
-    """The driven ground of a map, without the map. ``nodes`` are its keyframes, one a square."""
+    """The driven ground of a map, without the map. A *node* is the first pose in a square, and
+    ``spots`` are their positions."""
 
     def __init__(self, view: MapView) -> None:
         self._grids: dict[_Floor, OccupancyGrid] = {
             floor: free_floor(given.map).grid for floor, given in view.maps_in_force().items()
         }
-        self.nodes: list[KeyframeRecord] = []
-        self.spots: list[Spot] = []
-        self._of: dict[tuple[_Floor, int, int], int] = {}
-        self._links: list[dict[int, float]] = []
+        poses = view.poses()
+        squares, wide = _squares(poses)
+        found, first, of = np.unique(squares, return_index=True, return_inverse=True)
+        numbers = np.empty(len(first), np.int64)  # by square its node, in the order of their poses
+        numbers[np.argsort(first)] = np.arange(len(first))
+        nodes, first = numbers[of], np.sort(first)
+        self._keyframes = view.keyframes
+        self._ordinals: list[int] = poses.keyframes[first].tolist()
+        self._nodes = np.full(len(view.keyframes), -1)
+        self._nodes[poses.keyframes] = nodes
+        self._metres = poses.positions_um[first] / UM_PER_M
+        self.spots: list[Spot] = [(x, y) for x, y in self._metres.tolist()]
+        floors: set[_Floor] = {poses.names[number] for number in np.unique(poses.floors).tolist()}
         self._standing: dict[tuple[_Floor, int, int], list[ObjectRecord]] = {}
-        every_floor = {keyframe.floor for keyframe in view.keyframes}
         for each in view.objects.values():
             if each.confirmed and each.estimate is not None and each.missing_in is None:
-                floors = every_floor
-                if len(every_floor) > 1:  # without floors the sightings need not be read
-                    floors = {keyframe.floor for keyframe in view.sightings(each)}
-                for floor in floors:
+                of_it = floors
+                if len(floors) > 1:  # without floors the sightings need not be read
+                    of_it = {keyframe.floor for keyframe in view.sightings(each)}
+                for floor in of_it:
                     self._standing.setdefault((floor, *_stand(each.spot)), []).append(each)
-        last: dict[int, tuple[int, int]] = {}
-        self._floors = {floor: number for number, floor in enumerate(every_floor)}
-        self._posed = [k for k in view.keyframes if k.pose is not None]
-        for keyframe in sorted(self._posed, key=lambda k: (k.run, k.keyframe_id)):
-            node = self._node(keyframe)
-            before = last.get(keyframe.run)
-            if before is not None and before[0] != node:
-                self._link(before[0], node, STEP_M)
-            last[keyframe.run] = node, keyframe.ordinal
-        for node in range(len(self.nodes)):
-            for other in self._beside(node):
-                if self.is_free(self.nodes[node].floor, self.spots[node], self.spots[other]):
-                    self._link(node, other, _BESIDE_M)
+        self._floors = {floor: number for number, floor in enumerate(poses.names)}
+        at_last = np.flatnonzero(poses.runs == poses.runs.max(initial=0))
+        self._last: Floats = np.column_stack(
+            [poses.positions_um[at_last] / UM_PER_M, poses.floors[at_last]]
+        )
+        went = np.flatnonzero((np.diff(poses.runs) == 0) & (np.diff(nodes) != 0))
+        driven = self._within(np.stack([nodes[went], nodes[went + 1]]), STEP_M)
+        beside = self._within(np.sort(numbers[_beside(found, wide)], axis=0), _BESIDE_M)
+        a, b = np.concatenate([driven, self._without_walls(beside)], axis=1)
+        count = len(first)
+        links = np.unique(np.concatenate([a * count + b, b * count + a]))
+        self._links: list[int] = (links % max(count, 1)).tolist()
+        """The nodes that each is linked with, end to end; those of a node from ``_starts`` on."""
+        self._starts: list[int] = np.searchsorted(links, np.arange(count + 1) * count).tolist()
 
     def nearest(self, spot: Spot, among: Iterable[int] | None = None) -> int:
         """The node that is nearest to a spot in a straight line. Raises MisuseError for none."""
-        nodes = range(len(self.nodes)) if among is None else among
-        found = min(nodes, key=lambda n: (math.dist(self.spots[n], spot), n), default=None)
+        if among is None:
+            with np.errstate(over="ignore"):
+                away = np.hypot(*(self._metres - spot).T)
+                # of those that rounding may have put in another order the nearest is sought again
+                among = np.flatnonzero(
+                    away <= away.min(initial=math.inf) * (1 + _ROUNDING)
+                ).tolist()
+        found = min(among, key=lambda n: (math.dist(self.spots[n], spot), n), default=None)
         if found is None:
             raise MisuseError("this map has no driven ground: no keyframe has a pose")
         return found
 
-    def node_of(self, keyframe: KeyframeRecord) -> int | None:
-        """The node of a keyframe; None without a pose."""
-        return None if keyframe.pose is None else self._of[self._square(keyframe)]
+    def keyframe(self, node: int) -> KeyframeRecord:
+        """The keyframe that a node is the pose of."""
+        return self._keyframes[self._ordinals[node]]
+
+    def nodes_of(self, keyframes: Sequence[int]) -> list[int]:
+        """The nodes of those of some keyframes that have a pose."""
+        found = self._nodes[keyframes] if keyframes else self._nodes[:0]
+        nodes: list[int] = found[found >= 0].tolist()
+        return nodes
 
     def lengths_from(self, start: int) -> tuple[dict[int, float], dict[int, int]]:
         """The length of the shortest way to each node that has one, and the node before it."""
@@ -163,10 +140,12 @@ class DrivenGround:
             if node in done:
                 continue
             done.add(node)
-            for other, step in self._links[node].items():
-                if length + step < lengths.get(other, math.inf):
-                    lengths[other], before[other] = length + step, node
-                    heapq.heappush(waiting, (length + step, other))
+            spot = self.spots[node]
+            for other in self._links[self._starts[node] : self._starts[node + 1]]:
+                longer = length + math.dist(spot, self.spots[other])
+                if longer < lengths.get(other, math.inf):
+                    lengths[other], before[other] = longer, node
+                    heapq.heappush(waiting, (longer, other))
         return lengths, before
 
     def nodes_between(self, start: int, end: int) -> list[int] | None:
@@ -180,14 +159,14 @@ class DrivenGround:
         return nodes[::-1]
 
     def way_m(
-        self, found: ObjectRecord, seen_by: Iterable[KeyframeRecord], lengths: Mapping[int, float]
+        self, found: ObjectRecord, seen_by: Sequence[int], lengths: Mapping[int, float]
     ) -> float | None:
-        """The length of the shortest way to an Object: driven to where it was seen from, then
-        straight; None where none of that is reached."""
+        """The length of the shortest way to an Object: driven to where some keyframes saw it from,
+        then straight; None where none of that is reached."""
         ways = [
             lengths[node] + math.dist(self.spots[node], found.spot)
-            for keyframe in seen_by
-            if (node := self.node_of(keyframe)) is not None and node in lengths
+            for node in self.nodes_of(seen_by)
+            if node in lengths
         ]
         return min(ways, default=None)
 
@@ -244,7 +223,7 @@ class DrivenGround:
             spot = _spot(keyframe)
             blocked = int(self._is_taken(keyframe.floor, spot, found))
             blocked += not self.is_free(keyframe.floor, spot, found.spot)
-            worse = flaws[self._of[self._square(keyframe)]] + _BLOCKED * blocked
+            worse = flaws[int(self._nodes[keyframe.ordinal])] + _BLOCKED * blocked
             yield spot, keyframe.floor, keyframe, worse + _EARLIER * (keyframe.run != last)
 
     def _flaws(self, seen: Sequence[KeyframeRecord]) -> dict[int, float]:
@@ -252,18 +231,12 @@ class DrivenGround:
         run was."""
         saw = self._places(seen)
         flaws = dict[int, float]()
-        for node in {self._of[self._square(keyframe)] for keyframe in seen}:
-            place = *self.spots[node], self._floors[self.nodes[node].floor]
+        for node in set(self.nodes_of([keyframe.ordinal for keyframe in seen])):
+            place = *self.spots[node], self._floors[self.keyframe(node).floor]
             around = np.exp(_apart(saw, place) ** 2 / (-2 * _AROUND_M**2)).sum()
             off = _apart(self._last, place).min(initial=1.0)
             flaws[node] = math.exp(-float(around) / _MANY) + _OFF_LAST * float(off)
         return flaws
-
-    @cached_property
-    def _last(self) -> Floats:
-        """Where the last run was."""
-        last = max(keyframe.run for keyframe in self._posed)
-        return self._places([keyframe for keyframe in self._posed if keyframe.run == last])
 
     def _places(self, keyframes: Iterable[KeyframeRecord]) -> Floats:
         """x, y and the number of the floor of each keyframe."""
@@ -285,7 +258,8 @@ class DrivenGround:
         return grid is None or grid.is_free_line(_um(a), _um(b))
 
     def _driven(self) -> Iterator[_Candidate]:
-        for spot, keyframe in zip(self.spots, self.nodes, strict=True):
+        for node, spot in enumerate(self.spots):
+            keyframe = self.keyframe(node)
             yield spot, keyframe.floor, keyframe, 0.0
 
     def _around(self, found: ObjectRecord) -> Iterator[_Candidate]:
@@ -319,34 +293,51 @@ class DrivenGround:
         near = (across**2 + down**2) * grid.source.resolution**2
         return not bool((near < clearance_m**2).any())
 
-    def _square(self, keyframe: KeyframeRecord) -> tuple[_Floor, int, int]:
-        x_um, y_um = _pose_um(keyframe)
-        side = metres_to_um(_CELL_M)
-        return keyframe.floor, x_um // side, y_um // side
+    def _within(self, pairs: NDArray[np.int64], most_m: float) -> NDArray[np.int64]:
+        """The pairs of nodes, shape (2, n), that are at most so far from each other."""
+        away = np.hypot(*(self._metres[pairs[0]] - self._metres[pairs[1]]).T)
+        is_near = away <= most_m
+        for row in np.flatnonzero(np.abs(away - most_m) <= most_m * _ROUNDING).tolist():
+            a, b = pairs[:, row].tolist()
+            is_near[row] = math.dist(self.spots[a], self.spots[b]) <= most_m
+        return pairs[:, is_near]
 
-    def _node(self, keyframe: KeyframeRecord) -> int:
-        square = self._square(keyframe)
-        if square not in self._of:
-            self._of[square] = len(self.nodes)
-            self.nodes.append(keyframe)
-            self.spots.append(_spot(keyframe))
-            self._links.append({})
-        return self._of[square]
+    def _without_walls(self, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The pairs of nodes of a floor with no known wall in between."""
+        if not self._grids:
+            return pairs
+        is_free = [
+            self.is_free(self.keyframe(a).floor, self.spots[a], self.spots[b])
+            for a, b in pairs.T.tolist()
+        ]
+        return pairs[:, is_free]
 
-    def _link(self, a: int, b: int, most_m: float) -> None:
-        length = math.dist(self.spots[a], self.spots[b])
-        if length <= most_m:
-            self._links[a][b] = self._links[b][a] = length
 
-    def _beside(self, node: int) -> Iterator[int]:
-        """Later nodes in the squares around one."""
-        floor, column, row = self._square(self.nodes[node])
-        reach = math.ceil(_BESIDE_M / _CELL_M)
-        for x in range(column - reach, column + reach + 1):
-            for y in range(row - reach, row + reach + 1):
-                other = self._of.get((floor, x, y))
-                if other is not None and other > node:
-                    yield other
+def _squares(poses: Poses) -> tuple[NDArray[np.int64], int]:
+    """The square of each pose as a number, and by how much that grows from one column to the next;
+    `_REACH` squares around those of a floor are nobody's."""
+    cells = poses.positions_um // metres_to_um(_CELL_M)
+    columns, rows = (cells - cells.min(axis=0, initial=0)).T
+    wide = int(rows.max(initial=0)) + 1 + _REACH
+    floor = (int(columns.max(initial=0)) + 1 + _REACH) * wide
+    return poses.floors * floor + columns * wide + rows, wide
+
+
+def _beside(squares: NDArray[np.int64], wide: int) -> NDArray[np.int64]:
+    """The pairs of ascending squares, as indices of shape (2, n), that are at most `_REACH` columns
+    and rows apart."""
+    steps = [
+        columns * wide + rows
+        for columns in range(_REACH + 1)
+        for rows in range(-_REACH, _REACH + 1)
+        if (columns, rows) > (0, 0)
+    ]
+    pairs = []
+    for step in steps:
+        at = np.minimum(np.searchsorted(squares, squares + step), len(squares) - 1)
+        there = np.flatnonzero(squares[at] == squares + step)
+        pairs.append(np.stack([there, at[there]]))
+    return np.concatenate(pairs, axis=1)
 
 
 def _spot(keyframe: KeyframeRecord) -> Spot:

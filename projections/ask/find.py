@@ -318,8 +318,7 @@ class _Ways:
 
     def to(self, each: ObjectRecord) -> float | None:
         """The length of the way to an Object, in metres; None where there is none."""
-        seen_by = self._view.sightings(each)
-        way = self._ground.way_m(each, seen_by, self._lengths)
+        way = self._ground.way_m(each, self._view.seen_by(each), self._lengths)
         return None if way is None else self._more + way
 
 

@@ -14,8 +14,9 @@ from projections.map.place_regions import place_regions
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
-from .driven_ground import CLEARANCE_M, STEP_M, DrivenGround, GoalPose, Spot
+from .driven_ground import CLEARANCE_M, STEP_M, DrivenGround, Spot
 from .find import FoundObject, SeenAt, answer_of, point_of, seen_at
+from .goal_pose import GoalPose
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,15 +160,17 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
             f" {STEP_M:g} m or less"
         )
     spots = [ground.spots[node] for node in nodes]
+    keyframes = [ground.keyframe(node) for node in nodes]
+    seen = zip(spots, keyframes, strict=True)
+    placed = [(spot, each.place) for spot, each in seen if each.place is not None]
     if goal is not None and math.dist(spots[-1], (goal.x, goal.y)) > 0.0:
         spots.append((goal.x, goal.y))
-    placed = [(node, place) for node in nodes if (place := ground.nodes[node].place) is not None]
     doors, places = list[Door](), list[PlaceOrdinal]()
-    for number, (node, place) in enumerate(placed):
+    for number, ((bx, by), place) in enumerate(placed):
         if places and places[-1] == place:
             continue
         if places:
-            (ax, ay), (bx, by) = ground.spots[placed[number - 1][0]], ground.spots[node]
+            ax, ay = placed[number - 1][0]
             ids = [view.all_places[each].place_id for each in (places[-1], place)]
             doors.append(Door((ax + bx) / 2, (ay + by) / 2, *ids))
         places.append(place)
@@ -179,7 +182,7 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
         tuple(doors),
         tuple(spots),
         goal,
-        tuple(sorted({ground.nodes[node].offset for node in nodes})),
+        tuple(sorted({each.offset for each in keyframes})),
     )
 
 
@@ -206,8 +209,7 @@ def _end_of(
         return ground.nearest((goal.x, goal.y)), goal
     place = view.survivors.find(PlaceOrdinal(thing.ordinal))
     record = view.all_places[place]
-    members = (view.keyframes[number] for number in record.members)
-    nodes = {node for each in members if (node := ground.node_of(each)) is not None}
+    nodes = set(ground.nodes_of(record.members))
     return ground.nearest((record.centroid_x, record.centroid_y), nodes), None
 
 

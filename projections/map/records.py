@@ -7,11 +7,14 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from operator import itemgetter
+from typing import Any, Final, NamedTuple, Self
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
 from projections.fold import deltas
@@ -92,6 +95,32 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     def place(self) -> deltas.PlaceOrdinal | None:
         """The place it belongs to now; None for noise or without a pose."""
         return None if self.joined is None else self.survivors.find(self.joined)
+
+
+class Poses(NamedTuple):
+    """Poses as columns: ordinals of keyframes and runs, positions of shape (n, 2), and floors as
+    indices into ``names``, their names."""
+
+    keyframes: NDArray[np.int64]
+    runs: NDArray[np.int64]
+    positions_um: NDArray[np.int64]
+    floors: NDArray[np.int64]
+    names: Sequence[str | None]
+
+    @classmethod
+    def of(cls, keyframes: Iterable[KeyframeRecord]) -> Self:
+        """Those of some keyframes, in the order in which their runs went."""
+        posed = [(k.run, k.keyframe_id, k, k.pose) for k in keyframes if k.pose is not None]
+        posed.sort(key=itemgetter(0, 1))
+        names = dict.fromkeys(k.floor for _, _, k, _ in posed)
+        number_of = {name: number for number, name in enumerate(names)}
+        return cls(
+            np.array([k.ordinal for _, _, k, _ in posed], np.int64),
+            np.array([run for run, *_ in posed], np.int64),
+            np.array([(at.x_um, at.y_um) for *_, at in posed], np.int64).reshape(-1, 2),
+            np.array([number_of[k.floor] for _, _, k, _ in posed], np.int64),
+            list(names),
+        )
 
 
 class ObservationRecord(msgspec.Struct, eq=False, gc=False):

@@ -149,7 +149,15 @@ class MapView:
 
     def sightings(self, found: records.ObjectRecord) -> list[records.KeyframeRecord]:
         """The keyframes that saw an Object, one for each observation, in their order."""
-        return [self.keyframes[self.observations[o].keyframe] for o in found.observations]
+        return [self.keyframes[number] for number in self.seen_by(found)]
+
+    def seen_by(self, found: records.ObjectRecord) -> list[deltas.KeyframeOrdinal]:
+        """The ordinals of `sightings`."""
+        return [self.observations[number].keyframe for number in found.observations]
+
+    def poses(self) -> records.Poses:
+        """The keyframes that have a pose, in the order in which their runs went."""
+        return records.Poses.of(self.keyframes)
 
     def edges(self) -> list[tuple[PlaceOrdinal, PlaceOrdinal, int]]:
         """(a, b, shared_transitions), ascending."""

@@ -30,6 +30,7 @@ from projections.map.records import (
     ObjectRecord,
     ObservationRecord,
     PlaceRecord,
+    Poses,
     Relocation,
     RunRecord,
 )
@@ -115,6 +116,32 @@ class StoredView(MapView):
         """Store the digest in the cache."""
         if self._cache is not None and not self._is_changed:
             self._cache.keep_digest(self.next_offset, digest)
+
+    def seen_by(self, found: ObjectRecord) -> list[KeyframeOrdinal]:
+        """The ordinals of `sightings`."""
+        if self._is_changed or not found.observations:
+            return super().seen_by(found)
+        keyframes: list[KeyframeOrdinal]
+        keyframes = self._moment.column("observation", "keyframe")[found.observations].tolist()
+        return keyframes
+
+    def poses(self) -> Poses:
+        """The keyframes that have a pose, in the order in which their runs went."""
+        if self._is_changed:
+            return super().poses()
+        moment, count = self._moment, self._moment.count("keyframe")
+        numbers = np.flatnonzero(moment.column("keyframe", "pose"))
+        for name in ("keyframe_id", "run"):
+            numbers = numbers[np.argsort(moment.column("keyframe", name)[numbers], kind="stable")]
+        runs, x, y = (
+            moment.tables.integers("keyframe", each, count)[numbers]
+            for each in ("run", "x_um", "y_um")
+        )
+        codes, strings = moment.tables.codes("keyframe", "floor", count)
+        names: dict[str | None, int] = {}
+        number_of = [names.setdefault(name, len(names)) for name in (*strings, None)]
+        floors = np.array(number_of)[codes[numbers]]  # no name is -1, the last
+        return Poses(numbers, runs, np.stack([x, y], axis=1), floors, list(names))
 
     def det_ids(self) -> Sequence[str]:
         """The det_id of each observation."""

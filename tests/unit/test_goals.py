@@ -3,7 +3,8 @@
 import math
 
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
-from projections.ask.driven_ground import DrivenGround, GoalPose
+from projections.ask.driven_ground import DrivenGround
+from projections.ask.goal_pose import GoalPose
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, Pose, RunOrdinal
 from projections.fold.settings import Settings
 from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord

@@ -40,15 +40,15 @@ _UM2_PER_M2 = 1e12
 
 class LiveView(MapView):
     """A map read from the graph's database, made from the log ``log_id``. Its Objects have no
-    observations: `sightings` gives their keyframes."""
+    observations: `seen_by` gives their keyframes."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings, keep_embeddings=False)
         self.log_id: str | None = None
-        self.seen_in: dict[int, list[records.KeyframeRecord]] = {}
+        self.seen_in: dict[int, list[deltas.KeyframeOrdinal]] = {}
 
-    def sightings(self, found: records.ObjectRecord) -> list[records.KeyframeRecord]:
-        """The keyframes that saw an Object, one for each observation, in their order."""
+    def seen_by(self, found: records.ObjectRecord) -> list[deltas.KeyframeOrdinal]:
+        """The ordinals of `sightings`."""
         return self.seen_in.get(found.ordinal, [])
 
 
@@ -144,9 +144,10 @@ def _fill(view: LiveView, rows: dict[str, list[Any]]) -> None:
         view.all_objects.append(found)
         view.objects[found.ordinal] = found
         view.contents.update(found)
-    keyframes = {row[0]: view.keyframes[number] for number, row in enumerate(rows["keyframes"])}
+    keyframes = _numbers(row[0] for row in rows["keyframes"])
     for thing, keyframe in rows["sightings"]:
-        view.seen_in.setdefault(objects[thing], []).append(keyframes[keyframe])
+        ordinal = deltas.KeyframeOrdinal(keyframes[keyframe])
+        view.seen_in.setdefault(objects[thing], []).append(ordinal)
 
 
 def _numbers(graphids: Iterable[str]) -> dict[str, int]:

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from projections.ask.driven_ground import GoalPose
+from projections.ask.goal_pose import GoalPose
 
 from .bridge_options import DomainOption, domain_of
 from .option import option
