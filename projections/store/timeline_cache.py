@@ -50,7 +50,7 @@ from .columns import Stripe, joined_short
 from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, read_state, write_part
 from .tables import DamagedPart
 
-FOLD_VERSION: Final = 12
+FOLD_VERSION: Final = 13
 """To be raised with every change of the reducers that changes the map of some log."""
 MIN_EVENTS: Final = 2_000
 """Events; folding fewer takes about as long as starting Python."""
