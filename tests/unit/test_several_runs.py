@@ -10,8 +10,8 @@ from projections.localize.align.alignment import Alignment
 from projections.localize.align.matching import Transform
 from projections.localize.align.several import (
     Contradiction,
-    Pair,
     PlacedRun,
+    RunPair,
     _composed,
     _inverse,
     placed_runs,
@@ -22,17 +22,17 @@ RUNS = [RunId(name) for name in "abcd"]
 POSES = [np.array([(0.0, 0.0, 0.0), (8.0, 1.0, 0.5), (3.0, 6.0, 2.0)])] * 4
 
 
-def pair(one: int, other: int, score: float = 100.0, off: Transform = (0.0, 0.0, 0.0)) -> Pair:
+def pair(one: int, other: int, score: float = 100.0, off: Transform = (0.0, 0.0, 0.0)) -> RunPair:
     """The pair of two of the runs, its transform off by one before it."""
     true = _composed(_inverse(FRAMES[one]), FRAMES[other])
     information = np.diag((400.0, 400.0, 4000.0))
     found = Alignment(
         _composed(true, off), (), (), score, 0.0, 20, 20, 0.08, 0.02, 9.0, information
     )
-    return Pair(one, other, found)
+    return RunPair(one, other, found)
 
 
-def placed(*pairs: Pair, count: int = 4) -> tuple[dict[RunId, PlacedRun], list[Contradiction]]:
+def placed(*pairs: RunPair, count: int = 4) -> tuple[dict[RunId, PlacedRun], list[Contradiction]]:
     found, against = placed_runs(RUNS[:count], POSES[:count], pairs)
     return {each.run: each for each in found}, against
 

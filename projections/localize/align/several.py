@@ -28,7 +28,7 @@ _STEPS: Final = 8
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 
 
-class Pair(NamedTuple):
+class RunPair(NamedTuple):
     """The transform of the run ``other`` into the frame of the run ``one``, by their numbers."""
 
     one: int
@@ -102,12 +102,12 @@ def align_runs(things: Mapping[RunId, FramedThings]) -> tuple[list[PlacedRun], l
     for one, other in combinations(range(len(runs)), 2):
         found = align(things[runs[one]], things[runs[other]])
         if found is not None and found.verdict != "unknown":
-            pairs.append(Pair(one, other, found))
+            pairs.append(RunPair(one, other, found))
     return placed_runs(runs, [things[run].poses for run in runs], pairs)
 
 
 def placed_runs(
-    runs: Sequence[RunId], poses: Sequence[Floats], pairs: Sequence[Pair]
+    runs: Sequence[RunId], poses: Sequence[Floats], pairs: Sequence[RunPair]
 ) -> tuple[list[PlacedRun], list[Contradiction]]:
     """The same by the pairs that were found and the poses (k, 3) of each run."""
     kept = _most_consistent(poses, pairs)
@@ -155,12 +155,12 @@ def placed_runs(
     return found, against
 
 
-def _components(count: int, pairs: Sequence[Pair]) -> list[int]:
+def _components(count: int, pairs: Sequence[RunPair]) -> list[int]:
     """For each run the first one that it is connected to."""
     return [node.root for node in _by_tree(count, pairs)]
 
 
-def _most_consistent(poses: Sequence[Floats], pairs: Sequence[Pair]) -> list[Pair]:
+def _most_consistent(poses: Sequence[Floats], pairs: Sequence[RunPair]) -> list[RunPair]:
     """The pairs that agree with the transforms along a tree of pairs: that of the largest scores,
     then without each of its pairs that makes the sum of scores of those that agree larger."""
     left_out: set[int] = set()
@@ -178,13 +178,13 @@ def _most_consistent(poses: Sequence[Floats], pairs: Sequence[Pair]) -> list[Pai
         best = better[1]
 
 
-def _sum(pairs: Sequence[Pair]) -> float:
+def _sum(pairs: Sequence[RunPair]) -> float:
     return math.fsum(pair.found.score for pair in pairs)
 
 
 def _agreeing(
-    poses: Sequence[Floats], pairs: Sequence[Pair], left_out: Collection[int]
-) -> list[Pair]:
+    poses: Sequence[Floats], pairs: Sequence[RunPair], left_out: Collection[int]
+) -> list[RunPair]:
     """The pairs that agree with the tree of the largest scores without some."""
     tree = _by_tree(
         len(poses), [pair for number, pair in enumerate(pairs) if number not in left_out]
@@ -209,7 +209,7 @@ class _Node(NamedTuple):
     variance: float
 
 
-def _by_tree(count: int, pairs: Sequence[Pair]) -> list[_Node]:
+def _by_tree(count: int, pairs: Sequence[RunPair]) -> list[_Node]:
     """Each run by the tree of pairs that has the largest scores."""
     group = list(range(count))
     links: list[list[tuple[int, Transform, float]]] = [[] for _ in range(count)]
@@ -231,14 +231,14 @@ def _by_tree(count: int, pairs: Sequence[Pair]) -> list[_Node]:
     return [nodes[number] for number in range(count)]
 
 
-def _weakest_cut(count: int, kept: Sequence[Pair], pair: Pair) -> float:
+def _weakest_cut(count: int, kept: Sequence[RunPair], pair: RunPair) -> float:
     """The least sum of scores of pairs without which two runs would not be connected."""
     ends = [(each.one, each.other) for each in kept]
     return least_cut(count, ends, [each.found.score for each in kept], pair[:2])
 
 
 def _fitted(
-    members: Sequence[int], pairs: Sequence[Pair], start: Sequence[_Node]
+    members: Sequence[int], pairs: Sequence[RunPair], start: Sequence[_Node]
 ) -> tuple[dict[int, Transform], Floats]:
     """The transforms of the members into the frame of the first, by least squares over all pairs,
     and the covariance of those of the others."""
