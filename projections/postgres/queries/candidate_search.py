@@ -294,8 +294,9 @@ def _query_errors(url: str) -> Iterator[None]:
             ) from None
 
 
-_CANDIDATES = max(150, NEIGHBOURS)
-"""As many are found by the index, in its `ef_search`, and compared by their whole vectors."""
+_CANDIDATES = max(200, NEIGHBOURS)
+"""As many are found by the index, in its `ef_search`, and compared by their whole vectors. At
+300,000 observations 0.992 of the ten nearest are among them, of 150 0.979 (75 crops)."""
 
 
 def relocalize(
