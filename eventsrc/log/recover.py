@@ -39,8 +39,14 @@ from .format import (
 )
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
-from .rebuild_segment import adjacent_times, rebuild_segment, slice_scan
-from .rename_segments import Moved, quarantine, rename_segments
+from .rewrite_segments import (
+    Moved,
+    adjacent_times,
+    quarantine,
+    rebuild_segment,
+    rewrite_segments,
+    slice_scan,
+)
 from .scan import scan_active, scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_left, write_sealed_end
@@ -123,7 +129,7 @@ class _Recovery:
         for path in leftovers(self._log):
             unlink_quietly(path)
         noted = sealed_end(self._log)
-        log_id, self._moved = rename_segments(self._log, None if noted is None else noted.log_id)
+        log_id, self._moved = rewrite_segments(self._log, None if noted is None else noted.log_id)
         if self._moved:
             delete_durably(self._log / LEDGER)
         self._log_id = log_id or (uuid.uuid4().hex if noted is None else noted.log_id)

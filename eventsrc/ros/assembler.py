@@ -17,7 +17,7 @@ import msgspec
 
 from eventsrc.envelope.crops import Crop
 
-from .laser import KeptScans
+from .measured import KeptScans, place_solids
 from .messages import (
     CAMERA_INFO,
     DETECTION_TYPES,
@@ -36,7 +36,6 @@ from .messages import (
 )
 from .named_classes import ClassNames
 from .pictures import CutCrops, Jpegs, StreamPictures
-from .solids import place_solids
 from .stream import Counts, PicturePose, PoseSource, Stream
 from .transforms import TransformBuffer
 

@@ -22,7 +22,6 @@ from projections.map.view import MapView
 from . import map_table, replaced_tables
 from .connection import Connection, describe_connection, ensure_extension, statements
 from .cypher import PARENTS, add_policies, policies_apply
-from .grants import copy_privileges
 from .graph_rows import GraphRows, Row, changed_rows, changing_rows, fixed_rows
 from .labels import (
     CHANGING_EDGES,
@@ -42,7 +41,12 @@ from .labels import (
 )
 from .loader import Load, copy_to_graph, graph_statement, insert_into_graph, unnest_columns
 from .map_table import MapRow, map_rows
-from .replaced_tables import try_drop_lock, wait_for_drop, wait_for_earlier_transactions
+from .replaced_tables import (
+    copy_privileges,
+    try_drop_lock,
+    wait_for_drop,
+    wait_for_earlier_transactions,
+)
 from .sink import PreparedWrite
 
 EARLY: Final[frozenset[Label]] = frozenset({"Observation"})

@@ -20,8 +20,8 @@ from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.map.view import MapView
 
 from .connection import Connection, describe_connection, statements
-from .grants import copy_table_privileges
 from .labels import MAP_TABLE
+from .replaced_tables import copy_table_privileges
 
 
 class MapRow(NamedTuple):

@@ -36,10 +36,9 @@ from .connection import (
     extension_version,
     statements,
 )
-from .grants import copy_privileges
 from .labels import TABLE, SinkName
 from .loader import Load, copy_vectors, insert_vectors
-from .replaced_tables import try_drop_lock, wait_for_drop
+from .replaced_tables import copy_privileges, try_drop_lock, wait_for_drop
 from .sink import PreparedWrite
 from .vector_rows import VectorRow, new_rows
 

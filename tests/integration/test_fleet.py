@@ -16,10 +16,9 @@ from psycopg import sql
 from psycopg.conninfo import conninfo_to_dict
 
 from projections.adapters.fleet.engines import Ended, Progress, Task
-from projections.adapters.fleet.site_databases import exists
+from projections.adapters.fleet.site_databases import ask_sites, exists
 from projections.adapters.fleet.site_tasks import ChosenSettings, ReplayRequest, replay_site
 from projections.adapters.fleet.sites import Site
-from projections.adapters.fleet.which_site import ask_sites
 from projections.localize.relocalize import read_question
 from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer

@@ -22,8 +22,7 @@ from eventsrc.record.importers.run import import_files
 from eventsrc.record.recorder.bridged import MAX_KEYS, Bridge
 from eventsrc.record.recorder.checking import CheckedMessage
 from eventsrc.record.recorder.queue import BridgedMessage
-from eventsrc.record.ros_graph import find_topics
-from eventsrc.record.ros_node import RosNode
+from eventsrc.record.ros_node import RosNode, find_topics
 from eventsrc.record.transport.session import Router, Session, ZenohOptions, open_session
 from eventsrc.ros.library import Undecodable
 from eventsrc.ros.messages import DETECTIONS_3D, GRID
@@ -349,7 +348,7 @@ def test_the_command_finds_its_topics_by_itself(
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search for topics that waits 0.1 s for their first messages."""
-    monkeypatch.setattr("eventsrc.record.ros_graph._SAMPLES_S", 0.1)
+    monkeypatch.setattr("eventsrc.record.ros_node._SAMPLES_S", 0.1)
 
 
 @pytest.mark.usefixtures("impatient")

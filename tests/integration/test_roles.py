@@ -14,8 +14,8 @@ from projections.postgres import rebuild, tail
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, extension_version
 from projections.postgres.cypher import connect_for_cypher, enforces_row_security
-from projections.postgres.grants import roles_sql
 from projections.postgres.queries.candidate_search import CandidateReader
+from projections.postgres.replaced_tables import roles_sql
 from projections.postgres.status import projection_status
 from tests.support.logs import bridge, walk, write_log
 from tests.support.maps import drawn_map

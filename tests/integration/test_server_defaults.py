@@ -17,7 +17,7 @@ from projections.postgres import data_folder as _cluster
 from projections.postgres.check import check
 from projections.postgres.connection import Targets, connect, pin_session_settings
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.grants import roles_sql
+from projections.postgres.replaced_tables import roles_sql
 from projections.postgres.status import projection_status
 from tests.support.logs import walk, write_log
 from tests.support.rows import all_rows, wait_for_drops

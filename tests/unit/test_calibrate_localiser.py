@@ -19,10 +19,10 @@ from projections.localize.calibrate.localiser import (
     fit_line,
     logit,
 )
-from projections.localize.calibrate.report import localiser_document, localiser_text
 from projections.localize.evaluate.own_questions import OwnAnswer, own_scores
 from projections.localize.relocalize import Answer
 from projections.localize.relocalize.certainty import probability
+from projections.surfaces.cli.calibrate import localiser_document, localiser_text
 
 
 def _answer(

@@ -10,7 +10,7 @@ import pytest
 
 from eventsrc.envelope.ingest import Accepted, ingest
 from eventsrc.ros.assembler import Assembler, RosMessage
-from eventsrc.ros.laser import LASER_SCAN
+from eventsrc.ros.measured import LASER_SCAN
 from eventsrc.ros.transforms import Transform
 from tests.support import ros_messages as ros
 from tests.support.ros_messages import START, flat

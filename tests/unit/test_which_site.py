@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.adapters.fleet.which_site import (
+from projections.adapters.fleet.site_databases import (
     CONFIDENCE_WEIGHT,
     FITTED_SITES,
     INTERCEPT,

@@ -13,8 +13,8 @@ from typing import Any, Final, TypeVar
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import visible
 from eventsrc.ros import messages as ros
-from eventsrc.ros.laser import LASER_SCAN
 from eventsrc.ros.library import BagTopic, MessageTypes, Undecodable
+from eventsrc.ros.measured import LASER_SCAN
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.named_classes import CLASS_TYPES, ClassNames, nearest
 from eventsrc.ros.pictures import IMAGES, CutCrops

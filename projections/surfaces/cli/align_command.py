@@ -20,8 +20,7 @@ from projections.store.history_recorder import map_after
 
 from .edit_command import recorded_text
 from .folded_log import CachedLog, OpenLog, settings_from
-from .option import option
-from .options import JsonOption, ZenohClient, check_picture, user_at_host
+from .options import JsonOption, ZenohClient, check_picture, option, user_at_host
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:

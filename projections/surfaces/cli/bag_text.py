@@ -19,7 +19,7 @@ from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Counts
 
-from .option import option
+from .options import option
 
 _PANEL: Final = "Bags of ROS 2"
 _MOST_UNUSED: Final = 10

@@ -22,7 +22,7 @@ from eventsrc.record.importers.map_yaml import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport
-from eventsrc.record.ros_graph import MAP_FRAME, find_topics
+from eventsrc.record.ros_node import MAP_FRAME, find_topics
 from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
@@ -30,7 +30,7 @@ from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
 from eventsrc.ros.wire import MAX_DOMAIN, BridgeWire, RmwWire, Wire, topic_of
 
 from . import bag_text
-from .option import option
+from .options import option
 from .terminal import say
 
 TF_POSE: Final = "tf"

@@ -12,9 +12,9 @@ from projections.postgres import rebuild
 from projections.postgres.check import CheckReport
 from projections.postgres.check import check as check_projections
 from projections.postgres.embedded import EmbeddedServer
-from projections.postgres.grants import roles_sql
 from projections.postgres.labels import SinkName
 from projections.postgres.queries.candidate_search import question_error
+from projections.postgres.replaced_tables import roles_sql
 from projections.postgres.status import SinkStatus, Status, projection_status
 
 from .folded_log import LogSettings

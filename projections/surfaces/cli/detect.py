@@ -30,11 +30,10 @@ from eventsrc.record.robot.publisher import EnvelopePublisher
 from eventsrc.record.transport.config import check_key, parse_address
 from eventsrc.record.transport.session import Session, ZenohOptions, open_session
 
-from . import detect_checks
+from . import detect_text
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
 from .new_log import NewLogOptions
-from .option import option
-from .options import JsonOption, PublishKeyOption, ZenohPeer
+from .options import JsonOption, PublishKeyOption, ZenohPeer, option
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 
@@ -215,16 +214,16 @@ def detect(
         models = (("--detector", detector), ("--encoder", encoder))
         missing = [name for name, path in models if path is None]
         raise MisuseError(f"no {' and no '.join(missing)} given")
-    detect_checks.check_sources(images, zenoh_image, poses, zenoh_pose)
-    timing = detect_checks.timing_of(start, fps)
+    detect_text.check_sources(images, zenoh_image, poses, zenoh_pose)
+    timing = detect_text.timing_of(start, fps)
     if out is not None and keep_crops:
         raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
     check_key(key, "--key")
     settings = new_log.for_file(out)
     address = None if metrics is None else parse_address(metrics, "--metrics")
-    name = detect_checks.run_id_of(run_id)
+    name = detect_text.run_id_of(run_id)
     check_installed()
-    wanted = detect_checks.device_of(device)
+    wanted = detect_text.device_of(device)
     given_poses: Poses = PoseTrack() if poses is None else poses_of_file(poses)
     options = vision_models.FinderOptions(head, confidence, overlap, max_detections, size)
     finder = vision_models.Finder(
@@ -250,7 +249,7 @@ def detect(
             finder,
             opened,
             KeyframeGate(
-                detect_checks.limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
+                detect_text.limits_of(moved, turned, after, posed=bool(poses or zenoh_pose))
             ),
             live.poses if live is not None and live.poses is not None else given_poses,
             name,
@@ -262,7 +261,7 @@ def detect(
             stack,
             None if out is None else service.FileOutput(out, settings),
             zenoh,
-            spool or detect_checks.spool_path(),
+            spool or detect_text.spool_path(),
             key,
             session if keep_crops else None,
             stop,
@@ -280,7 +279,7 @@ def detect(
     report = detection.report()
     say(summary(name, report, where))
     for line in advice(
-        report, live, posed=bool(poses or zenoh_pose), spool=spool or detect_checks.spool_path()
+        report, live, posed=bool(poses or zenoh_pose), spool=spool or detect_text.spool_path()
     ):
         say(line)
     if json_:

@@ -24,8 +24,7 @@ from projections.surfaces.text_encoders import with_text_encoder
 
 from .edit_command import EditOptions, NewCommand
 from .folded_log import AssignedSettings, LogArgument, LogSettings, settings_from
-from .option import option
-from .options import JsonOption
+from .options import JsonOption, option
 from .terminal import display, emit, say
 
 PlaceArgument = Annotated[

@@ -27,8 +27,7 @@ from projections.fold.settings import Settings
 from projections.history.diff_rendering import difference_text
 
 from .folded_log import FoldSettings, settings_from
-from .option import option
-from .options import JsonOption, ZenohClient, user_at_host
+from .options import JsonOption, ZenohClient, option, user_at_host
 from .terminal import display, emit, say
 
 _MOST_LINES = 5

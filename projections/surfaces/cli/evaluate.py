@@ -16,8 +16,7 @@ from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 
 from .folded_log import FoldSettings, W
-from .option import option
-from .options import CameraOptions, JsonOption, check_picture
+from .options import CameraOptions, JsonOption, check_picture, option
 from .relocalize import method_from
 from .terminal import display, emit, say
 

@@ -21,7 +21,7 @@ from projections.map.one_floor import view_of_floor
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldToOption, KnownAtOption, LogSettings
-from .option import option
+from .options import option
 from .signals import stop_on_signals
 from .terminal import Bar, say
 

@@ -22,8 +22,7 @@ from projections.surfaces.text_encoders import words_of
 
 from .folded_log import CachedLog, FoldSettings, FoldToOption, KnownAtOption, NoCacheOption
 from .goals import ClearanceOption, GoalOption, GoalSender, print_goal
-from .option import option
-from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument
+from .options import Databases, JsonOption, LiveDbOption, LogOrDbArgument, option
 from .terminal import display, emit, say
 
 

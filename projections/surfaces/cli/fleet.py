@@ -20,13 +20,12 @@ from projections.adapters.fleet.sites import Site
 from . import fleet_options
 from .event_text import iso_time
 from .folded_log import FoldSettings, settings_from
-from .option import option
-from .options import CameraOptions, JsonOption, QuestionArgument, question_from
+from .options import CameraOptions, JsonOption, QuestionArgument, option, question_from
 from .terminal import display, emit, finish, say
 
 if TYPE_CHECKING:
+    from projections.adapters.fleet.site_databases import WhichSite
     from projections.adapters.fleet.site_tasks import ChosenSettings, SiteStatus
-    from projections.adapters.fleet.which_site import WhichSite
     from projections.postgres.status import SinkStatus
 
 fleet = typer.Typer(
@@ -247,7 +246,7 @@ def relocalize(
     Each site's map is asked as by `mapfold relocalize`; its answer is in the output. Exit 3 when a
     site could not be asked.
     """
-    from projections.adapters.fleet.which_site import ask_sites
+    from projections.adapters.fleet.site_databases import ask_sites
 
     question, asked_by = question_from(query), camera.camera
     sites = fleet_options.sites_of(place)

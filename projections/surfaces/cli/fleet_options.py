@@ -18,7 +18,7 @@ from projections.adapters.fleet.site_databases import site_databases
 from projections.adapters.fleet.sites import Site, find_sites
 from projections.postgres.connection import Targets
 
-from .option import option
+from .options import option
 from .terminal import Bar, people, say
 
 

@@ -24,7 +24,7 @@ from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings, preset_assignments, read_settings
 from projections.map.parsing import read_corrections
 
-from .option import option
+from .options import option
 from .terminal import say
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]

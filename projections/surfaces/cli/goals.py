@@ -11,8 +11,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError
 from projections.ask.goal_pose import GoalPose
 
 from .bridge_options import DomainOption, domain_of
-from .option import option
-from .options import ZenohClient
+from .options import ZenohClient, option
 from .terminal import display, emit, say
 
 

@@ -23,8 +23,7 @@ from eventsrc.record.transport.config import check_key
 from .bag_text import BagChoice, bag_lines
 from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions, say_camera
-from .option import option
-from .options import JsonOption
+from .options import JsonOption, option
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
 from .terminal import FileBars, emit, finish, say

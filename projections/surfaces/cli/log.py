@@ -31,8 +31,7 @@ from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 from .event_text import event_document, event_line, iso_time
 from .folded_log import LogArgument
 from .new_log import say_camera
-from .option import option
-from .options import JsonOption
+from .options import JsonOption, option
 from .terminal import Bar, display, emit, emit_lines, finish, say
 
 

@@ -17,8 +17,7 @@ from projections.store.history_recorder import HistoryRecorder, map_after
 from projections.store.timeline_cache import TimelineCache
 
 from .folded_log import CachedLog, FoldToOption, KnownAtOption, LogSettings, classes_advice
-from .option import option
-from .options import JsonOption, check_picture
+from .options import JsonOption, check_picture, option
 from .terminal import display, emit, say
 
 

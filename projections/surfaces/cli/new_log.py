@@ -28,8 +28,7 @@ from projections.map.parsing import read_commands
 from projections.map.state_output import camera_advice
 
 from .folded_log import NamedSettings, complete_preset
-from .option import option
-from .options import user_at_host
+from .options import option, user_at_host
 from .terminal import say
 
 ROS_PRESET: Final = "full"

@@ -19,13 +19,19 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
 from projections.fold.map_errors import QuestionError
 
-from .option import option
-
 if TYPE_CHECKING:
     from eventsrc.record.transport.session import Session
     from projections.fold.settings import CameraConstants
     from projections.localize.relocalize import Question
     from projections.postgres.connection import Targets
+from typing import Any
+
+
+def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
+    """The option ``names`` (by default that of the parameter's name) for an ``Annotated`` type.
+    ``more`` is for `typer.Option`."""
+    return typer.Option(*names, metavar=metavar, help=text, **more)
+
 
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 # Databases

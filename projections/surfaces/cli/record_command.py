@@ -28,8 +28,7 @@ from . import bridge_options
 from .bag_text import crop_cutter, stream_lines
 from .folded_log import classes_advice
 from .new_log import LogStart, NewLogOptions, say_camera
-from .option import option
-from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer
+from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer, option
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
 from .terminal import say, say_metrics

@@ -16,10 +16,9 @@ from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.crops import CROPS_TOPIC
 from eventsrc.envelope.system_events import MAX_REEMBEDDED
 
-from .detect_checks import device_of
+from .detect_text import device_of
 from .folded_log import LogArgument
-from .option import option
-from .options import JsonOption, user_at_host
+from .options import JsonOption, option, user_at_host
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say
 

@@ -40,8 +40,7 @@ from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults
-from .option import option
-from .options import CameraOptions, Databases, JsonOption, OptionalQuestion, question_from
+from .options import CameraOptions, Databases, JsonOption, OptionalQuestion, option, question_from
 from .terminal import display, emit, emit_lines, say
 
 

@@ -34,8 +34,7 @@ from projections.postgres.labels import SinkName
 from projections.postgres.origin import command_line
 
 from .folded_log import LogSettings, W
-from .option import option
-from .options import Databases, JsonOption
+from .options import Databases, JsonOption, option
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say, say_metrics
 

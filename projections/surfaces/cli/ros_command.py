@@ -14,8 +14,7 @@ from eventsrc.base.text import counted, visible
 from eventsrc.record.importers.bag_streams import BagOptions
 from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.recorder.listener import Listener
-from eventsrc.record.ros_graph import find_topics
-from eventsrc.record.ros_node import RosNode
+from eventsrc.record.ros_node import RosNode, find_topics
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.wire import RmwWire, topic_of
@@ -24,8 +23,7 @@ from projections.localize.relocalize import Answer, Question, rank
 
 from .bridge_options import DomainOption, domain_of, used_topics
 from .folded_log import FoldSettings, NoCacheOption
-from .option import option
-from .options import LiveDbOption, LogOrDbArgument, VectorsOption, ZenohClient
+from .options import LiveDbOption, LogOrDbArgument, VectorsOption, ZenohClient, option
 from .signals import stop_on_signals
 from .terminal import say
 

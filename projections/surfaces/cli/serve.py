@@ -24,7 +24,6 @@ from projections.surfaces.serve.answering import DEFAULT_MAX_BYTES
 from projections.surfaces.serve.asked import ServedLog
 
 from .folded_log import FoldSettings, NoCacheOption
-from .option import option
 from .options import (
     CameraOptions,
     Databases,
@@ -33,6 +32,7 @@ from .options import (
     VectorsOption,
     ZenohClient,
     ZenohPeer,
+    option,
     user_at_host,
 )
 from .signals import stop_on_signals

@@ -11,8 +11,7 @@ from eventsrc.record.transport.config import check_key
 from eventsrc.record.transport.session import ZenohOptions, open_session
 
 from .new_log import NewLogOptions
-from .option import option
-from .options import Databases, JsonOption, PublishKeyOption, ZenohPeer
+from .options import Databases, JsonOption, PublishKeyOption, ZenohPeer, option
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
 

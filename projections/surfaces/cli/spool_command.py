@@ -9,7 +9,7 @@ from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, counted, visible
 from eventsrc.record.robot.spool import Refused, Spool
 
-from .detect_checks import spool_path
+from .detect_text import spool_path
 from .options import JsonOption
 from .terminal import display, emit, finish, say
 

@@ -34,8 +34,7 @@ from projections.history.rendering import (
 from projections.store.history_records import Merge
 
 from .folded_log import CachedLog, KnownAtOption, W, known_point, point
-from .option import option
-from .options import JsonOption, check_picture
+from .options import JsonOption, check_picture, option
 from .terminal import Bar, display, emit, say
 
 MOST_LINES = 5

@@ -14,8 +14,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 
 from .folded_log import CachedLog, FoldSettings, W, point
-from .option import option
-from .options import VectorsOption, ZenohClient
+from .options import VectorsOption, ZenohClient, option
 from .signals import stop_on_signals
 from .terminal import say
 

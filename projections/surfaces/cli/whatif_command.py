@@ -23,8 +23,7 @@ from projections.localize.evaluate.truth import read_truth
 from projections.map.parsing import read_commands
 
 from . import folded_log
-from .option import option
-from .options import JsonOption, check_picture
+from .options import JsonOption, check_picture, option
 from .terminal import Bar, display, emit, say
 from .time_travel import MOST_LINES, AllOption, AtOption
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from projections.adapters.fleet.which_site import which_site
+from projections.adapters.fleet.site_databases import which_site
 from projections.localize.evaluate.questions import (
     ScoredQuestion,
     make_questions,

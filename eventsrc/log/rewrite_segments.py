@@ -1,4 +1,5 @@
-"""Rename every segment file by the base offset in its head: the first step of a recovery.
+"""Steps of a recovery: rename every segment file by the base offset in its head; write a new sealed
+segment from the good chunks of a damaged one.
 
 Log id and base in the head of a segment identify its log and its offsets. Its name may be wrong,
 because people copy, restore and rename files. The rules:
@@ -15,19 +16,28 @@ because people copy, restore and rename files. The rules:
 
 Nothing is deleted. A file is renamed in two steps, by way of ``….misnamed``; a recovery that was
 interrupted between them goes on from there.
+
+Every offset is kept, because checkpoints, maps and people refer to offsets: a lost event is
+replaced by a ``mapfold/loss`` event with cause ``rot``. Timestamps of lost events are estimated
+from their neighbours: those of the event before, or else of the one after.
 """
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.base.text import advised, visible
-from eventsrc.envelope.model import Offset
+from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
+from eventsrc.envelope.system_events import LOSS_KEY, Loss
 
+from . import mcap_records as _mcap
+from .channels import NO_SCHEMA, is_verbatim, key_channel, schema_of
 from .durable_files import sync_directory
 from .format import (
     ACTIVE,
@@ -47,9 +57,11 @@ from .format import (
     segment_path,
 )
 from .log_identity import CarriedId, own_log_id
-from .scan import scan_active, scan_sealed
-from .sealed_segment import check_sealed
-from .segment import Scan
+from .mcap_records import Channel, Schema
+from .scan import read_body, scan_active, scan_sealed
+from .seal import SegmentPlan, seal
+from .sealed_segment import SealedFile, check_sealed
+from .segment import ActiveFile, ChunkRef, Scan
 
 _FILE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -82,13 +94,13 @@ def quarantine(path: Path, suffix: str, reason: str) -> Moved:
 
 
 class RenamedSegments(NamedTuple):
-    """The result of `rename_segments`; ``log_id`` is None if no head could be read."""
+    """The result of `rewrite_segments`; ``log_id`` is None if no head could be read."""
 
     log_id: str | None
     moved: list[Moved]
 
 
-def rename_segments(log: Path, noted: str | None) -> RenamedSegments:
+def rewrite_segments(log: Path, noted: str | None) -> RenamedSegments:
     """Set aside and rename segment files, holding the writer lock; ``noted`` is the log id in
     `sealed_end`. Raises LogDamaged, with nothing done, for MCAP files of other programs."""
     files = [_inspect(segment.path, segment) for segment in segment_files(log)]
@@ -211,3 +223,156 @@ def _scan(file: _SegmentFile) -> Scan:
     if file.target.sealed:
         return scan_sealed(file.path, file.target.base, None)
     return scan_active(file.path, file.target.base)
+
+
+class EventTimes(NamedTuple):
+    """Log time and stamp of an event, int nanoseconds."""
+
+    logged_ns: int
+    stamp_ns: int
+
+
+UNKNOWN_TIMES = EventTimes(0, 0)
+
+
+def first_and_last_times(body: bytes) -> tuple[EventTimes, EventTimes]:
+    """The times of the first and the last event in the body of a good chunk."""
+    times = [
+        EventTimes(log_ns, stamp_ns) for _, _, log_ns, stamp_ns, _, _ in _mcap.iter_messages(body)
+    ]
+    return times[0], times[-1]
+
+
+def adjacent_times(before: SegmentPath | None, after: SegmentPath | None) -> EventTimes:
+    """The times of the event before a lost segment, or else of the one after it; zeros if neither
+    can be read."""
+    for segment, chunk, which in ((before, -1, 1), (after, 0, 0)):
+        if segment is None:
+            continue
+        try:
+            file = (SealedFile if segment.sealed else ActiveFile)(segment.path, segment.base)
+            if file.chunks:
+                return first_and_last_times(file.read_chunk(file.chunks[chunk]))[which]
+        except (LogDamaged, NotALog):
+            continue
+    return UNKNOWN_TIMES
+
+
+_BATCH = 4096
+"""Losses encoded at a time."""
+LOST_SCHEMA = "lost"
+"""The name of a schema that no readable chunk has."""
+
+
+@dataclass(slots=True)
+class _Definitions:
+    """Channels and schemas of the good chunks, and one channel for losses."""
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+
+    def add(self, body: bytes) -> None:
+        schemas, channels = _mcap.definitions(body)
+        self.schemas.update((schema.id, schema) for schema in schemas)
+        self.channels.update((channel.id, channel) for channel in channels)
+
+    def loss_channel(self) -> int:
+        for channel in self.channels.values():
+            if channel.topic == LOSS_KEY:
+                return channel.id
+        id_ = max(self.channels, default=0) + 1
+        schema = max([*self.schemas, *(c.schema_id for c in self.channels.values())], default=0) + 1
+        self.channels[id_] = key_channel(id_, schema, LOSS_KEY, ENVELOPE_VERSION)
+        return id_
+
+    def encode(self) -> bytes:
+        """All records, schemas first. A lost schema is generated again from its key; that of
+        verbatim messages, lost with all chunks that had it, is left empty."""
+        for channel in self.channels.values():
+            if channel.schema_id in (NO_SCHEMA, *self.schemas):
+                continue
+            name, encoding, text = LOST_SCHEMA, "", b""
+            if not is_verbatim(channel):
+                (name, text), encoding = schema_of(channel.topic), "jsonschema"
+            self.schemas[channel.schema_id] = Schema(
+                id=channel.schema_id, name=name, encoding=encoding, data=text
+            )
+        return _mcap.encode_all([*self.schemas.values(), *self.channels.values()])
+
+
+def rebuild_segment(plan: SegmentPlan, source: Path | None, scan: Scan, times: EventTimes) -> str:
+    """Seal the good chunks of ``source``, with losses for the gaps; the new file's SHA-256. Losses
+    have ``times`` if there is no good chunk to take them from."""
+    if source is None:
+        return seal(plan, _chunk_bodies(-1, scan, times))
+    fd = os.open(source, os.O_RDONLY)
+    try:
+        return seal(plan, _chunk_bodies(fd, scan, times))
+    finally:
+        os.close(fd)
+
+
+def _chunk_bodies(fd: int, scan: Scan, times: EventTimes) -> Iterator[bytes]:
+    definitions = _Definitions(dict(scan.channels), dict(scan.schemas))
+    for chunk in scan.chunks:
+        definitions.add(read_body(fd, chunk))
+    loss_channel = definitions.loss_channel() if scan.gaps else 0
+    prelude = definitions.encode()
+    if scan.chunks:
+        times = first_and_last_times(read_body(fd, scan.chunks[0]))[0]
+    pieces: list[tuple[int, ChunkRef | int]] = [(c.first, c) for c in scan.chunks]
+    pieces += scan.gaps
+    for first, rest in sorted(pieces, key=lambda piece: piece[0]):
+        if isinstance(rest, ChunkRef):
+            body = read_body(fd, rest)
+            times = first_and_last_times(body)[1]
+            yield prelude + body
+            prelude = b""
+        else:
+            for start in range(first, rest + 1, _BATCH):
+                upto = min(start + _BATCH, rest + 1)
+                yield prelude + _losses(scan.base, loss_channel, start, upto, times)
+                prelude = b""
+
+
+def _losses(base: Offset, channel: int, first: int, following: int, times: EventTimes) -> bytes:
+    parts: list[bytes] = []
+    for offset in range(first, following):
+        loss = Loss(publisher="log", first=offset, last=offset, count=1, cause="rot")
+        payload = loss.model_dump_json().encode()
+        head = _mcap.encode_message_head(
+            channel, offset - base, times.logged_ns, times.stamp_ns, len(payload)
+        )
+        parts += (head, payload)
+    return b"".join(parts)
+
+
+def slice_scan(source: Path, scan: Scan, first: Offset, end: Offset) -> Scan:
+    """The part of a scan of ``source`` from offset ``first`` to before ``end``, as a segment of its
+    own that ends with the last good event."""
+    rest = Scan(first, scan.log_id, next_offset=first, channels=scan.channels, schemas=scan.schemas)
+    for chunk in scan.chunks:
+        start, stop = max(first, chunk.first), min(end, chunk.following)
+        if start < stop:
+            body = partial(_slice_chunk, source, chunk, scan.base, range(start, stop), first)
+            rest.add_chunk(ChunkRef(0, chunk.length, start, stop, body=body))
+    return rest
+
+
+def _slice_chunk(
+    source: Path, chunk: ChunkRef, base: Offset, offsets: range, new_base: Offset
+) -> bytes:
+    """The messages of a chunk with these offsets, renumbered from ``new_base``."""
+    fd = os.open(source, os.O_RDONLY)
+    try:
+        body = read_body(fd, chunk)
+    finally:
+        os.close(fd)
+    schemas, channels = _mcap.definitions(body)
+    parts = [_mcap.encode_all([*schemas, *channels])]
+    for channel, sequence, log_ns, stamp_ns, at, end in _mcap.iter_messages(body):
+        offset = base + sequence
+        if offset in offsets:
+            head = _mcap.encode_message_head(channel, offset - new_base, log_ns, stamp_ns, end - at)
+            parts += (head, body[at:end])
+    return b"".join(parts)
