@@ -18,13 +18,7 @@ import numpy as np
 import pybase64
 from msgspec import Meta
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    Field,
-    PlainValidator,
-    StringConstraints,
-    WithJsonSchema,
-)
+from pydantic import AfterValidator, Field, PlainValidator, StringConstraints, WithJsonSchema
 from pydantic_core import ErrorDetails
 
 Offset = NewType("Offset", int)

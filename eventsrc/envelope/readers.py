@@ -28,34 +28,7 @@ from pydantic import (
     model_validator,
 )
 
-from .model import (
-    ANGLE_RAD,
-    BASE64,
-    HFOV_DEG,
-    INT64,
-    MAX_DEPTH_M,
-    MAX_DETECTIONS,
-    MAX_DIMENSION,
-    MAX_RANGES_BASE64,
-    MAX_SIZE_M,
-    MAX_TIMESTAMP_S,
-    PIXELS,
-    SIGMA_M,
-    TEXT,
-    Detection,
-    DetId,
-    Envelope,
-    Floor,
-    KeyframeId,
-    PoseCovariance,
-    Position,
-    RunId,
-    StatedCamera,
-    StatedScan,
-    Text,
-    contains_non_finite,
-    covariance_fault,
-)
+from . import model
 
 
 class NonFinite(Exception):
@@ -68,7 +41,7 @@ class NonFinite(Exception):
 def _require_finite(value: object) -> None:
     """Raise NonFinite for NaN or infinity in an unknown field: they are not JSON, and a reader of
     the log that parses JSON would fail. Returns None: the model drops the value, the log has it."""
-    if isinstance(value, float | list | dict) and contains_non_finite(value):
+    if isinstance(value, float | list | dict) and model.contains_non_finite(value):
         raise NonFinite
 
 
@@ -100,14 +73,14 @@ def _unless_foreign(is_ours: Callable[[Any], bool]) -> BeforeValidator:
     return BeforeValidator(own)
 
 
-_Size = Annotated[float, Field(gt=0.0, le=MAX_SIZE_M)]
+_Size = Annotated[float, Field(gt=0.0, le=model.MAX_SIZE_M)]
 Size = Annotated[
     tuple[_Size, _Size, _Size] | None,
     _unless_foreign(
         lambda given: isinstance(given, list) and len(given) == 3 and all(map(_is_number, given))
     ),
 ]
-Height = Annotated[Position | None, _unless_foreign(_is_number)]
+Height = Annotated[model.Position | None, _unless_foreign(_is_number)]
 
 
 class DetectionModel(_Model, title="Detection"):
@@ -120,17 +93,17 @@ class DetectionModel(_Model, title="Detection"):
     frame, beside ``position``. ``size`` is its length, width and height.
     """
 
-    det_id: Annotated[DetId, TEXT] | None = None
-    class_name: Text = Field(alias="class")
+    det_id: Annotated[model.DetId, model.TEXT] | None = None
+    class_name: model.Text = Field(alias="class")
     confidence: float
     bbox: tuple[float, float, float, float]
     embedding: str | None = None
-    embedding_dim: Annotated[int, Field(ge=1, le=MAX_DIMENSION)] | None = None
-    embedding_model: Text | None = None
-    depth_m: Annotated[float, Field(gt=0.0, le=MAX_DEPTH_M)] | None = None
-    depth_sigma_m: Annotated[float, SIGMA_M] | None = None
-    position: tuple[Position, Position] | None = None
-    position_sigma_m: Annotated[float, SIGMA_M] | None = None
+    embedding_dim: Annotated[int, Field(ge=1, le=model.MAX_DIMENSION)] | None = None
+    embedding_model: model.Text | None = None
+    depth_m: Annotated[float, Field(gt=0.0, le=model.MAX_DEPTH_M)] | None = None
+    depth_sigma_m: Annotated[float, model.SIGMA_M] | None = None
+    position: tuple[model.Position, model.Position] | None = None
+    position_sigma_m: Annotated[float, model.SIGMA_M] | None = None
     position_z: Height = None
     size: Size = None
 
@@ -139,10 +112,10 @@ class EnvelopeCamera(_Model):
     """The level pinhole camera that took the picture: horizontal field of view, picture size, and
     the angle from the robot's heading to where it looks, to the left."""
 
-    hfov_deg: Annotated[float, HFOV_DEG]
-    width_px: Annotated[float, PIXELS]
-    height_px: Annotated[float, PIXELS]
-    yaw_rad: Annotated[float, ANGLE_RAD] = 0.0
+    hfov_deg: Annotated[float, model.HFOV_DEG]
+    width_px: Annotated[float, model.PIXELS]
+    height_px: Annotated[float, model.PIXELS]
+    yaw_rad: Annotated[float, model.ANGLE_RAD] = 0.0
 
 
 class EnvelopeScan(_Model):
@@ -153,15 +126,15 @@ class EnvelopeScan(_Model):
     metres ahead of and to the left of the pose, and radians to the left of its heading.
     """
 
-    angle_min: Annotated[float, ANGLE_RAD]
-    angle_step: Annotated[float, ANGLE_RAD]
+    angle_min: Annotated[float, model.ANGLE_RAD]
+    angle_step: Annotated[float, model.ANGLE_RAD]
     ranges_mm: Annotated[
-        str, StringConstraints(max_length=MAX_RANGES_BASE64, pattern=f"^{BASE64}$")
+        str, StringConstraints(max_length=model.MAX_RANGES_BASE64, pattern=f"^{model.BASE64}$")
     ]
     range_max: Annotated[float, Field(gt=0.0, le=1000.0)]
     x: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
     y: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
-    yaw: Annotated[float, ANGLE_RAD] = 0.0
+    yaw: Annotated[float, model.ANGLE_RAD] = 0.0
 
 
 Scan = Annotated[
@@ -181,18 +154,20 @@ class EnvelopeModel(_Model, title="Envelope"):
     counts only beside a pose, and so does ``scan``.
     """
 
-    run_id: Annotated[RunId, TEXT]
-    keyframe_id: Annotated[KeyframeId, INT64]
-    timestamp: Annotated[float, Field(ge=0.0, le=MAX_TIMESTAMP_S)]
-    map_x: Position | None = None
-    map_y: Position | None = None
+    run_id: Annotated[model.RunId, model.TEXT]
+    keyframe_id: Annotated[model.KeyframeId, model.INT64]
+    timestamp: Annotated[float, Field(ge=0.0, le=model.MAX_TIMESTAMP_S)]
+    map_x: model.Position | None = None
+    map_y: model.Position | None = None
     map_yaw: float | None = None
     camera: EnvelopeCamera | None = None
-    floor: Floor = None
-    map_z: Position | None = None
-    pose_covariance: PoseCovariance | None = None
+    floor: model.Floor = None
+    map_z: model.Position | None = None
+    pose_covariance: model.PoseCovariance | None = None
     scan: Scan = None
-    detections: Annotated[tuple[DetectionModel, ...], Field(max_length=MAX_DETECTIONS), FailFast()]
+    detections: Annotated[
+        tuple[DetectionModel, ...], Field(max_length=model.MAX_DETECTIONS), FailFast()
+    ]
 
     @model_validator(mode="after")
     def _check_pose(self) -> "EnvelopeModel":
@@ -207,22 +182,24 @@ _validate_json: Callable[[bytes], EnvelopeModel] = TypeAdapter(
 """``EnvelopeModel.model_validate_json`` without its Python wrapper, a twentieth of the time."""
 
 
-def read_checked(payload: bytes) -> Envelope:
+def read_checked(payload: bytes) -> model.Envelope:
     """The envelope in ``payload``, valid except for its embeddings. Raises pydantic's
     ValidationError, NonFinite, or RecursionError for JSON that is nested too deeply."""
     fields = dict(_validate_json(payload).__dict__)
     if (camera := fields["camera"]) is not None:
-        fields["camera"] = StatedCamera(**camera.__dict__)
+        fields["camera"] = model.StatedCamera(**camera.__dict__)
     if (scan := fields["scan"]) is not None:
-        fields["scan"] = StatedScan(**scan.__dict__)
-    fields["detections"] = tuple([Detection(**each.__dict__) for each in fields["detections"]])
-    return Envelope(**fields)
+        fields["scan"] = model.StatedScan(**scan.__dict__)
+    fields["detections"] = tuple(
+        [model.Detection(**each.__dict__) for each in fields["detections"]]
+    )
+    return model.Envelope(**fields)
 
 
-_decode: Final = msgspec.json.Decoder(Envelope).decode
+_decode: Final = msgspec.json.Decoder(model.Envelope).decode
 
 
-def read_plain(payload: bytes) -> Envelope | None:
+def read_plain(payload: bytes) -> model.Envelope | None:
     """The envelope in ``payload``, valid except for its embeddings, which are not decoded; None if
     `read_checked` must read it. Call `eventsrc.envelope.ingest.check_cost` before."""
     try:
@@ -239,7 +216,7 @@ def read_plain(payload: bytes) -> Envelope | None:
     return envelope
 
 
-def _is_plain(envelope: Envelope) -> bool:
+def _is_plain(envelope: model.Envelope) -> bool:
     """Whether the envelope keeps the rules that its types do not state. Texts are printable, so
     they have no control characters."""
     if not envelope.run_id.isprintable():
@@ -249,14 +226,14 @@ def _is_plain(envelope: Envelope) -> bool:
     if isinstance(envelope.floor, str) and not envelope.floor.isprintable():
         return False
     covariance = envelope.pose_covariance
-    if covariance is not None and covariance_fault(covariance) is not None:
+    if covariance is not None and model.covariance_fault(covariance) is not None:
         return False
     ids: list[str] = []
     for detection in envelope.detections:
         if not detection.class_name.isprintable():
             return False
-        model, det_id = detection.embedding_model, detection.det_id
-        if model is not None and not model.isprintable():
+        space, det_id = detection.embedding_model, detection.det_id
+        if space is not None and not space.isprintable():
             return False
         if det_id is not None:
             ids.append(det_id)

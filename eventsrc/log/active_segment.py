@@ -31,20 +31,9 @@ from eventsrc.base.errors import LogError
 from eventsrc.base.machine import Clock, system_clock
 from eventsrc.envelope.model import Offset
 
+from . import format as names
 from .durable_files import FsyncPolicy, replace_durably, sync_file, write_all
 from .event import NewEvent
-from .format import (
-    ACTIVE,
-    BEGUN,
-    DAMAGED,
-    IMPORTED,
-    MARK_SEED,
-    NEW,
-    file_head,
-    free_name,
-    head_metadata,
-    segment_path,
-)
 from .group import Group, GroupBuilder
 
 
@@ -120,7 +109,7 @@ def find_problem(fd: int, path: Path, size: int) -> Problem | None:
 def quarantine(path: Path) -> None:
     """Rename the file at ``path``, if there is one, to ``….damaged``, as recovery does."""
     if path.exists():
-        path.rename(free_name(path, DAMAGED))
+        path.rename(names.free_name(path, names.DAMAGED))
 
 
 def is_readable_segment(path: Path, head_size: int) -> bool:
@@ -159,7 +148,7 @@ class ActiveSegment:
         self._on_fault = on_fault
         self._while_syncing = while_syncing
         self._clock = clock
-        self._notes = {IMPORTED: "1"} if imported else {}
+        self._notes = {names.IMPORTED: "1"} if imported else {}
         self._set_file(base)
         self._syncs = policy.syncs
         self._group = GroupBuilder(base, policy)
@@ -169,14 +158,16 @@ class ActiveSegment:
     def _set_file(self, base: Offset) -> None:
         """Set the base offset, and the path and mark seed of the file to `create`."""
         self.base = base
-        self.path = segment_path(self._log, base, ACTIVE)
+        self.path = names.segment_path(self._log, base, names.ACTIVE)
         self._mark_seed = secrets.randbits(32)
 
     def create(self) -> None:
         """Make the file, before the first commit. Raises OSError."""
-        temporary = segment_path(self._log, self.base, NEW)
-        notes = {MARK_SEED: f"{self._mark_seed:08x}", BEGUN: str(max(0, self._clock()))}
-        head = file_head(head_metadata(self._log_id, self.base, {**notes, **self._notes}))
+        temporary = names.segment_path(self._log, self.base, names.NEW)
+        notes = {names.MARK_SEED: f"{self._mark_seed:08x}", names.BEGUN: str(max(0, self._clock()))}
+        head = names.file_head(
+            names.head_metadata(self._log_id, self.base, {**notes, **self._notes})
+        )
         fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             write_all(fd, head)

@@ -18,25 +18,9 @@ from eventsrc.base.progress import reported
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
+from . import format as names
 from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
-from .format import (
-    ACTIVE,
-    DAMAGED,
-    DUPLICATE,
-    LEDGER,
-    PREVIOUS,
-    SEALED,
-    SEALED_END,
-    SegmentPath,
-    half_renamed,
-    head_at_any_base,
-    head_of,
-    leftovers,
-    list_segments,
-    origin_notes,
-    segment_path,
-)
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
 from .rewrite_segments import (
@@ -103,7 +87,7 @@ def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryR
     TooManyLosses when more than ``max_losses`` events would be added that the damaged bytes cannot
     have held; LogError when the disk fails.
     """
-    if not (log.is_dir() and half_renamed(log)):
+    if not (log.is_dir() and names.half_renamed(log)):
         segments_left(log)
     try:
         with WriterLock(log, system_clock):
@@ -119,22 +103,22 @@ class _Recovery:
     def __init__(self, log: Path, max_losses: int) -> None:
         self._log = log
         self._losses_left = max_losses
-        self._overlapping: list[SegmentPath] = []
+        self._overlapping: list[names.SegmentPath] = []
         """Segments set aside because they overlap others, in the order of their bases."""
         self._recovered: list[SegmentRecovery] = []
         self._next_offset = FIRST_OFFSET
-        self._previous: SegmentPath | None = None
+        self._previous: names.SegmentPath | None = None
 
     def run(self) -> RecoveryReport:
-        for path in leftovers(self._log):
+        for path in names.leftovers(self._log):
             unlink_quietly(path)
         noted = sealed_end(self._log)
         log_id, self._moved = rewrite_segments(self._log, None if noted is None else noted.log_id)
         if self._moved:
-            delete_durably(self._log / LEDGER)
+            delete_durably(self._log / names.LEDGER)
         self._log_id = log_id or (uuid.uuid4().hex if noted is None else noted.log_id)
         self._sealed_end = sealed_end_of(self._log, self._log_id)
-        segments = list_segments(self._log)
+        segments = names.list_segments(self._log)
         watched = reported(segments, "recovering", len(segments), "segments")
         for index, segment in enumerate(watched):
             following = segments[index + 1] if index + 1 < len(segments) else None
@@ -154,7 +138,7 @@ class _Recovery:
             self._log, self._next_offset, tuple(self._recovered), tuple(self._moved)
         )
 
-    def _replace_missing(self, end: Offset, following: SegmentPath | None) -> None:
+    def _replace_missing(self, end: Offset, following: names.SegmentPath | None) -> None:
         """Put a segment of losses in place of a missing one."""
         scan = Scan(self._next_offset, None, next_offset=self._next_offset)
         scan.add_gap_until(end)
@@ -163,13 +147,15 @@ class _Recovery:
     def _note_sealed_end(self) -> None:
         """Write how far the log is sealed, if the file says anything else."""
         if self._previous is None:
-            delete_durably(self._log / SEALED_END)
+            delete_durably(self._log / names.SEALED_END)
             return
         end = SealedEnd(self._log_id, self._previous.base, self._next_offset)
         if sealed_end(self._log) != end:
             write_sealed_end(self._log, end)
 
-    def _reach(self, segment: SegmentPath, following: SegmentPath | None) -> Offset | None:
+    def _reach(
+        self, segment: names.SegmentPath, following: names.SegmentPath | None
+    ) -> Offset | None:
         """Where a segment ends at least, by the next one or by `sealed_end`; None if unknown."""
         if self._overlapping:
             return None
@@ -177,10 +163,12 @@ class _Recovery:
             return following.base
         return None if self._sealed_end is None else self._sealed_end.reach(segment.base)
 
-    def _recover_segment(self, segment: SegmentPath, following: SegmentPath | None) -> None:
+    def _recover_segment(
+        self, segment: names.SegmentPath, following: names.SegmentPath | None
+    ) -> None:
         reach = self._reach(segment, following)
         if segment.sealed:
-            unlink_quietly(segment_path(self._log, segment.base, ACTIVE))
+            unlink_quietly(names.segment_path(self._log, segment.base, names.ACTIVE))
             scan = _scan(segment, reach)
             good = not (scan.gaps or scan.index_fault)
             if good and check_sealed(segment.path).fault is None:
@@ -193,15 +181,15 @@ class _Recovery:
                 return  # an empty and undamaged log
         self._rewrite(segment, scan, following)
 
-    def _set_aside_overlapping(self, segment: SegmentPath) -> None:
+    def _set_aside_overlapping(self, segment: names.SegmentPath) -> None:
         """Set aside a segment that begins before the previous one ends, from a backup perhaps."""
         reason = f"it begins before offset {self._next_offset}, where the segment before it ends"
-        delete_durably(self._log / LEDGER)
-        moved = quarantine(segment.path, DUPLICATE, reason)
+        delete_durably(self._log / names.LEDGER)
+        moved = quarantine(segment.path, names.DUPLICATE, reason)
         self._moved.append(moved)
         self._overlapping.append(replace(segment, path=self._log / moved.now))
 
-    def _fill_from_overlapping(self, following: SegmentPath | None) -> None:
+    def _fill_from_overlapping(self, following: names.SegmentPath | None) -> None:
         """Add missing events from the segments that were set aside."""
         for overlapping in self._overlapping:
             scan = _scan(overlapping, None)
@@ -212,7 +200,7 @@ class _Recovery:
                     self._rewrite(None, rest, following)
 
     def _check_losses(
-        self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
+        self, segment: names.SegmentPath | None, scan: Scan, following: names.SegmentPath | None
     ) -> None:
         """Raise TooManyLosses if too many losses would be added: a single damaged number can
         declare any count."""
@@ -223,7 +211,7 @@ class _Recovery:
         evidence = (
             f"{following.path.name} begins there"
             if following
-            else f"according to the offsets in the file and {SEALED_END}"
+            else f"according to the offsets in the file and {names.SEALED_END}"
         )
         next_step = (
             f"If that is right, run `{advised('log', 'recover', self._log, '--yes')}`; else move "
@@ -238,14 +226,14 @@ class _Recovery:
         )
 
     def _moved_so_far(self) -> str:
-        names = ", ".join(f"{moved.name} is now {moved.now}" for moved in self._moved)
-        return f" (done before: {names})" if names else ""
+        done = ", ".join(f"{moved.name} is now {moved.now}" for moved in self._moved)
+        return f" (done before: {done})" if done else ""
 
     def _rewrite(
-        self, segment: SegmentPath | None, scan: Scan, following: SegmentPath | None
+        self, segment: names.SegmentPath | None, scan: Scan, following: names.SegmentPath | None
     ) -> None:
         self._check_losses(segment, scan, following)
-        delete_durably(self._log / LEDGER)
+        delete_durably(self._log / names.LEDGER)
         copy = self._keep_copy(segment, scan)
         if scan.next_offset > scan.base:
             plan = SegmentPlan(
@@ -264,7 +252,7 @@ class _Recovery:
         self._next_offset = scan.next_offset
         self._recovered.append(_segment_report(segment, scan, copy))
 
-    def _remove_original(self, segment: SegmentPath, scan: Scan) -> None:
+    def _remove_original(self, segment: names.SegmentPath, scan: Scan) -> None:
         """Delete the original unless it was replaced under its name. A log without events gets an
         empty segment, which carries its id."""
         replaced = segment.sealed and scan.next_offset > scan.base
@@ -277,15 +265,15 @@ class _Recovery:
             segment.path.unlink()
             sync_directory(self._log)
 
-    def _sealed(self, base: Offset) -> SegmentPath:
-        return SegmentPath(segment_path(self._log, base, SEALED), base, True)
+    def _sealed(self, base: Offset) -> names.SegmentPath:
+        return names.SegmentPath(names.segment_path(self._log, base, names.SEALED), base, True)
 
-    def _keep_copy(self, segment: SegmentPath | None, scan: Scan) -> str | None:
+    def _keep_copy(self, segment: names.SegmentPath | None, scan: Scan) -> str | None:
         if segment is None or not (segment.sealed or scan.gaps):
             return None
         number = 1
         while True:
-            suffix = DAMAGED if number == 1 else f"{DAMAGED}-{number}"
+            suffix = names.DAMAGED if number == 1 else f"{names.DAMAGED}-{number}"
             copy = segment.path.with_name(segment.path.name + suffix)
             try:
                 keep_copy(segment.path, copy)
@@ -296,7 +284,7 @@ class _Recovery:
                 return copy.name
 
 
-def _scan(segment: SegmentPath, reach: Offset | None) -> Scan:
+def _scan(segment: names.SegmentPath, reach: Offset | None) -> Scan:
     """Scan a segment, which ends at ``reach`` if that is known."""
     if segment.sealed:
         return scan_sealed(segment.path, segment.base, reach)
@@ -305,37 +293,39 @@ def _scan(segment: SegmentPath, reach: Offset | None) -> Scan:
     return scan
 
 
-def _damaged_bytes(segment: SegmentPath | None, scan: Scan) -> int:
+def _damaged_bytes(segment: names.SegmentPath | None, scan: Scan) -> int:
     """Damaged bytes that can have held events; the holes of a sparse file cannot."""
     if segment is None:
         return 0
     return min(scan.lost_bytes, segment.path.stat().st_blocks * _BLOCK_BYTES)
 
 
-def _origin(segment: SegmentPath | None) -> dict[str, str]:
+def _origin(segment: names.SegmentPath | None) -> dict[str, str]:
     """Metadata with the time when the original was begun, if it can be read."""
     if segment is None:
         return {}
     try:
-        return origin_notes(head_at_any_base(segment.path))
+        return names.origin_notes(names.head_at_any_base(segment.path))
     except (LogDamaged, NotALog):
         return {}
 
 
-def _replaced_hash(following: SegmentPath | None) -> dict[str, str]:
+def _replaced_hash(following: names.SegmentPath | None) -> dict[str, str]:
     """Metadata with the hash that the next segment has of the one before it, if readable."""
     if following is None:
         return {}
     try:
-        previous = head_of(following.path, following.base).get(PREVIOUS)
+        previous = names.head_of(following.path, following.base).get(names.PREVIOUS)
     except (LogDamaged, NotALog):
         return {}
     return {} if previous is None else {REPLACES: previous}
 
 
-def _segment_report(segment: SegmentPath | None, scan: Scan, copy: str | None) -> SegmentRecovery:
+def _segment_report(
+    segment: names.SegmentPath | None, scan: Scan, copy: str | None
+) -> SegmentRecovery:
     return SegmentRecovery(
-        name=segment.path.name if segment else f"{scan.base:020d}{SEALED}",
+        name=segment.path.name if segment else f"{scan.base:020d}{names.SEALED}",
         kept_events=sum(chunk.following - chunk.first for chunk in scan.chunks),
         kept_bytes=sum(chunk.length for chunk in scan.chunks),
         lost_events=sum(last - first + 1 for first, last in scan.gaps),

@@ -24,20 +24,9 @@ from eventsrc.base.errors import LogDamaged, NotALog
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
+from . import format as names
 from . import mcap_records as _mcap
 from .durable_files import sync_directory, sync_file, unlink_quietly, write_all
-from .format import (
-    ACTIVE,
-    ForeignSegment,
-    SegmentPath,
-    half_renamed,
-    head_of,
-    leftovers,
-    list_segments,
-    mark_seed,
-    origin_notes,
-    segment_path,
-)
 from .log_identity import common_log_id
 from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
@@ -62,14 +51,14 @@ class Restart:
     torn_events: int = 0
     unsealed: list[tuple[Offset, Offset]] = field(default_factory=list)
     """Base and next offset of the finished segments to be sealed, in order."""
-    empty: SegmentPath | None = None
+    empty: names.SegmentPath | None = None
     """The last segment, if it has no events. The next writer replaces it under its name; until then
     it may be the only file that has the log's id."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Leftover:
-    segment: SegmentPath
+    segment: names.SegmentPath
     scan: Scan
     marked: int
     """How many of the scan's first chunks have a commit mark."""
@@ -91,19 +80,19 @@ def restart(log: Path) -> Restart:
     Raises LogDamaged for damage in what a writer needs, for segments of different logs, for a
     segment under the name of another, and for sealed segments that are missing at the end.
     """
-    for path in leftovers(log):
+    for path in names.leftovers(log):
         unlink_quietly(path)
-    for path in half_renamed(log):
+    for path in names.half_renamed(log):
         raise LogDamaged(
             f"{path}: a recovery was interrupted; run `{advised('log', 'recover', log)}`"
         )
-    segments = list_segments(log)
+    segments = names.list_segments(log)
     common_log_id(segments)
     for segment in [s for s in segments if s.sealed][-1:]:
         SealedFile(segment.path, segment.base).close()  # before anything is changed
     for segment in segments:
         if segment.sealed:
-            unlink_quietly(segment_path(log, segment.base, ACTIVE))
+            unlink_quietly(names.segment_path(log, segment.base, names.ACTIVE))
     state = Restart()
     found = _scan_leftovers(log, segments, state)
     last_sealed = max((s.base for s in segments if s.sealed), default=-1)
@@ -121,7 +110,9 @@ def restart(log: Path) -> Restart:
     return state
 
 
-def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> list[_Leftover]:
+def _scan_leftovers(
+    log: Path, segments: list[names.SegmentPath], state: Restart
+) -> list[_Leftover]:
     """The left-over segments that have events; those without are deleted, except for the last."""
     found = []
     for index, segment in enumerate(segments):
@@ -148,7 +139,7 @@ def _scan_leftovers(log: Path, segments: list[SegmentPath], state: Restart) -> l
     return found
 
 
-def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
+def _scan_leftover(segment: names.SegmentPath, reach: Offset | None) -> _Leftover:
     """Scan a left-over segment; ``reach`` is the base of the next one, None for the last."""
     finished = None if reach is None else _finished(segment, reach)
     if finished is not None:
@@ -166,7 +157,7 @@ def _scan_leftover(segment: SegmentPath, reach: Offset | None) -> _Leftover:
     return _Leftover(segment, scan, marked, file.position)
 
 
-def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
+def _finished(segment: names.SegmentPath, reach: Offset) -> _Leftover | None:
     """A segment whose marks reach the next one; None for one that must be scanned."""
     try:
         file = ActiveFile(segment.path, segment.base)
@@ -179,11 +170,11 @@ def _finished(segment: SegmentPath, reach: Offset) -> _Leftover | None:
     return _Leftover(segment, scan, len(file.chunks), file.position)
 
 
-def _refuse_foreign(segment: SegmentPath) -> None:
+def _refuse_foreign(segment: names.SegmentPath) -> None:
     """Raise ForeignSegment for a file that another program has put in place of a segment."""
     try:
-        head_of(segment.path, segment.base)
-    except ForeignSegment:
+        names.head_of(segment.path, segment.base)
+    except names.ForeignSegment:
         raise
     except (LogDamaged, NotALog):
         return  # a torn head: the scan reads what is there
@@ -206,7 +197,7 @@ def _finish(left: _Leftover) -> None:
         if left.marked < len(left.scan.chunks):
             os.ftruncate(fd, last.position + last.length)
             sync_file(fd)
-            seed = mark_seed(head_of(left.segment.path, left.segment.base))
+            seed = names.mark_seed(names.head_of(left.segment.path, left.segment.base))
             write_all(fd, _mcap.encode_mark(last.first, last.following, seed))
         elif os.fstat(fd).st_size > left.position:
             os.ftruncate(fd, left.position)
@@ -216,10 +207,10 @@ def _finish(left: _Leftover) -> None:
 
 
 def _seal_now(log: Path, left: _Leftover) -> None:
-    before = [s for s in list_segments(log) if s.base < left.segment.base]
+    before = [s for s in names.list_segments(log) if s.base < left.segment.base]
     previous = file_sha256(before[-1].path) if before else NO_PREVIOUS
     file = ActiveFile(left.segment.path, left.segment.base)
-    base, end, notes = left.segment.base, left.scan.next_offset, origin_notes(file.head)
+    base, end, notes = left.segment.base, left.scan.next_offset, names.origin_notes(file.head)
     plan = SegmentPlan(log, file.log_id, base, previous, end, notes)
     seal(plan, (file.read_chunk(chunk) for chunk in left.scan.chunks))
     note_sealed(log, SealedEnd(file.log_id, base, end))
@@ -229,7 +220,7 @@ def _seal_now(log: Path, left: _Leftover) -> None:
 
 def _read_end(log: Path, state: Restart, found: list[_Leftover]) -> None:
     """Set the log's end, and the hash that the next sealed segment carries."""
-    sealed = [segment for segment in list_segments(log) if segment.sealed]
+    sealed = [segment for segment in names.list_segments(log) if segment.sealed]
     if sealed:
         last = SealedFile(sealed[-1].path, sealed[-1].base)
         state.log_id = last.log_id

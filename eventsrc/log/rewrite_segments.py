@@ -36,26 +36,10 @@ from eventsrc.base.text import advised, visible
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, Loss
 
+from . import format as names
 from . import mcap_records as _mcap
 from .channels import NO_SCHEMA, is_verbatim, key_channel, schema_of
 from .durable_files import sync_directory
-from .format import (
-    ACTIVE,
-    DAMAGED,
-    DUPLICATE,
-    FOREIGN,
-    MISNAMED,
-    PREVIOUS,
-    SEALED,
-    ForeignSegment,
-    SegmentPath,
-    free_name,
-    half_renamed,
-    head_at_any_base,
-    not_files,
-    segment_files,
-    segment_path,
-)
 from .log_identity import CarriedId, own_log_id
 from .mcap_records import Channel, Schema
 from .scan import read_body, scan_active, scan_sealed
@@ -81,13 +65,13 @@ class _SegmentFile:
     read (``log_id`` is None then)."""
 
     path: Path
-    target: SegmentPath
+    target: names.SegmentPath
     log_id: str | None
 
 
 def quarantine(path: Path, suffix: str, reason: str) -> Moved:
     """Take a file out of the log: rename it to a free name with ``suffix``."""
-    aside = free_name(path, suffix)
+    aside = names.free_name(path, suffix)
     path.rename(aside)
     sync_directory(path.parent)
     return Moved(path.name, aside.name, reason)
@@ -103,10 +87,10 @@ class RenamedSegments(NamedTuple):
 def rewrite_segments(log: Path, noted: str | None) -> RenamedSegments:
     """Set aside and rename segment files, holding the writer lock; ``noted`` is the log id in
     `sealed_end`. Raises LogDamaged, with nothing done, for MCAP files of other programs."""
-    files = [_inspect(segment.path, segment) for segment in segment_files(log)]
-    files += [_inspect(path, _target_of(path)) for path in half_renamed(log)]
+    files = [_inspect(segment.path, segment) for segment in names.segment_files(log)]
+    files += [_inspect(path, _target_of(path)) for path in names.half_renamed(log)]
     log_id = own_log_id((c for f in files if (c := _carried(f)) is not None), noted)
-    moved = [quarantine(path, DAMAGED, "it is no file") for path in not_files(log)]
+    moved = [quarantine(path, names.DAMAGED, "it is no file") for path in names.not_files(log)]
     by_base: defaultdict[Offset, list[_SegmentFile]] = defaultdict(list)
     for file in files:
         if file.log_id in (None, log_id):
@@ -131,21 +115,21 @@ def _keep_best(files: list[_SegmentFile], following: Offset | None) -> Iterator[
     for file in files[1:]:
         if file.log_id is None:
             reason = "its head is damaged, and another file is this segment"
-            yield quarantine(file.path, DAMAGED, reason)
+            yield quarantine(file.path, names.DAMAGED, reason)
         else:
             reason = f"{files[0].target.path.name} holds the same offsets"
-            yield quarantine(file.path, DUPLICATE, reason)
+            yield quarantine(file.path, names.DUPLICATE, reason)
 
 
 def _rename(log: Path, files: list[_SegmentFile]) -> list[Moved]:
     moved: list[Moved] = []
     for file in [f for f in files if f.path != f.target.path]:
-        if not file.path.name.startswith(file.target.path.name + MISNAMED):
-            file.path.rename(free_name(file.target.path, MISNAMED))
+        if not file.path.name.startswith(file.target.path.name + names.MISNAMED):
+            file.path.rename(names.free_name(file.target.path, names.MISNAMED))
         reason = f"its head says that it begins at offset {file.target.base}"
         moved.append(Moved(file.path.name, file.target.path.name, reason))
     sync_directory(log)
-    for path in half_renamed(log):
+    for path in names.half_renamed(log):
         path.rename(_target_of(path).path)
     sync_directory(log)
     return moved
@@ -161,30 +145,32 @@ def _carried(file: _SegmentFile) -> CarriedId | None:
 def _foreign_suffix(log_id: str | None) -> str:
     """With the log id, if that can be part of a file's name: any program may have written it."""
     usable = log_id is not None and _FILE_NAME.fullmatch(log_id)
-    return f"{FOREIGN}-{log_id}" if usable else FOREIGN
+    return f"{names.FOREIGN}-{log_id}" if usable else names.FOREIGN
 
 
-def _target_of(path: Path) -> SegmentPath:
+def _target_of(path: Path) -> names.SegmentPath:
     """The segment that a half-renamed file is to become."""
-    name = path.name.partition(MISNAMED)[0]
-    return SegmentPath(path.with_name(name), Offset(int(name[:20])), name.endswith(SEALED))
+    name = path.name.partition(names.MISNAMED)[0]
+    return names.SegmentPath(
+        path.with_name(name), Offset(int(name[:20])), name.endswith(names.SEALED)
+    )
 
 
-def _inspect(path: Path, named: SegmentPath) -> _SegmentFile:
+def _inspect(path: Path, named: names.SegmentPath) -> _SegmentFile:
     try:
-        claims = head_at_any_base(path)
+        claims = names.head_at_any_base(path)
     except LogDamaged:
         return _SegmentFile(path, named, None)
-    except ForeignSegment as error:
+    except names.ForeignSegment as error:
         raise LogDamaged(_foreign_message(path, error)) from None
     except NotALog:
         return _SegmentFile(path, named, None)
-    base, sealed = Offset(int(claims["base"])), PREVIOUS in claims
-    where = segment_path(path.parent, base, SEALED if sealed else ACTIVE)
-    return _SegmentFile(path, SegmentPath(where, base, sealed), claims["log_id"])
+    base, sealed = Offset(int(claims["base"])), names.PREVIOUS in claims
+    where = names.segment_path(path.parent, base, names.SEALED if sealed else names.ACTIVE)
+    return _SegmentFile(path, names.SegmentPath(where, base, sealed), claims["log_id"])
 
 
-def _foreign_message(path: Path, error: ForeignSegment) -> str:
+def _foreign_message(path: Path, error: names.ForeignSegment) -> str:
     log = path.parent
     return (
         f"{error}; nothing was changed. Put the original back, or move the file out of {log}, run "
@@ -197,9 +183,9 @@ def _still_being_sealed(files: list[_SegmentFile]) -> bool:
     """Whether these are a good sealed segment and the active one it was made from, left by a
     crash."""
     if {file.path.name for file in files} != {
-        segment_path(file.path.parent, files[0].target.base, suffix).name
+        names.segment_path(file.path.parent, files[0].target.base, suffix).name
         for file in files
-        for suffix in (SEALED, ACTIVE)
+        for suffix in (names.SEALED, names.ACTIVE)
     }:
         return False
     sealed, active = sorted(files, key=lambda file: not file.target.sealed)
@@ -243,7 +229,7 @@ def first_and_last_times(body: bytes) -> tuple[EventTimes, EventTimes]:
     return times[0], times[-1]
 
 
-def adjacent_times(before: SegmentPath | None, after: SegmentPath | None) -> EventTimes:
+def adjacent_times(before: names.SegmentPath | None, after: names.SegmentPath | None) -> EventTimes:
     """The times of the event before a lost segment, or else of the one after it; zeros if neither
     can be read."""
     for segment, chunk, which in ((before, -1, 1), (after, 0, 0)):

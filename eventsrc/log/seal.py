@@ -29,20 +29,10 @@ from eventsrc.base.errors import LogDamaged
 from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
 
+from . import format as names
 from . import mcap_records as _mcap
 from .channels import is_verbatim
 from .durable_files import drop_cached, replace_durably, sync_file, unlink_quietly, write_all
-from .format import (
-    ACTIVE,
-    FOLLOWING,
-    PREVIOUS,
-    SEALED,
-    SEALING,
-    file_head,
-    head_metadata,
-    metadata_name,
-    segment_path,
-)
 from .mcap_records import (
     FRAME,
     MAX_MESSAGES,
@@ -195,9 +185,9 @@ def seal(plan: SegmentPlan, bodies: Iterable[bytes]) -> str:
 
     Raises OSError, and LogDamaged for bodies that a writer does not make; leaves nothing then.
     """
-    temporary = segment_path(plan.log, plan.base, SEALING)
+    temporary = names.segment_path(plan.log, plan.base, names.SEALING)
     sha256 = write_sealed(plan, bodies, temporary)
-    replace_durably(temporary, segment_path(plan.log, plan.base, SEALED))
+    replace_durably(temporary, names.segment_path(plan.log, plan.base, names.SEALED))
     return sha256
 
 
@@ -216,7 +206,9 @@ def write_sealed(
         builder.sync()
     except BadRecord as error:
         unlink_quietly(temporary)
-        raise LogDamaged(f"{segment_path(plan.log, plan.base, ACTIVE)}: {error}") from None
+        raise LogDamaged(
+            f"{names.segment_path(plan.log, plan.base, names.ACTIVE)}: {error}"
+        ) from None
     except BaseException:
         unlink_quietly(temporary)
         raise
@@ -244,12 +236,16 @@ class _Builder:
         self._edges = [0]
         self._log_ns: list[int] = []
         self._stamp_ns: list[int] = []
-        values = {PREVIOUS: plan.previous_sha256, FOLLOWING: str(plan.following), **plan.notes}
-        head = head_metadata(plan.log_id, plan.base, values)
-        start = file_head(head)
+        values = {
+            names.PREVIOUS: plan.previous_sha256,
+            names.FOLLOWING: str(plan.following),
+            **plan.notes,
+        }
+        head = names.head_metadata(plan.log_id, plan.base, values)
+        start = names.file_head(head)
         length = len(_mcap.encode(head))
         self._metadata.append(MetadataIndex(len(start) - length, length, head.name))
-        self._seal_name = metadata_name(SEAL_METADATA, plan.log_id, plan.base)
+        self._seal_name = names.metadata_name(SEAL_METADATA, plan.log_id, plan.base)
         self._write(start)
 
     def _write(self, data: bytes) -> None:

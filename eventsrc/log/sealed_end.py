@@ -21,18 +21,9 @@ from eventsrc.base.errors import LogDamaged, LogError, LogNotFound, NotALog
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
+from . import format as names
 from . import mcap_records as _mcap
 from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
-from .format import (
-    DAMAGED,
-    SEALED,
-    SEALED_END,
-    SegmentPath,
-    free_name,
-    list_growing,
-    read_number,
-    segment_path,
-)
 from .mcap_records import Metadata
 
 _MAX_BYTES: Final = 4096
@@ -55,11 +46,11 @@ class SealedEnd(NamedTuple):
         """Why a log that ends at ``next_offset`` is damaged; None if nothing is missing."""
         if next_offset >= self.following:
             return None
-        name = segment_path(log, max(self.base, next_offset), SEALED).name
-        new_log = "" if next_offset else f"; for a new log delete {log / SEALED_END}"
+        name = names.segment_path(log, max(self.base, next_offset), names.SEALED).name
+        new_log = "" if next_offset else f"; for a new log delete {log / names.SEALED_END}"
         return (
             f"{log}: offsets {next_offset} to {self.following - 1} were sealed and are not there "
-            f"(by {SEALED_END}; {name} was deleted or replaced): put the file back, or run "
+            f"(by {names.SEALED_END}; {name} was deleted or replaced): put the file back, or run "
             f"`{advised('log', 'recover', log)}`, which marks them as lost{new_log}"
         )
 
@@ -91,13 +82,15 @@ def sealed_end_of(log: Path, log_id: str | None) -> SealedEnd | None:
 def read_sealed_end(log: Path) -> SealedEnd | None:
     """How far a log was sealed, None without a file. Raises InvalidSealedEnd."""
     try:
-        data = _read(log / SEALED_END)
+        data = _read(log / names.SEALED_END)
         values = json.loads(data)
         if not (isinstance(values, dict) and all(isinstance(v, str) for v in values.values())):
             raise InvalidSealedEnd("it is no JSON object of texts")
-        values = _mcap.checked_metadata(Metadata(SEALED_END, values))
+        values = _mcap.checked_metadata(Metadata(names.SEALED_END, values))
         end = SealedEnd(
-            values["log_id"], read_number(values["base"]), read_number(values["following"])
+            values["log_id"],
+            names.read_number(values["base"]),
+            names.read_number(values["following"]),
         )
     except FileNotFoundError:
         return None
@@ -132,10 +125,10 @@ def note_sealed(log: Path, end: SealedEnd) -> None:
 def write_sealed_end(log: Path, end: SealedEnd) -> None:
     """Write the file durably; a folder of its name is set aside. Raises OSError."""
     values = {"log_id": end.log_id, "base": str(end.base), "following": str(end.following)}
-    record = _mcap.metadata_with_crc(SEALED_END, values)
-    final, temporary = log / SEALED_END, log / f"{SEALED_END}.new"
+    record = _mcap.metadata_with_crc(names.SEALED_END, values)
+    final, temporary = log / names.SEALED_END, log / f"{names.SEALED_END}.new"
     if final.is_dir() and not final.is_symlink():
-        final.rename(free_name(final, DAMAGED))
+        final.rename(names.free_name(final, names.DAMAGED))
     unlink_quietly(temporary)
     try:
         fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
@@ -150,7 +143,7 @@ def write_sealed_end(log: Path, end: SealedEnd) -> None:
         raise
 
 
-def segments_of(path: Path) -> list[SegmentPath]:
+def segments_of(path: Path) -> list[names.SegmentPath]:
     """The segments of a log; LogNotFound, NotALog or LogDamaged when there are none, LogError when
     the folder may not be read."""
     try:
@@ -160,7 +153,7 @@ def segments_of(path: Path) -> list[SegmentPath]:
         raise LogError(f"{path}: {reason}; check the folder's rights and its disk") from error
 
 
-def segments_left(path: Path) -> list[SegmentPath]:
+def segments_left(path: Path) -> list[names.SegmentPath]:
     """`segments_of`, and none, instead of LogDamaged, where all of a log are missing."""
     try:
         return segments_of(path)
@@ -168,7 +161,7 @@ def segments_left(path: Path) -> list[SegmentPath]:
         return []
 
 
-def _segments_of(path: Path) -> list[SegmentPath]:
+def _segments_of(path: Path) -> list[names.SegmentPath]:
     if not path.exists():
         raise LogNotFound(f"no log at {path}; record or import one, or check the path")
     if not path.is_dir():
@@ -176,7 +169,7 @@ def _segments_of(path: Path) -> list[SegmentPath]:
             f"{path} is a file; a log is a directory. `{advised('import', 'LOG', path)}` imports it"
         )
     end = sealed_end(path)
-    segments = list_growing(path)
+    segments = names.list_growing(path)
     if not segments:
         if end is not None:
             end.require(path, FIRST_OFFSET)

@@ -13,18 +13,7 @@ from eventsrc.base.progress import report_progress
 from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
-from .format import (
-    IMPORTED,
-    PREVIOUS,
-    SEALED,
-    SEALED_END,
-    SegmentPath,
-    WrongPlace,
-    head_at_any_base,
-    head_of,
-    not_files,
-    segment_path,
-)
+from . import format as names
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
 from .scan import scan_active, scan_sealed, scanned_events
@@ -49,7 +38,7 @@ class Verification:
 
 def verify_log(log: Path) -> Verification:
     """Verify a log. Raises LogNotFound, NotALog, or LogError if the disk cannot be read."""
-    before: list[SegmentPath] = []
+    before: list[names.SegmentPath] = []
     while True:
         end = sealed_end(log)  # before the folder is listed: a writer may be active
         segments = segments_left(log)
@@ -64,7 +53,7 @@ def verify_log(log: Path) -> Verification:
 
 
 class _Verifier:
-    def __init__(self, log: Path, segments: list[SegmentPath], end: SealedEnd | None) -> None:
+    def __init__(self, log: Path, segments: list[names.SegmentPath], end: SealedEnd | None) -> None:
         self._log = log
         self._segments = segments
         self._has_writer = is_held(log)
@@ -89,7 +78,7 @@ class _Verifier:
                 reach = None if self._end is None else self._end.reach(segment.base)
             size += self._verify_segment(segment, reach)
         self._check_sealed_end()
-        for path in not_files(self._log):
+        for path in names.not_files(self._log):
             self._add("crc", "is no file, but a folder, a pipe or a device", path.name)
         report_progress("verifying", 1, 1, "MB")
         return Verification(
@@ -101,11 +90,13 @@ class _Verifier:
             (*self._found, *self._events.findings()),
         )
 
-    def _verify_segment(self, segment: SegmentPath, reach: Offset | None) -> int:
+    def _verify_segment(self, segment: names.SegmentPath, reach: Offset | None) -> int:
         """Verify one segment, which ends at ``reach`` if that is known; its size in bytes."""
         self._report(self._bytes_done)
         if not segment.sealed and not segment.path.exists():  # sealed since the folder was listed
-            segment = SegmentPath(segment_path(self._log, segment.base, SEALED), segment.base, True)
+            segment = names.SegmentPath(
+                names.segment_path(self._log, segment.base, names.SEALED), segment.base, True
+            )
         name = segment.path.name
         if segment.base != self._next_offset:
             last = max(Offset(segment.base - 1), self._next_offset)
@@ -127,7 +118,7 @@ class _Verifier:
             self._expected_hashes = set()  # it has no hash before it is sealed
         for first, last in scan.gaps:
             self._add("gap", "recorded events cannot be read", name, first, last)
-        self._events.begin_segment(imported=IMPORTED in head)
+        self._events.begin_segment(imported=names.IMPORTED in head)
         size = segment.path.stat().st_size
         self._bytes_done += size
         self._verify_events(segment, scan)
@@ -140,22 +131,24 @@ class _Verifier:
         about this log."""
         if self._end is not None and self._end.following > self._next_offset:
             first, last = self._next_offset, Offset(self._end.following - 1)
-            self._add("gap", "segments that were sealed are not there", SEALED_END, first, last)
+            self._add(
+                "gap", "segments that were sealed are not there", names.SEALED_END, first, last
+            )
         repair = f"ignored; `{advised('log', 'recover', self._log)}` replaces it"
         try:
             end = read_sealed_end(self._log)
         except InvalidSealedEnd as error:
-            self._add("crc", f"{error}; {repair}", SEALED_END)
+            self._add("crc", f"{error}; {repair}", names.SEALED_END)
             return
         if end is not None and self._log_id not in (None, end.log_id):
             text = f"belongs to log {end.log_id}, not {self._log_id}: {repair}"
-            self._add("log_id", visible(text), SEALED_END)
+            self._add("log_id", visible(text), names.SEALED_END)
 
     def _report(self, done: int) -> None:
         total = max(self._bytes // 1_000_000, 1)
         report_progress("verifying", min(done // 1_000_000, total), total, "MB")
 
-    def _skip_segment(self, segment: SegmentPath, reach: Offset | None) -> None:
+    def _skip_segment(self, segment: names.SegmentPath, reach: Offset | None) -> None:
         """Report the offsets of a segment that does not belong here as missing."""
         if reach is not None:
             text = "the segment for these events is missing"
@@ -163,11 +156,11 @@ class _Verifier:
             self._next_offset = reach
         self._expected_hashes = set()
 
-    def _check_head(self, segment: SegmentPath) -> dict[str, str] | None:
+    def _check_head(self, segment: names.SegmentPath) -> dict[str, str] | None:
         """The head of a segment; None for one of another log or base, empty for a damaged one."""
         try:
-            head = head_of(segment.path, segment.base)
-        except WrongPlace as error:
+            head = names.head_of(segment.path, segment.base)
+        except names.WrongPlace as error:
             self._add("chain", str(error), segment.path.name)
             return None
         except (LogDamaged, NotALog) as error:
@@ -180,7 +173,7 @@ class _Verifier:
             return None
         return head
 
-    def _check_file(self, segment: SegmentPath, scan: Scan, head: dict[str, str]) -> None:
+    def _check_file(self, segment: names.SegmentPath, scan: Scan, head: dict[str, str]) -> None:
         name = segment.path.name
         check = check_sealed(segment.path)
         if check.fault is not None:
@@ -188,7 +181,7 @@ class _Verifier:
             self._add("crc", f"{check.fault}{known}", name)
         elif scan.index_fault is not None:
             self._add("crc", scan.index_fault, name)
-        previous = head.get(PREVIOUS, NO_PREVIOUS)
+        previous = head.get(names.PREVIOUS, NO_PREVIOUS)
         if head and self._expected_hashes and previous not in self._expected_hashes:
             self._add("chain", "was not written after the segment before it", name)
         self._expected_hashes = {check.sha256, head.get(REPLACES, check.sha256)}
@@ -198,7 +191,7 @@ class _Verifier:
             text = f"{counted(scan.lost_bytes, 'byte')} at its end: the writer died while writing"
             self._add("torn", text, name, count=scan.torn_events)
 
-    def _verify_events(self, segment: SegmentPath, scan: Scan) -> None:
+    def _verify_events(self, segment: names.SegmentPath, scan: Scan) -> None:
         fd = os.open(segment.path, os.O_RDONLY)
         try:
             for chunk in scan.chunks:
@@ -224,19 +217,19 @@ class _Verifier:
         self._found.append(Finding(kind, message, segment, first, last, count))
 
 
-def _size_of(segment: SegmentPath) -> int:
+def _size_of(segment: names.SegmentPath) -> int:
     try:
         return segment.path.stat().st_size
     except OSError:  # sealed meanwhile, or unreadable, which is reported when it is read
         return 0
 
 
-def _log_id_of(segments: list[SegmentPath], end: SealedEnd | None) -> str | None:
+def _log_id_of(segments: list[names.SegmentPath], end: SealedEnd | None) -> str | None:
     """The log id that recovery would keep; None if no head can be read."""
     carried = []
     for segment in segments:
         try:
-            head = head_at_any_base(segment.path)
+            head = names.head_at_any_base(segment.path)
         except (LogDamaged, NotALog):
             continue
         base = Offset(int(head["base"]))

@@ -17,23 +17,8 @@ import msgspec
 
 from eventsrc.envelope.crops import Crop
 
+from . import messages
 from .measured import KeptScans, place_solids
-from .messages import (
-    CAMERA_INFO,
-    DETECTION_TYPES,
-    FLOATS,
-    TEXT,
-    UNCLASSIFIED,
-    BadMessage,
-    Detected,
-    Lens,
-    StampedEmbeddings,
-    detections_of,
-    embeddings_of_floats,
-    embeddings_of_text,
-    lens_of,
-    read,
-)
 from .named_classes import ClassNames
 from .pictures import CutCrops, Jpegs, StreamPictures
 from .stream import Counts, PicturePose, PoseSource, Stream
@@ -75,7 +60,7 @@ class _Picture:
 
     received_ns: int
     state: "_StreamState"
-    detected: Detected
+    detected: messages.Detected
     keyframe_id: int
     pose: PicturePose | None = None
     checked_at: int = -1
@@ -202,10 +187,10 @@ class _StreamState:
         if cut is not None and stream.images is not None:
             self._pictures = StreamPictures(stream, cut, self.counts)
         self.poses = PoseSource(stream, buffer, self.counts)
-        self._lens: Lens | None = None
+        self._lens: messages.Lens | None = None
         self._names = ClassNames()
         self._told: Mapping[str, str] = {}
-        self._embeddings: dict[int, StampedEmbeddings] = {}
+        self._embeddings: dict[int, messages.StampedEmbeddings] = {}
         self._scans = KeptScans()
         self._next = stream.first_keyframe
 
@@ -233,16 +218,18 @@ class _StreamState:
         def counting(topic: str, type_name: str, content: Any) -> None:
             try:
                 handler(topic, type_name, content)
-            except BadMessage as error:
+            except messages.BadMessage as error:
                 self.counts.refuse(topic, str(error))
 
         return counting
 
     def picture(self, type_name: str, received_ns: int, content: Any) -> _Picture:
         """The detections of a message, with the next keyframe id. Raises BadMessage."""
-        if type_name not in DETECTION_TYPES:
-            raise BadMessage(f"it is {type_name:.80}, not {' or '.join(DETECTION_TYPES)}")
-        detected = read(detections_of, content)
+        if type_name not in messages.DETECTION_TYPES:
+            raise messages.BadMessage(
+                f"it is {type_name:.80}, not {' or '.join(messages.DETECTION_TYPES)}"
+            )
+        detected = messages.read(messages.detections_of, content)
         self._next += 1
         jpegs = None if self._pictures is None else self._pictures.cut(detected)
         return _Picture(received_ns, self, detected, self._next - 1, jpegs=jpegs)
@@ -320,11 +307,11 @@ class _StreamState:
             fields["pose_covariance"] = list(pose.covariance)
         return fields
 
-    def _name_classes(self, detected: Detected) -> None:
+    def _name_classes(self, detected: messages.Detected) -> None:
         given, told = self.stream.labels, self._told
         for detection in detected.detections:
             class_id = detection["class"]
-            if class_id != UNCLASSIFIED:
+            if class_id != messages.UNCLASSIFIED:
                 detection["class"] = given.get(class_id) or told.get(class_id, class_id)
             self.counts.numbered += detection["class"].isdecimal()
 
@@ -332,7 +319,7 @@ class _StreamState:
         if self._names.add(type_name, content):
             self._told = self._names.of(self.stream.detections).labels
 
-    def _attach_embeddings(self, detected: Detected) -> None:
+    def _attach_embeddings(self, detected: messages.Detected) -> None:
         given = self._embeddings.pop(detected.stamp_ns, None)
         if given is None:
             return
@@ -358,20 +345,25 @@ class _StreamState:
                     detection["embedding_model"] = model
 
     def _set_lens(self, _topic: str, type_name: str, content: Any) -> None:
-        if type_name != CAMERA_INFO:
-            raise BadMessage(f"it is {type_name:.80}, not {CAMERA_INFO}")
-        self._lens = read(lens_of, content)
+        if type_name != messages.CAMERA_INFO:
+            raise messages.BadMessage(f"it is {type_name:.80}, not {messages.CAMERA_INFO}")
+        self._lens = messages.read(messages.lens_of, content)
 
     def _keep_embeddings(self, topic: str, type_name: str, content: Any) -> None:
-        reader = {TEXT: embeddings_of_text, FLOATS: embeddings_of_floats}.get(type_name)
+        reader = {
+            messages.TEXT: messages.embeddings_of_text,
+            messages.FLOATS: messages.embeddings_of_floats,
+        }.get(type_name)
         if reader is None:
-            raise BadMessage(f"it is {type_name:.80}, not {TEXT} or {FLOATS}")
-        given = read(reader, content)
+            raise messages.BadMessage(
+                f"it is {type_name:.80}, not {messages.TEXT} or {messages.FLOATS}"
+            )
+        given = messages.read(reader, content)
         if len(self._embeddings) >= _MOST_EMBEDDINGS:
             del self._embeddings[next(iter(self._embeddings))]
             self.counts.refuse(topic, _UNCLAIMED)
         if given.stamp_ns in self._embeddings:
-            raise BadMessage("there were others of its stamp before")
+            raise messages.BadMessage("there were others of its stamp before")
         self._embeddings[given.stamp_ns] = given
 
     def count_unclaimed(self) -> None:

@@ -13,14 +13,7 @@ from typing import NamedTuple
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
-from eventsrc.envelope.commands import (
-    MAX_COMMAND_BYTES,
-    MAX_YAW_RAD,
-    CorrectedPose,
-    CorrectPoses,
-    RigidTransform,
-    encode_command,
-)
+from eventsrc.envelope import commands
 from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
 
@@ -43,7 +36,7 @@ class Laid(NamedTuple):
     ``unknown`` are poses of keyframes that the run does not have; ``widest_s`` is the longest time
     between two poses that was interpolated over."""
 
-    poses: tuple[CorrectedPose, ...]
+    poses: tuple[commands.CorrectedPose, ...]
     left: tuple[KeyframeId, ...]
     unknown: tuple[TrajectoryPose, ...]
     widest_s: float
@@ -64,14 +57,14 @@ def lay(
             continue
         (x, y, yaw), width = found
         widest = max(widest, width)
-        poses.append(CorrectedPose(keyframe_id=keyframe_id, x=x, y=y, yaw=yaw))
+        poses.append(commands.CorrectedPose(keyframe_id=keyframe_id, x=x, y=y, yaw=yaw))
     return Laid(tuple(poses), tuple(left), (), widest)
 
 
 def _by_keyframe(trajectory: Trajectory, keyframes: Sequence[RunKeyframe]) -> Laid:
     given = {KeyframeId(int(pose.key)): pose for pose in trajectory.poses}
     poses = [
-        CorrectedPose(keyframe_id=k.keyframe_id, x=pose.x, y=pose.y, yaw=pose.yaw)
+        commands.CorrectedPose(keyframe_id=k.keyframe_id, x=pose.x, y=pose.y, yaw=pose.yaw)
         for k in keyframes
         if (pose := given.get(k.keyframe_id)) is not None
     ]
@@ -133,7 +126,7 @@ def by_trajectory(
     *,
     ignore_missing: bool = False,
     note: Callable[[str], None] = lambda _: None,
-) -> CorrectPoses:
+) -> commands.CorrectPoses:
     """The poses of a file for the keyframes of a run. ``note`` is called with a message if
     the file may be cut off, keyframes or poses are left out, or poses are interpolated."""
     keyframes = _keyframes(current, run_id, span)
@@ -145,24 +138,25 @@ def by_trajectory(
     if not laid.poses:
         raise MisuseError(_nothing_laid(trajectory, keyframes, slack_s))
     _note_left(note, run_id, trajectory, laid, slack_s)
-    command = build(CorrectPoses, stamp, run_id=run_id, poses=laid.poses)
-    size = len(encode_command(command))
-    if size > MAX_COMMAND_BYTES:
+    command = build(commands.CorrectPoses, stamp, run_id=run_id, poses=laid.poses)
+    size = len(commands.encode_command(command))
+    if size > commands.MAX_COMMAND_BYTES:
         raise MisuseError(
-            f"{trajectory.name}: {counted(len(laid.poses), 'pose')} make a command of {size:,} "
-            f"bytes, more than {MAX_COMMAND_BYTES:,}; give it in parts with --from and --to"
+            f"{trajectory.name}: {counted(len(laid.poses), 'pose')} make a command of {size:,}"
+            f" bytes, more than {commands.MAX_COMMAND_BYTES:,}; give it in parts with --from and"
+            " --to"
         )
     return command
 
 
 def by_transform(
     current: MapToEdit, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
-) -> CorrectPoses:
+) -> commands.CorrectPoses:
     """One rigid transform of the keyframes of a run."""
     for name, value, most in (
         ("--dx", dx, MAX_POSITION_M),
         ("--dy", dy, MAX_POSITION_M),
-        ("--dyaw", dyaw, MAX_YAW_RAD),
+        ("--dyaw", dyaw, commands.MAX_YAW_RAD),
     ):
         if not math.isfinite(value) or abs(value) > most:
             raise MisuseError(f"{name} {value}: not between ±{most:,.0f}")
@@ -170,10 +164,10 @@ def by_transform(
         raise MisuseError("--dx, --dy and --dyaw are all 0: nothing would move")
     _keyframes(current, run_id, span)
     return build(
-        CorrectPoses,
+        commands.CorrectPoses,
         stamp,
         run_id=run_id,
-        transform=RigidTransform.of(dx, dy, dyaw),
+        transform=commands.RigidTransform.of(dx, dy, dyaw),
         first=span.first,
         last=span.last,
     )

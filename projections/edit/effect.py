@@ -10,25 +10,8 @@ from typing import Any, NamedTuple
 
 from eventsrc.base.progress import working
 from eventsrc.base.text import advised, counted, table, visible
-from eventsrc.envelope.commands import (
-    Command,
-    CorrectPoses,
-    DifferentObjects,
-    DropDetection,
-    DropObject,
-    ForgetKeyframes,
-    ForgetRun,
-    Join,
-    KeepApart,
-    NamePlace,
-    Reembed,
-    Relabel,
-    SameObject,
-    Undo,
-    UndoMerge,
-    UseSettings,
-    encode_command,
-)
+from eventsrc.envelope import commands as kinds
+from eventsrc.envelope.commands import Command, encode_command
 from eventsrc.envelope.model import Offset
 from eventsrc.log import cache_folder, make_cache_folder, write_cache_file
 from projections.fold.corrections import (
@@ -212,7 +195,7 @@ def effect_keys(settings_of: SettingsOf, commands: Iterable[RecordedCommand]) ->
     for offset, command in commands:
         encoded = encode_command(command)
         digest.update(f" {offset} {len(encoded)} ".encode() + encoded)
-        if isinstance(command, UseSettings):
+        if isinstance(command, kinds.UseSettings):
             named = json.dumps(command.settings).encode()
             if named not in known:
                 known[named] = fingerprint_under(Settings.from_document(command.settings))
@@ -263,33 +246,33 @@ Found = Sequence[tuple[RecordedCommand, Effect | None]]
 def what(command: Command) -> str:
     """A short description of a command's subject."""
     match command:
-        case NamePlace():
+        case kinds.NamePlace():
             return f"{_name(command.place)} is {command.name}"
-        case KeepApart() | Join():
+        case kinds.KeepApart() | kinds.Join():
             return " and ".join(map(_name, command.places))
-        case UndoMerge():
+        case kinds.UndoMerge():
             return f"at {command.merge_offset}: {' and '.join(map(_name, command.places))}"
-        case SameObject() | DifferentObjects():
+        case kinds.SameObject() | kinds.DifferentObjects():
             return " and ".join(command.det_ids)
-        case DropObject() | DropDetection():
+        case kinds.DropObject() | kinds.DropDetection():
             more = len(command.det_ids) - 1
             return command.det_ids[0] + (f" and {more:,} more" if more else "")
-        case ForgetRun():
+        case kinds.ForgetRun():
             return command.run_id
-        case ForgetKeyframes():
+        case kinds.ForgetKeyframes():
             return f"{command.run_id}:{command.first}..{command.last}"
-        case CorrectPoses():
+        case kinds.CorrectPoses():
             return f"{command.run_id}: {_poses(command)}"
-        case Relabel():
+        case kinds.Relabel():
             (label, name), *others = command.labels
             return f"{label} is {name}" + (f" and {len(others):,} more" if others else "")
-        case UseSettings():
+        case kinds.UseSettings():
             plain, given = _default_settings(), settings_by_name(command.settings)
             changed = {name: value for name, value in given.items() if plain.get(name) != value}
             return ", ".join(assignment_texts(changed)) or "the defaults"
-        case Reembed():
+        case kinds.Reembed():
             return f"{counted(command.detections, 'detection')} in {command.space}"
-        case Undo():
+        case kinds.Undo():
             return command.undone
 
 
@@ -302,7 +285,7 @@ def _name(anchor: Any) -> str:
     return f"{anchor.run_id}:{anchor.keyframe_id}"
 
 
-def _poses(command: CorrectPoses) -> str:
+def _poses(command: kinds.CorrectPoses) -> str:
     if command.transform is None:
         return counted(len(command.poses), "pose")
     t = command.transform

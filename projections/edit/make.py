@@ -15,23 +15,8 @@ from pydantic import ValidationError
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, counted, visible
-from eventsrc.envelope.commands import (
-    Anchor,
-    Command,
-    DifferentObjects,
-    DropDetection,
-    DropObject,
-    ForgetKeyframes,
-    ForgetRun,
-    Join,
-    KeepApart,
-    NamePlace,
-    Relabel,
-    SameObject,
-    Undo,
-    UndoMerge,
-    UseSettings,
-)
+from eventsrc.envelope import commands as kinds
+from eventsrc.envelope.commands import Anchor, Command
 from eventsrc.envelope.model import DetId, KeyframeId, RunId, describe_error
 from projections.fold.corrections import Keyframe, RecordedCommand, compile_corrections
 from projections.fold.settings import Settings
@@ -64,7 +49,7 @@ def build(model: type[_C], stamp: Stamp, **fields: Any) -> _C:
 _OPTIONS = {"command_id": "--command-id", "issued_by": "--issued-by", "reason": "--reason"}
 
 
-def name_place(current: MapToEdit, stamp: Stamp, place: str, name: str) -> NamePlace:
+def name_place(current: MapToEdit, stamp: Stamp, place: str, name: str) -> kinds.NamePlace:
     """The command that names a place."""
     anchor = current.find_place(place)
     number = current.place_of(anchor)
@@ -76,28 +61,28 @@ def name_place(current: MapToEdit, stamp: Stamp, place: str, name: str) -> NameP
         raise MisuseError(f"{name!r} is the id of a place; give another name")
     if number is not None and current.view.all_places[number].name == name:
         raise conflicts.EditRefused(f"{current.place_name(anchor)} is called {name!r} already")
-    return build(NamePlace, stamp, place=_anchor(anchor), name=name)
+    return build(kinds.NamePlace, stamp, place=_anchor(anchor), name=name)
 
 
-def keep_apart(current: MapToEdit, stamp: Stamp, first: str, second: str) -> KeepApart:
+def keep_apart(current: MapToEdit, stamp: Stamp, first: str, second: str) -> kinds.KeepApart:
     """The command that keeps two places apart."""
     pair = _two_places(current, first, second)
     if pair in current.corrections.apart:
         raise conflicts.EditRefused(f"{first} and {second} are kept apart already")
     conflicts.check_apart(current, pair)
-    return build(KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
+    return build(kinds.KeepApart, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
 
 
-def undo_merge(current: MapToEdit, stamp: Stamp, offset: int) -> UndoMerge:
+def undo_merge(current: MapToEdit, stamp: Stamp, offset: int) -> kinds.UndoMerge:
     """The command that keeps apart the places merged at ``offset``."""
     anchors = merged_at(current, offset)
     conflicts.check_apart(current, anchors)
     return build(
-        UndoMerge, stamp, merge_offset=offset, places=tuple(_anchor(each) for each in anchors)
+        kinds.UndoMerge, stamp, merge_offset=offset, places=tuple(_anchor(each) for each in anchors)
     )
 
 
-def join(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Join:
+def join(current: MapToEdit, stamp: Stamp, first: str, second: str) -> kinds.Join:
     """The command that joins two places."""
     pair = _two_places(current, first, second)
     if current.place_of(pair[0]) == current.place_of(pair[1]):
@@ -106,7 +91,7 @@ def join(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Join:
         )
     _check_floor(f"{first} and {second}", *(current.keyframes[each].floor for each in pair))
     conflicts.check_join(current, *pair)
-    return build(Join, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
+    return build(kinds.Join, stamp, places=(_anchor(pair[0]), _anchor(pair[1])))
 
 
 def _check_floor(what: str, one: str | None, other: str | None) -> None:
@@ -132,7 +117,7 @@ def _anchor(keyframe: Keyframe) -> Anchor:
     return Anchor(run_id=keyframe.run_id, keyframe_id=keyframe.keyframe_id)
 
 
-def same_object(current: MapToEdit, stamp: Stamp, first: str, second: str) -> SameObject:
+def same_object(current: MapToEdit, stamp: Stamp, first: str, second: str) -> kinds.SameObject:
     """The command that makes two objects one."""
     one, other = current.find_observation(first), current.find_observation(second)
     if one.object == other.object:
@@ -146,12 +131,12 @@ def same_object(current: MapToEdit, stamp: Stamp, first: str, second: str) -> Sa
             f"{first} is of class {one.class_name!r}, {second} of {other.class_name!r}; only"
             " objects of one class can be one"
         )
-    return build(SameObject, stamp, det_ids=(one.det_id, other.det_id))
+    return build(kinds.SameObject, stamp, det_ids=(one.det_id, other.det_id))
 
 
 def different_objects(
     current: MapToEdit, stamp: Stamp, first: str, second: str
-) -> DifferentObjects:
+) -> kinds.DifferentObjects:
     """The command that keeps two objects apart. Two observations of one object are named by their
     det_ids."""
     one, other = current.find_observation(first), current.find_observation(second)
@@ -163,37 +148,39 @@ def different_objects(
     if (one.det_id, other.det_id) in current.corrections.different:
         raise conflicts.EditRefused(f"{first} and {second} are kept apart already")
     conflicts.check_different(current, one.det_id, other.det_id)
-    return build(DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))
+    return build(kinds.DifferentObjects, stamp, det_ids=(one.det_id, other.det_id))
 
 
-def drop_object(current: MapToEdit, stamp: Stamp, thing: str) -> DropObject:
+def drop_object(current: MapToEdit, stamp: Stamp, thing: str) -> kinds.DropObject:
     """The command that leaves an object's present observations out of the map."""
     found = current.find_object(thing)
     det_ids = tuple(current.view.observations[number].det_id for number in found.observations)
-    return build(DropObject, stamp, det_ids=det_ids)
+    return build(kinds.DropObject, stamp, det_ids=det_ids)
 
 
-def drop_detection(current: MapToEdit, stamp: Stamp, det_ids: Sequence[str]) -> DropDetection:
+def drop_detection(current: MapToEdit, stamp: Stamp, det_ids: Sequence[str]) -> kinds.DropDetection:
     """The command that leaves detections out of the map."""
     named = tuple(dict.fromkeys(map(DetId, det_ids)))
     for det_id in named:
         if det_id not in current.observations:
             conflicts.check_not_dropped(current, det_id)
             raise NoSuchThing("observation", det_id, current.observations)
-    return build(DropDetection, stamp, det_ids=named)
+    return build(kinds.DropDetection, stamp, det_ids=named)
 
 
-def forget_run(current: MapToEdit, stamp: Stamp, run_id: str) -> ForgetRun:
+def forget_run(current: MapToEdit, stamp: Stamp, run_id: str) -> kinds.ForgetRun:
     """The command that leaves a run out of every fold."""
     conflicts.check_run_in_map(current, run_id)
     current.run(run_id)
-    return build(ForgetRun, stamp, run_id=run_id)
+    return build(kinds.ForgetRun, stamp, run_id=run_id)
 
 
 _RANGE = re.compile(r"(-?[0-9]{1,19})\.\.(-?[0-9]{1,19})")
 
 
-def forget_keyframes(current: MapToEdit, stamp: Stamp, run_id: str, span: str) -> ForgetKeyframes:
+def forget_keyframes(
+    current: MapToEdit, stamp: Stamp, run_id: str, span: str
+) -> kinds.ForgetKeyframes:
     """The command that leaves keyframes ``A..B`` of a run, both included, out of every fold."""
     found = _RANGE.fullmatch(span)
     if found is None:
@@ -208,7 +195,7 @@ def forget_keyframes(current: MapToEdit, stamp: Stamp, run_id: str, span: str) -
         raise MisuseError(
             f"no keyframe of {run_id} in {span}{already}; {keyframes_of(current, run_id)}"
         )
-    return build(ForgetKeyframes, stamp, run_id=run_id, first=first, last=last)
+    return build(kinds.ForgetKeyframes, stamp, run_id=run_id, first=first, last=last)
 
 
 def keyframes_of(current: MapToEdit, run_id: str) -> str:
@@ -234,7 +221,7 @@ def relabel(
     stamp: Stamp,
     given: Mapping[str, str],
     listed: Mapping[str, str] = MappingProxyType({}),
-) -> Relabel:
+) -> kinds.Relabel:
     """The command that names the classes of recorded labels. The log must have each label that is
     ``given``, and one of those that are ``listed``, as all that a detector knows: the others name
     what is recorded later."""
@@ -258,7 +245,7 @@ def relabel(
         current.note(
             visible(f"the log has {len(found):,} of {of}{rest}; the others name what comes later")
         )
-    return build(Relabel, stamp, labels=tuple(labels.items()))
+    return build(kinds.Relabel, stamp, labels=tuple(labels.items()))
 
 
 _MOST_LABELS = 10
@@ -268,7 +255,7 @@ def _recorded_labels(current: MapToEdit) -> dict[str, None]:
     """The classes as the log has them, whatever they are called now."""
     view = current.view
     if current.corrections.labels:
-        others = [c for c in current.commands if not isinstance(c.command, Relabel)]
+        others = [c for c in current.commands if not isinstance(c.command, kinds.Relabel)]
         view = current.fold(compile_corrections(others), current.settings)
     return dict.fromkeys(sorted({each.class_name for each in view.observations}))
 
@@ -286,15 +273,15 @@ def _no_label(
     )
 
 
-def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> UseSettings:
+def use_settings(current: MapToEdit, stamp: Stamp, settings: Settings) -> kinds.UseSettings:
     """The command that changes the settings of the map from here on."""
     if settings == (current.corrections.settings or Settings()):
         raise conflicts.EditRefused("these are the settings of the log already")
     plain = settings.model_dump()
-    return build(UseSettings, stamp, settings=plain)
+    return build(kinds.UseSettings, stamp, settings=plain)
 
 
-def undo(current: MapToEdit, stamp: Stamp, command_id: str) -> Undo:
+def undo(current: MapToEdit, stamp: Stamp, command_id: str) -> kinds.Undo:
     """The command that undoes another one."""
     found = current.find_command(command_id)
     if found is None:
@@ -305,7 +292,7 @@ def undo(current: MapToEdit, stamp: Stamp, command_id: str) -> Undo:
             f"command {visible(command_id)} is undone already, by {conflicts.describe(by)}; undo"
             " that to restore it"
         )
-    return build(Undo, stamp, undone=command_id)
+    return build(kinds.Undo, stamp, undone=command_id)
 
 
 def undone_by(commands: Sequence[RecordedCommand]) -> dict[str, RecordedCommand]:
@@ -319,7 +306,7 @@ def undone_by(commands: Sequence[RecordedCommand]) -> dict[str, RecordedCommand]
         command = recorded.command
         later.add(command.command_id)
         in_force = command.command_id not in undone
-        if isinstance(command, Undo) and in_force and command.undone not in later:
+        if isinstance(command, kinds.Undo) and in_force and command.undone not in later:
             undone.setdefault(command.undone, recorded)
     return undone
 
@@ -360,7 +347,7 @@ def merged_at(current: MapToEdit, offset: int) -> tuple[Keyframe, ...]:
 def _check_not_undone(current: MapToEdit, offset: int) -> None:
     for recorded in current.corrections.in_force:
         command = recorded.command
-        if isinstance(command, UndoMerge) and command.merge_offset == offset:
+        if isinstance(command, kinds.UndoMerge) and command.merge_offset == offset:
             raise conflicts.EditRefused(
                 f"the merge at {offset} is undone already, by {conflicts.describe(recorded)}"
             )

@@ -16,19 +16,8 @@ from typing import Any, Final, NamedTuple
 
 from eventsrc.base.errors import LogBusy, LogError, MapfoldError, TransportError
 from eventsrc.base.text import advised, visible
-from eventsrc.envelope.commands import (
-    Anchor,
-    Command,
-    CorrectPoses,
-    DifferentObjects,
-    Join,
-    KeepApart,
-    NamePlace,
-    Relabel,
-    SameObject,
-    UndoMerge,
-    encode_command,
-)
+from eventsrc.envelope import commands as kinds
+from eventsrc.envelope.commands import Anchor, Command, encode_command
 from eventsrc.envelope.model import DetId, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY
 from eventsrc.log import LogReader, LogWriter
@@ -74,7 +63,7 @@ def outcome_of(current: MapToEdit, command: Command, *, recorded: bool) -> Outco
     if recorded:
         return Outcome(change, effect)
     _check_does(change, command, effect)
-    rooms = tuple(_other_rooms(change)) if isinstance(command, Relabel) else ()
+    rooms = tuple(_other_rooms(change)) if isinstance(command, kinds.Relabel) else ()
     return Outcome(change, effect, void=tuple(_void(change)), rooms=rooms)
 
 
@@ -108,7 +97,7 @@ def _is_the_cause(change: Change) -> bool:
 def _check_does(change: Change, command: Command, effect: Effect) -> None:
     current = change.current
     match command:
-        case KeepApart() | UndoMerge():
+        case kinds.KeepApart() | kinds.UndoMerge():
             located = Located.of(change.after)
             for first, second in combinations(command.places, 2):
                 place = located.place(first)
@@ -122,7 +111,7 @@ def _check_does(change: Change, command: Command, effect: Effect) -> None:
                         f"(`{advised('merges', current.reader.path)}`) or keyframes that founded "
                         "two"
                     )
-        case DifferentObjects():
+        case kinds.DifferentObjects():
             located = Located.of(change.after)
             one, other = map(located.object, command.det_ids)
             if one is not None and one == other:
@@ -131,7 +120,7 @@ def _check_does(change: Change, command: Command, effect: Effect) -> None:
                     f"{command.det_ids[1]!r}: both would be of one object still; name the "
                     "det_ids that founded two objects"
                 )
-        case Join() | SameObject() | CorrectPoses() if effect.none:
+        case kinds.Join() | kinds.SameObject() | kinds.CorrectPoses() if effect.none:
             raise EditRefused(f"{command.kind} would change nothing in the map; it is not recorded")
         case _:
             pass
@@ -182,25 +171,25 @@ class Located(NamedTuple):
     def why_void(self, command: Command) -> str:
         """Why a command has no effect in this map; empty if it may have one."""
         match command:
-            case NamePlace():
+            case kinds.NamePlace():
                 return self._not_placed((command.place,), 1)
-            case KeepApart() | Join() | UndoMerge():
+            case kinds.KeepApart() | kinds.Join() | kinds.UndoMerge():
                 why = self._not_placed(command.places, 2)
-                if why or isinstance(command, Join):
+                if why or isinstance(command, kinds.Join):
                     return why
                 places = {self.place(a) for a in command.places} - {None}
                 return "" if len(places) > 1 else "what it keeps apart is one place"
-            case SameObject() | DifferentObjects():
+            case kinds.SameObject() | kinds.DifferentObjects():
                 for det_id in command.det_ids:
                     if det_id not in self.observations:
                         return f"its detection {det_id!r} is left out"
                     if self.object(det_id) is None:
                         return f"its detection {det_id!r} is of no object"
-                if isinstance(command, SameObject):
+                if isinstance(command, kinds.SameObject):
                     return ""
                 one, other = map(self.object, command.det_ids)
                 return "what it keeps apart is one object" if one == other else ""
-            case CorrectPoses():
+            case kinds.CorrectPoses():
                 there = any(k.run_id == command.run_id for k in self.keyframes)
                 return "" if there else f"its run {command.run_id!r} is left out"
             case _:

@@ -18,17 +18,7 @@ from typing import Any
 
 from eventsrc.base.errors import MisuseError
 
-from .condition_functions import (
-    FUNCTIONS,
-    Direction,
-    Function,
-    HistoryFacts,
-    Mention,
-    Names,
-    Type,
-    Value,
-    no_function,
-)
+from . import condition_functions as functions
 
 MAX_DEPTH = 100
 """Greatest depth of ``not``, ``and``, ``or`` and comparisons; it bounds the recursion here."""
@@ -65,9 +55,9 @@ class ExpressionError(MisuseError):
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    function: Function
-    mentions: tuple[Mention, ...]
-    value: Callable[[HistoryFacts], Value]
+    function: functions.Function
+    mentions: tuple[functions.Mention, ...]
+    value: Callable[[functions.HistoryFacts], functions.Value]
 
     def __str__(self) -> str:
         arguments = ", ".join(repr(mention.text) for mention in self.mentions)
@@ -79,9 +69,9 @@ class _Term:
     """A part of a condition with its type, and the function of a map that gives its value."""
 
     column: int
-    type: Type
-    value: Callable[[HistoryFacts], Value]
-    direction: Direction = Direction.STEADY
+    type: functions.Type
+    value: Callable[[functions.HistoryFacts], functions.Value]
+    direction: functions.Direction = functions.Direction.STEADY
     calls: tuple[_Call, ...] = ()
     text: str | None = None  # of one in quotes
 
@@ -98,20 +88,20 @@ class Expression:
     def __str__(self) -> str:
         return self.source
 
-    def holds(self, facts: HistoryFacts) -> bool:
+    def holds(self, facts: functions.HistoryFacts) -> bool:
         """Whether it is true of this map."""
         return bool(self._term.value(facts))
 
-    def readings(self, facts: HistoryFacts) -> tuple[tuple[str, Value], ...]:
+    def readings(self, facts: functions.HistoryFacts) -> tuple[tuple[str, functions.Value], ...]:
         """Every function call as written, with its value."""
         return tuple({str(call): call.value(facts) for call in self._term.calls}.items())
 
     @property
-    def direction(self) -> Direction:
+    def direction(self) -> functions.Direction:
         """How its truth can change as events are added."""
         return self._term.direction
 
-    def mentions(self) -> tuple[Mention, ...]:
+    def mentions(self) -> tuple[functions.Mention, ...]:
         """The keyframes, places, objects, classes and runs it names."""
         called = (mention for call in self._term.calls for mention in call.mentions)
         return (*called, *self._compared)
@@ -128,7 +118,7 @@ class _Parser:
         self._source = source
         self._lines = source.lstrip().splitlines(keepends=True)
         self._skipped = len(source) - len(source.lstrip())
-        self.compared: list[Mention] = []
+        self.compared: list[functions.Mention] = []
         """Texts that are compared with a place."""
 
     def parse(self) -> _Term:
@@ -157,15 +147,15 @@ class _Parser:
             raise self._error(column, f"nested more than {MAX_DEPTH} deep")
         match node:
             case ast.Constant(value=str() as text):
-                return _Term(column, Type.TEXT, lambda _: text, text=text)
+                return _Term(column, functions.Type.TEXT, lambda _: text, text=text)
             case ast.Constant(value=int() as number) if type(number) is int:
-                return _Term(column, Type.NUMBER, lambda _: number)
+                return _Term(column, functions.Type.NUMBER, lambda _: number)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() as number)) if (
                 type(number) is int
             ):
-                return _Term(column, Type.NUMBER, lambda _: -number)
+                return _Term(column, functions.Type.NUMBER, lambda _: -number)
             case ast.Name(id="none"):
-                return _Term(column, Type.TEXT, lambda _: None)
+                return _Term(column, functions.Type.TEXT, lambda _: None)
             case ast.Name(id=name):
                 return self._call(name, column, [])
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
@@ -174,7 +164,7 @@ class _Parser:
                 inner = self._boolean(self._term(operand, depth + 1), "the operand of not")
                 return _Term(
                     column,
-                    Type.BOOLEAN,
+                    functions.Type.BOOLEAN,
                     lambda facts: not inner.value(facts),
                     inner.direction.opposite,
                     inner.calls,
@@ -202,9 +192,9 @@ class _Parser:
         join = all if word == "and" else any
         return _Term(
             column,
-            Type.BOOLEAN,
+            functions.Type.BOOLEAN,
             lambda facts: join(term.value(facts) for term in terms),
-            functools.reduce(Direction.joined, (term.direction for term in terms)),
+            functools.reduce(functions.Direction.joined, (term.direction for term in terms)),
             tuple(call for term in terms for call in term.calls),
         )
 
@@ -214,14 +204,14 @@ class _Parser:
         at = right.column
         if left.type is not right.type:
             raise self._error(at, f"cannot compare {left.type.value} with {right.type.value}")
-        if left.type is Type.BOOLEAN:
+        if left.type is functions.Type.BOOLEAN:
             raise self._error(at, "true and false cannot be compared; use and, or, not")
-        if left.type is Type.TEXT and sign not in ("==", "!="):
+        if left.type is functions.Type.TEXT and sign not in ("==", "!="):
             raise self._error(at, f"texts have no order; {sign!r} needs numbers")
         left, right = self._as_place(left, right), self._as_place(right, left)
         return _Term(
             left.column,
-            Type.BOOLEAN,
+            functions.Type.BOOLEAN,
             lambda facts: holds(left.value(facts), right.value(facts)),
             left.direction.compared(sign, right.direction),
             left.calls + right.calls,
@@ -232,26 +222,27 @@ class _Parser:
         text = term.text
         if text is None or not any(call.function.gives_place for call in other.calls):
             return term
-        self.compared.append(Mention(Names.PLACE, text, term.column))
-        return replace(term, value=lambda facts: facts.id_of(Names.PLACE, text))
+        self.compared.append(functions.Mention(functions.Names.PLACE, text, term.column))
+        return replace(term, value=lambda facts: facts.id_of(functions.Names.PLACE, text))
 
     def _call(self, name: str, column: int, arguments: list[ast.expr]) -> _Term:
-        function = FUNCTIONS.get(name)
+        function = functions.FUNCTIONS.get(name)
         if function is None:
-            raise self._error(column, no_function(name))
+            raise self._error(column, functions.no_function(name))
         texts = [self._argument(function, node) for node in arguments]
         least = 0 if function.optional else len(function.parameters)
         if not least <= len(texts) <= len(function.parameters):
             raise self._error(column, f"write it as {function.signature}")
         mentions = tuple(
-            Mention(kind, *text) for kind, text in zip(function.parameters, texts, strict=False)
+            functions.Mention(kind, *text)
+            for kind, text in zip(function.parameters, texts, strict=False)
         )
         names = (text for text, _ in texts)
         call = _Call(function, mentions, operator.methodcaller(function.name, *names))
-        direction = Direction.RISING if function.rises else Direction.EITHER_WAY
+        direction = functions.Direction.RISING if function.rises else functions.Direction.EITHER_WAY
         return _Term(column, function.result, call.value, direction, (call,))
 
-    def _argument(self, function: Function, node: ast.expr) -> tuple[str, int]:
+    def _argument(self, function: functions.Function, node: ast.expr) -> tuple[str, int]:
         """The text and its column."""
         column = self._column(node.lineno, node.col_offset)
         if not (isinstance(node, ast.Constant) and isinstance(node.value, str)):
@@ -259,7 +250,7 @@ class _Parser:
         return node.value, column
 
     def _boolean(self, term: _Term, what: str) -> _Term:
-        if term.type is Type.BOOLEAN:
+        if term.type is functions.Type.BOOLEAN:
             return term
         reason = f"{what} must be true or false, and this is {term.type.value}"
         raise self._error(term.column, reason)

@@ -22,14 +22,8 @@ from typing import Any
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
+from projections.fold import deltas
 from projections.fold.corrections import RecordedCommand
-from projections.fold.deltas import (
-    KeyframeOrdinal,
-    MergeEvidence,
-    ObjectOrdinal,
-    PlaceLink,
-    PlaceOrdinal,
-)
 from projections.fold.exact import UM_PER_M
 from projections.map.phrases import command_document, command_on, command_title
 from projections.store.history import History
@@ -50,13 +44,13 @@ class Chain:
     ``distances_um`` are the steps between them.
     """
 
-    joined: PlaceOrdinal
-    absorbed: PlaceOrdinal
-    points: tuple[KeyframeOrdinal, ...]
+    joined: deltas.PlaceOrdinal
+    absorbed: deltas.PlaceOrdinal
+    points: tuple[deltas.KeyframeOrdinal, ...]
     distances_um: tuple[int, ...]
 
     @property
-    def made_core(self) -> tuple[KeyframeOrdinal, ...]:
+    def made_core(self) -> tuple[deltas.KeyframeOrdinal, ...]:
         """The points that this event made core."""
         return self.points[1:-1]
 
@@ -87,11 +81,11 @@ def chains_of(history: History, merge: Merge) -> list[Chain]:
 
 
 def _contacts(
-    history: History, merge: Merge, keyframe: KeyframeOrdinal
-) -> dict[PlaceOrdinal, KeyframeOrdinal]:
+    history: History, merge: Merge, keyframe: deltas.KeyframeOrdinal
+) -> dict[deltas.PlaceOrdinal, deltas.KeyframeOrdinal]:
     """By place the nearest old core point within ε of a new one."""
     offset, neighbours = merge.cause.offset, history.neighbours
-    contacts: dict[PlaceOrdinal, KeyframeOrdinal] = {}
+    contacts: dict[deltas.PlaceOrdinal, deltas.KeyframeOrdinal] = {}
     near = (k for k in neighbours.of(keyframe, Offset(offset + 1)) if neighbours.is_core(k, offset))
     for old in sorted(near, key=lambda k: (neighbours.distance_um(keyframe, k), k)):
         place = history.place_at(old, offset)
@@ -103,12 +97,12 @@ def _contacts(
 def _shortest(
     history: History,
     merge: Merge,
-    contacts: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
-    joined: set[PlaceOrdinal],
-    remaining: set[PlaceOrdinal],
+    contacts: dict[deltas.KeyframeOrdinal, dict[deltas.PlaceOrdinal, deltas.KeyframeOrdinal]],
+    joined: set[deltas.PlaceOrdinal],
+    remaining: set[deltas.PlaceOrdinal],
 ) -> Chain | None:
     """Breadth first over the new core points, from the joined places to a remaining one."""
-    paths: deque[tuple[PlaceOrdinal, tuple[KeyframeOrdinal, ...]]] = deque(
+    paths: deque[tuple[deltas.PlaceOrdinal, tuple[deltas.KeyframeOrdinal, ...]]] = deque(
         (place, (old, new))
         for new in contacts
         for place, old in contacts[new].items()
@@ -129,18 +123,18 @@ def _shortest(
 def _new_core_neighbours(
     history: History,
     merge: Merge,
-    keyframe: KeyframeOrdinal,
-    contacts: dict[KeyframeOrdinal, dict[PlaceOrdinal, KeyframeOrdinal]],
-) -> Iterator[KeyframeOrdinal]:
+    keyframe: deltas.KeyframeOrdinal,
+    contacts: dict[deltas.KeyframeOrdinal, dict[deltas.PlaceOrdinal, deltas.KeyframeOrdinal]],
+) -> Iterator[deltas.KeyframeOrdinal]:
     near = history.neighbours.of(keyframe, Offset(merge.cause.offset + 1))
     return (k for k in near if k in contacts)
 
 
 def _chain_of(
     history: History,
-    joined: PlaceOrdinal,
-    absorbed: PlaceOrdinal,
-    points: tuple[KeyframeOrdinal, ...],
+    joined: deltas.PlaceOrdinal,
+    absorbed: deltas.PlaceOrdinal,
+    points: tuple[deltas.KeyframeOrdinal, ...],
 ) -> Chain:
     distances = tuple(history.neighbours.distance_um(a, b) for a, b in pairwise(points))
     return Chain(joined, absorbed, points, distances)
@@ -188,12 +182,12 @@ def _drive_text(history: History, merge: Merge, most_seen: int | None) -> str:
     )
 
 
-def seen_from_both(history: History, merge: Merge) -> Sequence[ObjectOrdinal]:
+def seen_from_both(history: History, merge: Merge) -> Sequence[deltas.ObjectOrdinal]:
     """The objects that keyframes of all the places had seen when these merged."""
     return history.sighting_index.seen_from_all(merge.places, merge.cause.offset)
 
 
-def join_links(merge: Merge) -> list[PlaceLink]:
+def join_links(merge: Merge) -> list[deltas.PlaceLink]:
     """The links of the places that a command joined, one for each: the keyframes that it names."""
     return [
         link
@@ -202,7 +196,7 @@ def join_links(merge: Merge) -> list[PlaceLink]:
     ]
 
 
-def _join_text(history: History, link: PlaceLink) -> str:
+def _join_text(history: History, link: deltas.PlaceLink) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     distance = f"{link.distance_um / 1e6:.3f} m apart"
     found = _command(history, (link.core, link.neighbour), joins=True)
@@ -210,7 +204,7 @@ def _join_text(history: History, link: PlaceLink) -> str:
 
 
 def _command(
-    history: History, pair: tuple[KeyframeOrdinal, KeyframeOrdinal], *, joins: bool
+    history: History, pair: tuple[deltas.KeyframeOrdinal, deltas.KeyframeOrdinal], *, joins: bool
 ) -> RecordedCommand | None:
     """The command that joins two keyframes, or keeps them apart."""
     first, second = (log_name(history, keyframe) for keyframe in pair)
@@ -262,7 +256,7 @@ def chain_text(history: History, chain: Chain) -> str:
     return " ".join([*steps, names[-1]])
 
 
-def _link_text(history: History, link: PlaceLink) -> str:
+def _link_text(history: History, link: deltas.PlaceLink) -> str:
     core, neighbour = keyframe_name(history, link.core), keyframe_name(history, link.neighbour)
     if history.settings.places == "rooms":
         drive = f"{link.distance_um / 1e6:.3f} m"
@@ -270,7 +264,7 @@ def _link_text(history: History, link: PlaceLink) -> str:
     return f"{core} and {neighbour} are core points {link.distance_um / 1e6:.3f} m apart"
 
 
-def link_document(history: History, link: PlaceLink) -> dict[str, Any]:
+def link_document(history: History, link: deltas.PlaceLink) -> dict[str, Any]:
     """A link of the merge as JSON."""
     return {
         "core": keyframe_name(history, link.core),
@@ -327,12 +321,12 @@ def _drives_document(history: History, merge: Merge) -> dict[str, Any]:
     return {"drives": drives, "seen_from_both": seen}
 
 
-def _joined_document(history: History, link: PlaceLink) -> dict[str, Any]:
+def _joined_document(history: History, link: deltas.PlaceLink) -> dict[str, Any]:
     command = _document(_command(history, (link.core, link.neighbour), joins=True))
     return {**link_document(history, link), "command": command}
 
 
-def evidence_text(evidence: MergeEvidence | None) -> str:
+def evidence_text(evidence: deltas.MergeEvidence | None) -> str:
     """``0.34 m apart, looks +3.2, positions +1.1, in one picture 0 of 12 times``; looks and
     positions are log-likelihood ratios in nats. None stands for a merge by a command."""
     if evidence is None:
@@ -344,7 +338,7 @@ def evidence_text(evidence: MergeEvidence | None) -> str:
     )
 
 
-def evidence_document(evidence: MergeEvidence) -> dict[str, Any]:
+def evidence_document(evidence: deltas.MergeEvidence) -> dict[str, Any]:
     """The evidence of a merge of objects as JSON; log-likelihood ratios in nats."""
     return {
         "distance_m": evidence.distance_um / UM_PER_M,

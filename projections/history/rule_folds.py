@@ -22,17 +22,8 @@ from eventsrc.base.errors import MapfoldError
 from eventsrc.base.machine import gc_paused, usable_processors
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.log import LogReader
+from projections.fold import deltas as d
 from projections.fold.corrections import NO_CORRECTIONS, Corrections, map_fingerprint
-from projections.fold.deltas import (
-    KeyframeAdded,
-    KeyframePlaced,
-    ObjectFound,
-    ObjectSeen,
-    ObjectsMerged,
-    PlaceFormed,
-    PlacesMerged,
-    RunSeen,
-)
 from projections.fold.settings import Settings
 from projections.map.digest import map_digest
 from projections.map.fold import fold_parsed, new_map, read_ahead
@@ -52,9 +43,11 @@ Offsets: TypeAlias = "array[int]"
 
 MIN_PARALLEL_EVENTS = 20_000
 """Events times settings from which processes are started: about two seconds of folding."""
-_PLACE_DELTAS = frozenset({RunSeen, KeyframeAdded, PlaceFormed, KeyframePlaced, PlacesMerged})
+_PLACE_DELTAS = frozenset(
+    {d.RunSeen, d.KeyframeAdded, d.PlaceFormed, d.KeyframePlaced, d.PlacesMerged}
+)
 """The deltas that `fold_result` needs from a history; the rest is in the view."""
-_OBJECT_DELTAS = frozenset({ObjectFound, ObjectSeen, ObjectsMerged})
+_OBJECT_DELTAS = frozenset({d.ObjectFound, d.ObjectSeen, d.ObjectsMerged})
 """Also needed where objects may merge."""
 
 NO_NUMBER: Final = -1
@@ -171,7 +164,7 @@ def _place_numbers(places: Sequence[PlaceHistory]) -> list[int]:
 
     def founding(ordinal: int) -> tuple[int, int]:
         place = places[ordinal]
-        members = [d.keyframe for d in place.joined if d.offset == place.formed.offset]
+        members = [each.keyframe for each in place.joined if each.offset == place.formed.offset]
         return place.formed.offset, min(members, default=place.formed.founder)
 
     numbers = [0] * len(places)

@@ -9,35 +9,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 from eventsrc.envelope.model import Offset
-from projections.fold.deltas import (
-    Delta,
-    KeyframeOrdinal,
-    KeyframePlaced,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectMoved,
-    ObjectOrdinal,
-    ObjectRelocated,
-    ObjectSeen,
-    ObjectsMerged,
-    ObservationAdded,
-    ObservationOrdinal,
-    PlaceChanged,
-    PlaceFormed,
-    PlaceNamed,
-    PlaceOrdinal,
-    PlacesLinked,
-    PlacesMerged,
-    RunOrdinal,
-    RunSeen,
-)
+from projections.fold import deltas as d
 
 from .place_regions import Region, place_regions
 from .view import MapView
 
-Embedded: TypeAlias = tuple[ObservationAdded, int]
+Embedded: TypeAlias = tuple[d.ObservationAdded, int]
 """An observation with an embedding of the map's space, and the log time of its event, in ns. There
 are none if the view keeps no embeddings."""
 
@@ -61,14 +38,14 @@ class BatchChanges:
     keyframes: range
     observations: range
     embedded: list[Embedded]
-    runs: list[RunOrdinal]
-    objects: list[ObjectOrdinal]
-    places: list[PlaceOrdinal]
-    located: list[ObjectOrdinal]
-    placed: list[KeyframeOrdinal]
-    links: list[tuple[PlaceOrdinal, PlaceOrdinal]]
-    reassigned: list[ObservationOrdinal]
-    formed: list[PlaceOrdinal]
+    runs: list[d.RunOrdinal]
+    objects: list[d.ObjectOrdinal]
+    places: list[d.PlaceOrdinal]
+    located: list[d.ObjectOrdinal]
+    placed: list[d.KeyframeOrdinal]
+    links: list[tuple[d.PlaceOrdinal, d.PlaceOrdinal]]
+    reassigned: list[d.ObservationOrdinal]
+    formed: list[d.PlaceOrdinal]
     floors: range
     maps: bool = False
     regions: "FollowedRegions | None" = None
@@ -79,17 +56,17 @@ class FollowedRegions:
     called, and only if a place or a map has changed since it was called last."""
 
     def __init__(self) -> None:
-        self.regions: dict[PlaceOrdinal, Region] = {}
+        self.regions: dict[d.PlaceOrdinal, Region] = {}
         """As of the last call of `changed`."""
         self._are_due = True
-        self._changed: set[PlaceOrdinal] = set()
+        self._changed: set[d.PlaceOrdinal] = set()
 
     def end_batch(self, *, may_differ: bool) -> None:
         """Begin a new batch after one by whose changes regions may differ."""
         self._are_due |= may_differ
         self._changed = set()
 
-    def changed(self, view: MapView) -> set[PlaceOrdinal]:
+    def changed(self, view: MapView) -> set[d.PlaceOrdinal]:
         """The places whose region is another than after the last batch for which this was called;
         at first all that have one."""
         if self._are_due:
@@ -108,18 +85,18 @@ class ChangeTracker:
         self._regions = FollowedRegions()
         self._start()
 
-    def apply_event(self, offset: Offset, deltas: Sequence[Delta], logged_ns: int) -> None:
+    def apply_event(self, offset: Offset, deltas: Sequence[d.Delta], logged_ns: int) -> None:
         """Apply the deltas of the event at ``offset``, which was logged at ``logged_ns``."""
         collectors = self._COLLECTORS
         for delta in deltas:
-            if type(delta) is ObservationAdded:
+            if type(delta) is d.ObservationAdded:
                 if delta.embedding is not None:
                     self._embedded.append((delta, logged_ns))
             elif (collect := collectors.get(type(delta))) is not None:
                 collect(self, delta)
         self.view.apply_event(offset, deltas)
 
-    def apply_names(self, deltas: Sequence[PlaceNamed]) -> None:
+    def apply_names(self, deltas: Sequence[d.PlaceNamed]) -> None:
         """Apply the deltas of `SemanticMap.use_names`, which are of no event's fold."""
         for delta in deltas:
             self._places.add(delta.place)
@@ -159,23 +136,23 @@ class ChangeTracker:
         self._keyframes = len(self.view.keyframes)
         self._observations = len(self.view.observations)
         self._embedded: list[Embedded] = []
-        self._runs: set[RunOrdinal] = set()
-        self._objects: set[ObjectOrdinal] = set()
-        self._places: set[PlaceOrdinal] = set()
-        self._located: set[ObjectOrdinal] = set()
-        self._placed: set[KeyframeOrdinal] = set()
-        self._links: set[tuple[PlaceOrdinal, PlaceOrdinal]] = set()
-        self._reassigned: set[ObservationOrdinal] = set()
-        self._formed: set[PlaceOrdinal] = set()
+        self._runs: set[d.RunOrdinal] = set()
+        self._objects: set[d.ObjectOrdinal] = set()
+        self._places: set[d.PlaceOrdinal] = set()
+        self._located: set[d.ObjectOrdinal] = set()
+        self._placed: set[d.KeyframeOrdinal] = set()
+        self._links: set[tuple[d.PlaceOrdinal, d.PlaceOrdinal]] = set()
+        self._reassigned: set[d.ObservationOrdinal] = set()
+        self._formed: set[d.PlaceOrdinal] = set()
         self._floors = len(self.view.floors)
         self._maps = self.view.maps_in_force()
         self.view.contents.touched.clear()
 
-    def _place_formed(self, delta: PlaceFormed) -> None:
+    def _place_formed(self, delta: d.PlaceFormed) -> None:
         self._places.add(delta.place)
         self._formed.add(delta.place)
 
-    def _places_merged(self, delta: PlacesMerged) -> None:
+    def _places_merged(self, delta: d.PlacesMerged) -> None:
         self._places.add(delta.survivor)
         self._places.update(delta.absorbed)
         for place in delta.absorbed:
@@ -184,7 +161,7 @@ class ChangeTracker:
             if place < len(self.view.all_places):
                 self._placed.update(self.view.all_places[place].unordered_members)
 
-    def _objects_merged(self, delta: ObjectsMerged) -> None:
+    def _objects_merged(self, delta: d.ObjectsMerged) -> None:
         self._objects.update((delta.survivor, delta.absorbed))
         self._located.add(delta.absorbed)
         # Before the view applies it, as above. An Object that this event has found is not there
@@ -194,19 +171,19 @@ class ChangeTracker:
 
     # Of the class, not bound to the tracker; `MapView` says why.
     _COLLECTORS: ClassVar[dict[type, Callable[["ChangeTracker", Any], None]]] = {
-        RunSeen: lambda self, d: self._runs.add(d.run),
-        ObjectFound: lambda self, d: self._objects.add(d.object),
-        ObjectSeen: lambda self, d: self._objects.add(d.object),
-        ObjectsMerged: _objects_merged,
-        ObjectEstimated: lambda self, d: self._objects.add(d.object),
-        ObjectClassified: lambda self, d: self._objects.add(d.object),
-        ObjectMissing: lambda self, d: self._objects.add(d.object),
-        ObjectRelocated: lambda self, d: self._objects.add(d.object),
-        ObjectMoved: lambda self, d: self._located.add(d.object),
-        PlaceFormed: _place_formed,
-        PlaceChanged: lambda self, d: self._places.add(d.place),
-        PlaceNamed: lambda self, d: self._places.add(d.place),
-        KeyframePlaced: lambda self, d: self._placed.add(d.keyframe),
-        PlacesMerged: _places_merged,
-        PlacesLinked: lambda self, d: self._links.add((d.a, d.b)),
+        d.RunSeen: lambda self, of: self._runs.add(of.run),
+        d.ObjectFound: lambda self, of: self._objects.add(of.object),
+        d.ObjectSeen: lambda self, of: self._objects.add(of.object),
+        d.ObjectsMerged: _objects_merged,
+        d.ObjectEstimated: lambda self, of: self._objects.add(of.object),
+        d.ObjectClassified: lambda self, of: self._objects.add(of.object),
+        d.ObjectMissing: lambda self, of: self._objects.add(of.object),
+        d.ObjectRelocated: lambda self, of: self._objects.add(of.object),
+        d.ObjectMoved: lambda self, of: self._located.add(of.object),
+        d.PlaceFormed: _place_formed,
+        d.PlaceChanged: lambda self, of: self._places.add(of.place),
+        d.PlaceNamed: lambda self, of: self._places.add(of.place),
+        d.KeyframePlaced: lambda self, of: self._placed.add(of.keyframe),
+        d.PlacesMerged: _places_merged,
+        d.PlacesLinked: lambda self, of: self._links.add((of.a, of.b)),
     }

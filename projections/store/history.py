@@ -17,17 +17,8 @@ import numpy as np
 
 from eventsrc.envelope.model import KeyframeId, Offset, RunId
 from eventsrc.envelope.occupancy_map import OccupancyMap, decode_map
+from projections.fold import deltas as d
 from projections.fold.corrections import Corrections
-from projections.fold.deltas import (
-    EventSkipped,
-    KeyframeAdded,
-    KeyframeOrdinal,
-    MapGiven,
-    ObjectOrdinal,
-    PlaceOrdinal,
-    PlacesLinked,
-    RunSeen,
-)
 from projections.fold.settings import Settings
 from projections.map.records import ObjectRecord
 
@@ -40,7 +31,7 @@ from .tables import Groups, Tables
 
 NEVER: Final = Offset(2**63 - 1)
 """The offset of an event that has not happened."""
-NO_PLACE: Final = PlaceOrdinal(-1)
+NO_PLACE: Final = d.PlaceOrdinal(-1)
 """The value of `History.placed_in` for a keyframe in no place."""
 _MOST_STATES: Final = 64
 
@@ -70,21 +61,23 @@ class SightingIndex:
         self._placed_at = np.array(history.placed_offsets)
         self._placed_in = np.array(history.placed_in)
 
-    def seen_from_all(self, places: Iterable[PlaceOrdinal], end: Offset) -> Sequence[ObjectOrdinal]:
+    def seen_from_all(
+        self, places: Iterable[d.PlaceOrdinal], end: Offset
+    ) -> Sequence[d.ObjectOrdinal]:
         """The objects seen from every one of these places by the events below ``end``, as ascending
         ordinals."""
         count, history = bisect_left(self._offsets, end), self._history
         survivors: list[int] = [NO_PLACE] * len(history.places)
         for place, record in enumerate(history.places):
             if record.formed.offset < end:
-                survivors[place] = history.survivor_of(PlaceOrdinal(place), end)
+                survivors[place] = history.survivor_of(d.PlaceOrdinal(place), end)
         keyframes = self._keyframes[:count]
         is_placed = self._placed_at[keyframes] < end
         joined = np.where(is_placed, self._placed_in[keyframes], 0)
         found = np.where(is_placed, np.array([*survivors, NO_PLACE])[joined], NO_PLACE)
         seen = [set(np.unique(self._objects[:count][found == place]).tolist()) for place in places]
         things = (
-            {history.object_survivor(ObjectOrdinal(each), end) for each in from_one}
+            {history.object_survivor(d.ObjectOrdinal(each), end) for each in from_one}
             for from_one in seen
         )
         return sorted(set.intersection(*things))
@@ -107,10 +100,10 @@ class History:
         self.next_offset = tables.end
         self.tables = tables
         self.map_at = map_at
-        self._states: dict[ObjectOrdinal, tuple[list[int], list[ObjectRecord]]] = {}
+        self._states: dict[d.ObjectOrdinal, tuple[list[int], list[ObjectRecord]]] = {}
 
     @cached_property
-    def keyframes(self) -> Sequence[KeyframeAdded]:
+    def keyframes(self) -> Sequence[d.KeyframeAdded]:
         """The keyframes by ordinal."""
         return Chunks(self.tables.count("keyframe"), partial(self.tables.deltas, "keyframe"))
 
@@ -125,9 +118,9 @@ class History:
         return as_ints(placed_columns(self.tables)[0])
 
     @cached_property
-    def placed_in(self) -> Sequence[PlaceOrdinal]:
+    def placed_in(self) -> Sequence[d.PlaceOrdinal]:
         """By keyframe the place that it joined."""
-        return cast("Sequence[PlaceOrdinal]", as_ints(placed_columns(self.tables)[1]))
+        return cast("Sequence[d.PlaceOrdinal]", as_ints(placed_columns(self.tables)[1]))
 
     @cached_property
     def places(self) -> Sequence[history_records.PlaceHistory]:
@@ -161,9 +154,9 @@ class History:
         return objects
 
     @cached_property
-    def runs(self) -> Sequence[Sequence[RunSeen]]:
+    def runs(self) -> Sequence[Sequence[d.RunSeen]]:
         """Each run as it was seen."""
-        runs: list[list[RunSeen]] = []
+        runs: list[list[d.RunSeen]] = []
         for seen in self.tables.deltas("run"):
             if seen.run == len(runs):
                 runs.append([])
@@ -171,35 +164,35 @@ class History:
         return runs
 
     @cached_property
-    def skipped(self) -> Sequence[EventSkipped]:
+    def skipped(self) -> Sequence[d.EventSkipped]:
         """What was left out."""
         return Chunks(self.tables.count("skipped"), partial(self.tables.deltas, "skipped"))
 
     @cached_property
-    def maps(self) -> Sequence[MapGiven]:
+    def maps(self) -> Sequence[d.MapGiven]:
         """The occupancy maps."""
         if not (count := self.tables.count("map")):
             return []
         offsets = self.tables.column("map", "offset").tolist()
         return [
-            MapGiven(offset, self.map_at(offset))
+            d.MapGiven(offset, self.map_at(offset))
             if document is None
-            else MapGiven(offset, decode_map(document.encode()), scanned=True)
+            else d.MapGiven(offset, decode_map(document.encode()), scanned=True)
             for offset, document in zip(
                 offsets, self.tables.texts("map", "document", 0, count), strict=True
             )
         ]
 
     @cached_property
-    def edges(self) -> Mapping[tuple[PlaceOrdinal, PlaceOrdinal], Sequence[PlacesLinked]]:
+    def edges(self) -> Mapping[tuple[d.PlaceOrdinal, d.PlaceOrdinal], Sequence[d.PlacesLinked]]:
         """By pair of places their shared transitions in order."""
-        edges: dict[tuple[PlaceOrdinal, PlaceOrdinal], list[PlacesLinked]] = {}
+        edges: dict[tuple[d.PlaceOrdinal, d.PlaceOrdinal], list[d.PlacesLinked]] = {}
         for linked in self.tables.deltas("linked"):
             edges.setdefault((linked.a, linked.b), []).append(linked)
         return edges
 
     @cached_property
-    def keyframe_ordinals(self) -> Mapping[tuple[RunId, KeyframeId], KeyframeOrdinal]:
+    def keyframe_ordinals(self) -> Mapping[tuple[RunId, KeyframeId], d.KeyframeOrdinal]:
         """The keyframes by run and id."""
         tables = self.tables
         runs = {seen[0].run_id: number for number, seen in enumerate(self.runs)}
@@ -240,16 +233,16 @@ class History:
         ]
 
     @cached_property
-    def place_ordinals(self) -> Mapping[str, PlaceOrdinal]:
+    def place_ordinals(self) -> Mapping[str, d.PlaceOrdinal]:
         """The places by id."""
         texts = self.tables.texts("formed", "place_id", 0, self.tables.count("formed"))
-        return {text or "": PlaceOrdinal(number) for number, text in enumerate(texts)}
+        return {text or "": d.PlaceOrdinal(number) for number, text in enumerate(texts)}
 
     @cached_property
-    def object_ordinals(self) -> Mapping[str, ObjectOrdinal]:
+    def object_ordinals(self) -> Mapping[str, d.ObjectOrdinal]:
         """The objects by id."""
         texts = self.tables.texts("found", "object_id", 0, self.tables.count("found"))
-        return {text or "": ObjectOrdinal(number) for number, text in enumerate(texts)}
+        return {text or "": d.ObjectOrdinal(number) for number, text in enumerate(texts)}
 
     @cached_property
     def neighbours(self) -> Neighbours:
@@ -312,27 +305,29 @@ class History:
         """The index of sightings."""
         return SightingIndex(self)
 
-    def place_at(self, keyframe: KeyframeOrdinal, end: Offset | None = None) -> PlaceOrdinal | None:
+    def place_at(
+        self, keyframe: d.KeyframeOrdinal, end: Offset | None = None
+    ) -> d.PlaceOrdinal | None:
         """The place a keyframe is in after the events below ``end`` (default: all so far)."""
         end = self.next_offset if end is None else end
         if self.placed_offsets[keyframe] >= end:
             return None
         return self.survivor_of(self.placed_in[keyframe], end)
 
-    def survivor_of(self, place: PlaceOrdinal, end: Offset | None = None) -> PlaceOrdinal:
+    def survivor_of(self, place: d.PlaceOrdinal, end: Offset | None = None) -> d.PlaceOrdinal:
         """The place that ``place`` is part of after the events below ``end`` (default: all)."""
         end = self.next_offset if end is None else end
         while (merge := self.places[place].absorbed_by) is not None and merge.cause.offset < end:
             place = merge.survivor
         return place
 
-    def object_survivor(self, found: ObjectOrdinal, end: Offset) -> ObjectOrdinal:
+    def object_survivor(self, found: d.ObjectOrdinal, end: Offset) -> d.ObjectOrdinal:
         """The object that ``found`` is part of after the events below ``end``."""
         while (merge := self.objects[found].absorbed_by) is not None and merge.offset < end:
             found = merge.survivor
         return found
 
-    def object_at(self, found: ObjectOrdinal, end: Offset) -> ObjectRecord:
+    def object_at(self, found: d.ObjectOrdinal, end: Offset) -> ObjectRecord:
         """What an object is after the events below ``end``, without its observations; not seen
         before it is found."""
         if found not in self._states:
@@ -349,7 +344,7 @@ class History:
         """`object_at` of all objects found by the events below ``end``, absorbed ones too."""
         return ObjectStates.all_at(self.tables, end).records(ObjectRecord)
 
-    def transitions(self, a: PlaceOrdinal, b: PlaceOrdinal, end: Offset) -> int:
+    def transitions(self, a: d.PlaceOrdinal, b: d.PlaceOrdinal, end: Offset) -> int:
         """Shared transitions of two places after the events below ``end``."""
         pair = (min(a, b), max(a, b))
         linked = history_records.last_before(self.edges.get(pair, ()), end)

@@ -14,16 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset
-from projections.fold.deltas import (
-    Body,
-    Delta,
-    KeyframeAdded,
-    KeyframeOrdinal,
-    ObjectRelocated,
-    ObservationOrdinal,
-    PlaceOrdinal,
-    SkipKind,
-)
+from projections.fold import deltas as d
 from projections.fold.pair_groups import PlaceSurvivors
 from projections.map.records import (
     KeyframeRecord,
@@ -81,7 +72,7 @@ class StoredView(MapView):
         self.runs = _runs(moment)
         self.adjacency = _adjacency(moment)
         for kind, count in _skipped(moment).items():
-            self.skipped[cast("SkipKind", kind)] = count
+            self.skipped[cast("d.SkipKind", kind)] = count
         self.floors = {name: number for number, name in enumerate(_floors(moment))}
         for given in history.maps[: moment.count("map")] if moment.count("map") else ():
             self.maps[given.map.floor] = given
@@ -96,12 +87,12 @@ class StoredView(MapView):
         self.observations = cast("list[ObservationRecord]", observations)
         self.advance(end)
 
-    def apply(self, delta: Delta) -> None:
+    def apply(self, delta: d.Delta) -> None:
         """Apply one delta."""
         self._make_all()
         super().apply(delta)
 
-    def apply_event(self, offset: Offset, deltas: Iterable[Delta]) -> None:
+    def apply_event(self, offset: Offset, deltas: Iterable[d.Delta]) -> None:
         """Apply all deltas of the event at ``offset`` and advance past it."""
         self._make_all()
         super().apply_event(offset, deltas)
@@ -162,7 +153,7 @@ class StoredView(MapView):
             return super().vectors(observations)
         return self._recorded(observations)
 
-    def floor_of(self, place: PlaceOrdinal) -> str | None:
+    def floor_of(self, place: d.PlaceOrdinal) -> str | None:
         """The name of the floor that a place is on; None if the log has none."""
         return super().floor_of(place) if self.floors else None
 
@@ -198,7 +189,7 @@ class StoredView(MapView):
 def _keyframes(
     moment: Moment, survivors: PlaceSurvivors, first: int, last: int
 ) -> list[KeyframeRecord]:
-    added: list[KeyframeAdded] = moment.tables.deltas("keyframe", first, last)
+    added: list[d.KeyframeAdded] = moment.tables.deltas("keyframe", first, last)
     _, joined = moment.placed
     starts = moment.observation_starts[first : last + 1].tolist()
     places = joined[first:last].tolist()
@@ -212,7 +203,7 @@ def _keyframes(
             k.timestamp,
             k.pose,
             survivors,
-            list(map(ObservationOrdinal, range(*span))) or (),
+            list(map(d.ObservationOrdinal, range(*span))) or (),
             None if place == NONE else place,
             k.floor,
             k.camera,
@@ -246,9 +237,9 @@ def _observations(moment: Moment, first: int, last: int) -> list[ObservationReco
     )
 
 
-def _bodies(found: dict[str, list[Any]]) -> Iterable[Body | None]:
+def _bodies(found: dict[str, list[Any]]) -> Iterable[d.Body | None]:
     there, *parts = (found[name] for name in TABLES["observation"] if name.startswith("body"))
-    made = (Body(*each) for each in zip(*parts, strict=True))
+    made = (d.Body(*each) for each in zip(*parts, strict=True))
     return (each if is_there else None for each, is_there in zip(made, there, strict=True))
 
 
@@ -258,20 +249,20 @@ class StoredPlace(PlaceRecord):
     __slots__ = ("_made", "_moment")
 
     _moment: Moment
-    _made: list[KeyframeOrdinal] | None
+    _made: list[d.KeyframeOrdinal] | None
 
     def read_from(self, moment: Moment) -> None:
         """Use ``moment`` as the source of the members."""
         self._moment, self._made = moment, None
 
     @property
-    def unordered_members(self) -> list[KeyframeOrdinal]:
+    def unordered_members(self) -> list[d.KeyframeOrdinal]:
         if self._made is None:
             self._made = self._moment.members[self.ordinal].tolist()
         return self._made
 
     @unordered_members.setter
-    def unordered_members(self, members: list[KeyframeOrdinal]) -> None:
+    def unordered_members(self, members: list[d.KeyframeOrdinal]) -> None:
         self._made = members
 
 
@@ -298,14 +289,14 @@ class StoredObject(ObjectRecord):
     __slots__ = ("_made", "_moment")
 
     _moment: Moment
-    _made: list[ObservationOrdinal] | None
+    _made: list[d.ObservationOrdinal] | None
 
     def read_from(self, moment: Moment) -> None:
         """Use ``moment`` as the source of the observations."""
         self._moment, self._made = moment, None
 
     @property
-    def observations(self) -> list[ObservationOrdinal]:
+    def observations(self) -> list[d.ObservationOrdinal]:
         if self._made is None:
             moment, absorbed = self._moment, self.ordinal in self._moment.absorbed_objects
             made = [] if absorbed else moment.sightings[self.ordinal].tolist()
@@ -315,7 +306,7 @@ class StoredObject(ObjectRecord):
         return self._made
 
     @observations.setter
-    def observations(self, observations: list[ObservationOrdinal]) -> None:
+    def observations(self, observations: list[d.ObservationOrdinal]) -> None:
         self._made = observations
 
 
@@ -323,10 +314,10 @@ def _objects(moment: Moment) -> list[ObjectRecord]:
     objects = ObjectStates.all_at(moment.tables, moment.end).records(StoredObject)
     for each in objects:
         each.read_from(moment)
-    moved: list[ObjectRelocated] = moment.deltas("relocated")
-    for d in moved:
-        at = (d.from_x_um, d.from_y_um, d.to_x_um, d.to_y_um)
-        objects[d.object].relocations.append(Relocation(d.offset, d.observation, *at))
+    moved: list[d.ObjectRelocated] = moment.deltas("relocated")
+    for way in moved:
+        at = (way.from_x_um, way.from_y_um, way.to_x_um, way.to_y_um)
+        objects[way.object].relocations.append(Relocation(way.offset, way.observation, *at))
     for survivor, absorbed in moment.object_merges:  # in order
         relocations = objects[survivor].relocations + objects[absorbed].relocations
         objects[survivor].relocations = sorted(relocations, key=lambda r: (r.offset, r.observation))
@@ -346,7 +337,7 @@ def _runs(moment: Moment) -> list[RunRecord]:
     return records
 
 
-def _adjacency(moment: Moment) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
+def _adjacency(moment: Moment) -> dict[tuple[d.PlaceOrdinal, d.PlaceOrdinal], int]:
     a, b = (moment.column("linked", each).astype(np.int64) for each in ("a", "b"))
     pairs = a << 32 | b
     _, first = np.unique(pairs, return_index=True)
@@ -354,7 +345,7 @@ def _adjacency(moment: Moment) -> dict[tuple[PlaceOrdinal, PlaceOrdinal], int]:
     rows = (len(pairs) - 1 - last)[np.argsort(first)]
     counts = moment.column("linked", "shared_transitions")[rows].tolist()
     found = zip(a[rows].tolist(), b[rows].tolist(), counts, strict=True)
-    return {(PlaceOrdinal(a), PlaceOrdinal(b)): count for a, b, count in found if count}
+    return {(d.PlaceOrdinal(a), d.PlaceOrdinal(b)): count for a, b, count in found if count}
 
 
 def _floors(moment: Moment) -> list[str]:

@@ -25,13 +25,7 @@ from eventsrc.envelope.system_events import (
     ROS_KEY,
 )
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
-from eventsrc.record.append import (
-    Checked,
-    NewMap,
-    check_payloads,
-    checked_event,
-    rejected_event,
-)
+from eventsrc.record.append import Checked, NewMap, check_payloads, checked_event, rejected_event
 
 from .bag_streams import BagOptions
 from .known_log import IS_KNOWN, KnownEvents, LogCommands, NotTakenOver, SourceCommands

@@ -33,14 +33,7 @@ from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEve
 from eventsrc.record.append import CROP_FORMAT, append_payload, map_event
 from eventsrc.record.gap_history import keyframe_of, loss_of
 from eventsrc.record.transport.session import Received, SequenceNumber
-from eventsrc.ros.derivation import (
-    CDR,
-    ROS2MSG,
-    Derivation,
-    Derived,
-    RosRecording,
-    read_recording,
-)
+from eventsrc.ros.derivation import CDR, ROS2MSG, Derivation, Derived, RosRecording, read_recording
 from eventsrc.ros.library import MessageTypes, Undecodable
 from eventsrc.ros.pictures import CutCrops
 from eventsrc.ros.stream import Counts

@@ -13,13 +13,7 @@ from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogWriter
 from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
-from eventsrc.record.transport.session import (
-    Query,
-    Received,
-    Session,
-    SizeLimit,
-    check_keys,
-)
+from eventsrc.record.transport.session import Query, Received, Session, SizeLimit, check_keys
 
 from .bridged import Bridge
 from .edits import EditRequest, Edits, edit_key

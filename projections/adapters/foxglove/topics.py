@@ -18,35 +18,8 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, TypedDict
 
-from foxglove import Channel, Context, Schema
+from foxglove import Channel, Context, Schema, messages
 from foxglove.channels import FrameTransformsChannel, GridChannel, LogChannel, SceneUpdateChannel
-from foxglove.messages import (
-    Color,
-    CubePrimitive,
-    FrameTransform,
-    FrameTransforms,
-    Grid,
-    KeyValuePair,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    Log,
-    LogLevel,
-    PackedElementField,
-    PackedElementFieldNumericType,
-    Point3,
-    Pose,
-    Quaternion,
-    SceneEntity,
-    SceneEntityDeletion,
-    SceneEntityDeletionType,
-    SceneUpdate,
-    SpherePrimitive,
-    TextPrimitive,
-    Timestamp,
-    TriangleListPrimitive,
-    Vector2,
-    Vector3,
-)
 
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from eventsrc.log import Event, MessageFormat
@@ -129,8 +102,11 @@ class MapTopics:
     def changes(self, lines: Iterable[str], time_ns: int) -> None:
         """The changes of the map, a message for each line."""
         for line in lines:
-            message = Log(
-                timestamp=timestamp(time_ns), level=LogLevel.Info, name="mapfold", message=line
+            message = messages.Log(
+                timestamp=timestamp(time_ns),
+                level=messages.LogLevel.Info,
+                name="mapfold",
+                message=line,
             )
             self._changes.log(message, log_time=time_ns)
 
@@ -139,7 +115,7 @@ class MapTopics:
         latest = robot_of(view)
         if latest is not None and latest.pose is not None:
             transform = _transform(latest.pose, height(view, latest.floor), time_ns)
-            self._robot.log(FrameTransforms(transforms=[transform]), log_time=time_ns)
+            self._robot.log(messages.FrameTransforms(transforms=[transform]), log_time=time_ns)
 
     def scene(
         self, view: MapView, merges: Sequence[PlacesMerged], time_ns: int, **state: Any
@@ -162,32 +138,34 @@ class MapTopics:
         return self._walls[floor]
 
 
-def _transform(pose: MapPose, z: float, time_ns: int) -> FrameTransform:
-    return FrameTransform(
+def _transform(pose: MapPose, z: float, time_ns: int) -> messages.FrameTransform:
+    return messages.FrameTransform(
         timestamp=timestamp(time_ns),
         parent_frame_id=FRAME,
         child_frame_id=ROBOT_FRAME,
-        translation=Vector3(x=pose.x_m, y=pose.y_m, z=z),
+        translation=messages.Vector3(x=pose.x_m, y=pose.y_m, z=z),
         rotation=_turned(pose.yaw_rad),
     )
 
 
-def _turned(yaw: float) -> Quaternion:
-    return Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+def _turned(yaw: float) -> messages.Quaternion:
+    return messages.Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
 
 
-def _grid(source: OccupancyMap, z: float, time_ns: int) -> Grid:
+def _grid(source: OccupancyMap, z: float, time_ns: int) -> messages.Grid:
     x, y, yaw = source.origin
-    return Grid(
+    return messages.Grid(
         timestamp=timestamp(time_ns),
         frame_id=FRAME,
-        pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_turned(yaw)),
+        pose=messages.Pose(position=messages.Vector3(x=x, y=y, z=z), orientation=_turned(yaw)),
         column_count=source.width,
-        cell_size=Vector2(x=source.resolution, y=source.resolution),
+        cell_size=messages.Vector2(x=source.resolution, y=source.resolution),
         row_stride=source.width,
         cell_stride=1,
         fields=[
-            PackedElementField(name="occupancy", offset=0, type=PackedElementFieldNumericType.Uint8)
+            messages.PackedElementField(
+                name="occupancy", offset=0, type=messages.PackedElementFieldNumericType.Uint8
+            )
         ],
         data=source.cells.tobytes(),
     )
@@ -197,19 +175,19 @@ FRAME: Final = "map"
 FLOOR_M: Final = 3.0
 """Height of a floor above the one before, in the order in which the log met them."""
 _SECOND_NS: Final = 1_000_000_000
-_INK: Final = Color(r=0.15, g=0.15, b=0.18, a=1.0)
-_GREY: Final = Color(r=0.45, g=0.45, b=0.5, a=0.8)
-_RED: Final = Color(r=0.85, g=0.1, b=0.15, a=0.9)
+_INK: Final = messages.Color(r=0.15, g=0.15, b=0.18, a=1.0)
+_GREY: Final = messages.Color(r=0.45, g=0.45, b=0.5, a=0.8)
+_RED: Final = messages.Color(r=0.85, g=0.1, b=0.15, a=0.9)
 
 
-def timestamp(time_ns: int) -> Timestamp:
+def timestamp(time_ns: int) -> messages.Timestamp:
     """Foxglove's form of a time; before 1970 there is none, so 1970 is as early as it gets."""
-    return Timestamp(sec=max(time_ns, 0) // _SECOND_NS, nsec=max(time_ns, 0) % _SECOND_NS)
+    return messages.Timestamp(sec=max(time_ns, 0) // _SECOND_NS, nsec=max(time_ns, 0) % _SECOND_NS)
 
 
 def map_scene(
     view: MapView, merges: Iterable[PlacesMerged], time_ns: int, *, everything: bool
-) -> SceneUpdate:
+) -> messages.SceneUpdate:
     """Places with outline and name, confirmed Objects or with ``everything`` all, adjacency, the
     path of each run, and a mark where each of ``merges`` happened; entities in that order, those of
     a kind by ordinal."""
@@ -217,10 +195,13 @@ def map_scene(
     places = places_of(view)
     parts = [*_places(view, places), *_objects(view, everything=everything)]
     parts += [*_ways(view, ways_of(view, places)), *_paths(view), *_merges(view, merges)]
-    return SceneUpdate(
-        deletions=[SceneEntityDeletion(timestamp=now, type=SceneEntityDeletionType.All)],
+    return messages.SceneUpdate(
+        deletions=[
+            messages.SceneEntityDeletion(timestamp=now, type=messages.SceneEntityDeletionType.All)
+        ],
         entities=[
-            SceneEntity(timestamp=now, frame_id=FRAME, id=name, **shapes) for name, shapes in parts
+            messages.SceneEntity(timestamp=now, frame_id=FRAME, id=name, **shapes)
+            for name, shapes in parts
         ],
     )
 
@@ -228,12 +209,12 @@ def map_scene(
 class _Shapes(TypedDict, total=False):
     """Fields of an entity."""
 
-    metadata: list[KeyValuePair]
-    cubes: list[CubePrimitive]
-    spheres: list[SpherePrimitive]
-    lines: list[LinePrimitive]
-    triangles: list[TriangleListPrimitive]
-    texts: list[TextPrimitive]
+    metadata: list[messages.KeyValuePair]
+    cubes: list[messages.CubePrimitive]
+    spheres: list[messages.SpherePrimitive]
+    lines: list[messages.LinePrimitive]
+    triangles: list[messages.TriangleListPrimitive]
+    texts: list[messages.TextPrimitive]
 
 
 _Part = tuple[str, _Shapes]
@@ -244,7 +225,7 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
     for shown in places:
         place, z = shown.record, height(view, shown.floor)
         colour = _colour(place.ordinal)
-        corners = [Point3(x=x, y=y, z=z) for x, y in shown.hull]
+        corners = [messages.Point3(x=x, y=y, z=z) for x, y in shown.hull]
         shapes: _Shapes = {
             "metadata": _metadata(
                 place_id=place.place_id, keyframes=place.keyframe_count, name=place.name
@@ -253,11 +234,11 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
         }
         if shown.outlines:
             shapes["lines"] = [
-                LinePrimitive(
-                    type=LinePrimitiveLineType.LineStrip,
+                messages.LinePrimitive(
+                    type=messages.LinePrimitiveLineType.LineStrip,
                     pose=_at(0.0, 0.0, 0.0),
                     thickness=0.05,
-                    points=[Point3(x=x, y=y, z=z) for x, y in ring],
+                    points=[messages.Point3(x=x, y=y, z=z) for x, y in ring],
                     color=colour,
                 )
                 for ring in shown.outlines
@@ -265,7 +246,7 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
         if shown.region is None and corners:
             fan = [i for corner in range(1, len(corners) - 1) for i in (0, corner, corner + 1)]
             shapes["triangles"] = [
-                TriangleListPrimitive(
+                messages.TriangleListPrimitive(
                     pose=_at(0.0, 0.0, 0.0),
                     points=corners,
                     indices=fan,
@@ -274,9 +255,9 @@ def _places(view: MapView, places: Iterable[ShownPlace]) -> Iterator[_Part]:
             ]
         if not shown.outlines:
             shapes["spheres"] = [
-                SpherePrimitive(
+                messages.SpherePrimitive(
                     pose=_at(*shown.centroid, z),
-                    size=Vector3(x=0.3, y=0.3, z=0.3),
+                    size=messages.Vector3(x=0.3, y=0.3, z=0.3),
                     color=colour,
                 )
             ]
@@ -300,9 +281,9 @@ def _objects(view: MapView, *, everything: bool) -> Iterator[_Part]:
                     missing=True if missing else None,
                 ),
                 "cubes": [
-                    CubePrimitive(
+                    messages.CubePrimitive(
                         pose=_at(*found.spot, z),
-                        size=Vector3(x=0.2, y=0.2, z=0.2),
+                        size=messages.Vector3(x=0.2, y=0.2, z=0.2),
                         color=_RED if missing else colour,
                     )
                 ],
@@ -312,15 +293,15 @@ def _objects(view: MapView, *, everything: bool) -> Iterator[_Part]:
 
 
 def _ways(view: MapView, ways: Iterable[Way]) -> Iterator[_Part]:
-    lines: list[LinePrimitive] = []
+    lines: list[messages.LinePrimitive] = []
     for way in ways:
         points = [
-            Point3(x=end.centroid[0], y=end.centroid[1], z=height(view, end.floor))
+            messages.Point3(x=end.centroid[0], y=end.centroid[1], z=height(view, end.floor))
             for end in way.ends
         ]
         lines.append(
-            LinePrimitive(
-                type=LinePrimitiveLineType.LineStrip,
+            messages.LinePrimitive(
+                type=messages.LinePrimitiveLineType.LineStrip,
                 pose=_at(0.0, 0.0, 0.1),
                 thickness=min(0.05 * way.transitions, 0.25),
                 points=points,
@@ -332,15 +313,15 @@ def _ways(view: MapView, ways: Iterable[Way]) -> Iterator[_Part]:
 
 
 def _paths(view: MapView) -> Iterator[_Part]:
-    points: dict[str, list[Point3]] = {run.run_id: [] for run in view.runs}
+    points: dict[str, list[messages.Point3]] = {run.run_id: [] for run in view.runs}
     for k in view.keyframes:
         if k.pose is not None:
             z = height(view, k.floor)
-            points[k.run_id].append(Point3(x=k.pose.x_m, y=k.pose.y_m, z=z))
+            points[k.run_id].append(messages.Point3(x=k.pose.x_m, y=k.pose.y_m, z=z))
     for run_id, path in points.items():
         if len(path) > 1:
-            line = LinePrimitive(
-                type=LinePrimitiveLineType.LineStrip,
+            line = messages.LinePrimitive(
+                type=messages.LinePrimitiveLineType.LineStrip,
                 pose=_at(0.0, 0.0, 0.05),
                 thickness=0.03,
                 points=[*thinned(path)],
@@ -365,8 +346,8 @@ def _merges(view: MapView, merges: Iterable[PlacesMerged]) -> Iterator[_Part]:
                     offset=merge.offset, bridge=f"{bridge.run_id}:{bridge.keyframe_id}"
                 ),
                 "spheres": [
-                    SpherePrimitive(
-                        pose=_at(*where, z), size=Vector3(x=0.3, y=0.3, z=0.3), color=_RED
+                    messages.SpherePrimitive(
+                        pose=_at(*where, z), size=messages.Vector3(x=0.3, y=0.3, z=0.3), color=_RED
                     )
                 ],
                 "texts": [_text(label, where, z + 0.3, 0.2)],
@@ -379,19 +360,24 @@ def height(view: MapView, floor: str | None) -> float:
     return 0.0 if floor is None else FLOOR_M * view.floors.get(floor, 0)
 
 
-def _colour(place: PlaceOrdinal, alpha: float = 1.0) -> Color:
+def _colour(place: PlaceOrdinal, alpha: float = 1.0) -> messages.Color:
     colour = place_colour(place)
     red, green, blue = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
-    return Color(r=red, g=green, b=blue, a=alpha)
+    return messages.Color(r=red, g=green, b=blue, a=alpha)
 
 
-def _at(x: float, y: float, z: float) -> Pose:
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+def _at(x: float, y: float, z: float) -> messages.Pose:
+    return messages.Pose(
+        position=messages.Vector3(x=x, y=y, z=z),
+        orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+    )
 
 
-def _text(text: str, where: Point, z: float, size: float) -> TextPrimitive:
-    return TextPrimitive(pose=_at(*where, z), billboard=True, font_size=size, color=_INK, text=text)
+def _text(text: str, where: Point, z: float, size: float) -> messages.TextPrimitive:
+    return messages.TextPrimitive(
+        pose=_at(*where, z), billboard=True, font_size=size, color=_INK, text=text
+    )
 
 
-def _metadata(**values: object) -> list[KeyValuePair]:
-    return [KeyValuePair(key=k, value=str(v)) for k, v in values.items() if v is not None]
+def _metadata(**values: object) -> list[messages.KeyValuePair]:
+    return [messages.KeyValuePair(key=k, value=str(v)) for k, v in values.items() if v is not None]

@@ -9,14 +9,7 @@ from .certainty import UNKNOWN_BELOW
 from .constants import MapConstants
 from .ground import WallMap
 from .question import Question, QuestionCrop, QuestionView, describe_value
-from .ranking import (
-    Answer,
-    Evidence,
-    Method,
-    PoseHypothesis,
-    RankedPlace,
-    rank,
-)
+from .ranking import Answer, Evidence, Method, PoseHypothesis, RankedPlace, rank
 from .reading import (
     MAX_QUESTION_BYTES,
     parse_json,

@@ -219,9 +219,7 @@ class Map:
 
     def draw(self, out: str | Path, title: str = "") -> None:
         """Draw the map to a file .png, .svg or .pdf. Raises MisuseError if it cannot be written."""
-        from projections.adapters.drawing import (
-            draw_map,  # here: matplotlib takes half a second to import
-        )
+        from projections.adapters.drawing import draw_map
 
         draw_map(self.view, Path(out), title=title or self._title)
 

@@ -41,18 +41,7 @@ from projections.map.view import MapView
 from projections.postgres.queries.live_view import LiveView
 from projections.surfaces.text_encoders import words_of
 
-from .asked import (
-    NO_LOG,
-    NO_LOG_OF_CROPS,
-    NO_LOG_OF_THE_PAST,
-    ChangesQuery,
-    FindQuery,
-    LogBusyError,
-    MapQuestion,
-    NotInMapError,
-    ServedLog,
-    asked,
-)
+from . import asked
 from .pools import Pools
 from .states import refuse_unknown, state_read
 
@@ -187,8 +176,8 @@ DEFAULT_MAX_BYTES: Final = 1_000_000
 _KINDS: Final[tuple[tuple[type[MapfoldError], str, int, str | None], ...]] = (
     (BusyError, "too_much", 503, None),
     (TooMuchError, "too_much", 429, None),
-    (LogBusyError, "too_much", 429, None),
-    (NotInMapError, "bad_question", 404, None),
+    (asked.LogBusyError, "too_much", 429, None),
+    (asked.NotInMapError, "bad_question", 404, None),
     (QuestionError, "bad_question", 400, None),
     (ProjectionMissing, "database", 503, "there is no map yet; ask again later"),
     (
@@ -219,7 +208,7 @@ class Answerer:
         per_second: float,
         max_bytes: int = DEFAULT_MAX_BYTES,
         camera: CameraConstants | None = None,
-        log: ServedLog | None = None,
+        log: asked.ServedLog | None = None,
         note: Callable[[str], None] = lambda _: None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -268,32 +257,32 @@ class Answerer:
             self._bucket.take_token()
             return self._pools.on_graph(read)
 
-    def ask(self, question: MapQuestion) -> dict[str, Any]:
+    def ask(self, question: asked.MapQuestion) -> dict[str, Any]:
         """The answer to a question of the map. Raises NotInMapError."""
-        return asked(question, self._view())
+        return asked.asked(question, self._view())
 
-    def find(self, query: FindQuery) -> dict[str, Any]:
+    def find(self, query: asked.FindQuery) -> dict[str, Any]:
         """The Objects that are asked for, in a past map by the log. Raises NotInMapError."""
         if query.at is None and query.known_at is None:
             return self.ask(query.question(lambda view: words_of(view, self._vectors)))
-        return self._ask_log(NO_LOG_OF_THE_PAST, lambda log, view: log.find(view, query))
+        return self._ask_log(asked.NO_LOG_OF_THE_PAST, lambda log, view: log.find(view, query))
 
     def _vectors(self, _: MapView) -> ObjectVectors:
         with self._reporting_errors():
             return self._pools.object_vectors()
 
-    def changes(self, query: ChangesQuery) -> dict[str, Any]:
+    def changes(self, query: asked.ChangesQuery) -> dict[str, Any]:
         """A page of what changed in the building. Raises NotInMapError."""
-        return self._ask_log(NO_LOG, lambda log, view: log.changes(view, query))
+        return self._ask_log(asked.NO_LOG, lambda log, view: log.changes(view, query))
 
     def crop(self, name: str) -> bytes:
         """The JPEG of a detection, or of an Object's best view. Raises NotInMapError."""
-        return self._ask_log(NO_LOG_OF_CROPS, lambda log, view: log.crop(view, name))
+        return self._ask_log(asked.NO_LOG_OF_CROPS, lambda log, view: log.crop(view, name))
 
-    def _ask_log(self, missing: str, ask: Callable[[ServedLog, LiveView], Result]) -> Result:
+    def _ask_log(self, missing: str, ask: Callable[[asked.ServedLog, LiveView], Result]) -> Result:
         """The log's answer; without one NotInMapError with the text ``missing``."""
         if self._log is None:
-            raise NotInMapError(missing)
+            raise asked.NotInMapError(missing)
         view = self._view()
         with self._reporting_errors():
             try:
