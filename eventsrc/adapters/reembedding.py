@@ -20,11 +20,18 @@ from numpy.typing import NDArray
 from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.envelope.commands import InvalidCommand, Reembed, encode_command, parse_command
 from eventsrc.envelope.crops import CROP_SCHEMA, CROPS_TOPIC, Crop, InvalidCrop, decode_crop
-from eventsrc.envelope.embeddings import InvalidEmbeddings, NewVectors, decode_embeddings, is_usable
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
-from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAX_REEMBEDDED
+from eventsrc.envelope.system_events import (
+    COMMAND_KEY,
+    EMBEDDINGS_KEY,
+    MAX_REEMBEDDED,
+    InvalidEmbeddings,
+    NewVectors,
+    decode_embeddings,
+    is_usable,
+)
 from eventsrc.log import Event, LogReader, LogWriter, VerbatimEvent
 
 DEFAULT_BATCH: Final = 64

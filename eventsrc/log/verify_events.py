@@ -30,12 +30,12 @@ from pydantic import ValidationError
 from eventsrc.base.text import visible
 from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
-from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.gaps import Gap, GapLedger, gap_of
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import KeyframeId, Offset, RunId, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap, decode_map
+from eventsrc.envelope.system_events import InvalidEmbeddings, decode_embeddings
 
 from .event import Event
 

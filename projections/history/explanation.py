@@ -15,7 +15,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import KeyframeOrdinal, PlaceOrdinal, Pose
 from projections.fold.exact import mean_m
-from projections.map.confirmed import objects_text
+from projections.map.records import objects_text
 from projections.store.history import NEVER, History
 from projections.store.history_records import Cause, Merge, PlaceHistory, count_before
 

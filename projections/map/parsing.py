@@ -25,12 +25,17 @@ from eventsrc.base.errors import LogDamaged
 from eventsrc.base.machine import gc_paused
 from eventsrc.base.text import advised
 from eventsrc.envelope.commands import InvalidCommand, Reembed, UnknownKind, parse_command
-from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope.forms import read_envelope, read_envelopes
 from eventsrc.envelope.ingest import Accepted, Rejected
 from eventsrc.envelope.model import FIRST_OFFSET, DetId, Offset
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
-from eventsrc.envelope.system_events import COMMAND_KEY, EMBEDDINGS_KEY, MAP_KEY
+from eventsrc.envelope.system_events import (
+    COMMAND_KEY,
+    EMBEDDINGS_KEY,
+    MAP_KEY,
+    InvalidEmbeddings,
+    decode_embeddings,
+)
 from eventsrc.log import Event, LogReader
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.edited_events import Reembedded

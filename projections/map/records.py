@@ -7,7 +7,11 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import math
+<<<<<<< HEAD
 from collections.abc import Iterable, Mapping, Sequence
+=======
+from collections.abc import Collection, Iterable, Mapping, Sequence
+>>>>>>> 00c60520 (Let no command import another: shared options, --method and the warning of no truth in the modules they share)
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Self
@@ -16,11 +20,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.base.text import counted
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId, StatedCamera
 from projections.fold import deltas
+from projections.fold.deltas import ObservationOrdinal
 from projections.fold.exact import UM_PER_M, UnitVector, mean_m
 from projections.fold.pair_groups import PlaceSurvivors
 from projections.fold.place_types import ONCE
+from projections.fold.spots import SPOT_M
 
 _UM2_PER_M2 = UM_PER_M * UM_PER_M
 
@@ -206,7 +213,7 @@ class ObjectRecord:
     `MapView.objects` lists those that were not absorbed. The fields after ``observations`` are
     those of fusion by evidence: ``misses`` is the number of keyframes of a run that should show it
     and do not, ``missing_in`` the run by which it is missing. ``confirmed`` is as in
-    `projections.map.confirmed`, ``counted_as`` how `PlaceContents` counts it.
+    `projections.map.records`, ``counted_as`` how `PlaceContents` counts it.
     """
 
     ordinal: deltas.ObjectOrdinal
@@ -307,3 +314,47 @@ class PlaceContents:
         """The weight of each class in a place."""
         counts = self._counts.get(place, {})
         return {name: often + ONCE * once for name, (once, often) in counts.items()}
+
+
+APART_UM: Final = round(SPOT_M * UM_PER_M)
+APART_S: Final = 60.0
+
+
+def confirm(
+    found: ObjectRecord,
+    new: Iterable[ObservationOrdinal],
+    observations: list[ObservationRecord],
+    keyframes: list[KeyframeRecord],
+) -> None:
+    """Set whether an Object is confirmed, after ``new`` have become observations of it."""
+    if found.confirmed:
+        return
+    first = keyframes[observations[found.observations[0]].keyframe]
+    found.confirmed = any(
+        seen.measured or _is_apart(first, keyframes[seen.keyframe])
+        for seen in map(observations.__getitem__, new)
+    )
+
+
+def objects_text(objects: Collection[ObjectRecord]) -> str:
+    """``142 objects + 695 seen once``: those that are confirmed, and the others."""
+    return counts_text(len(objects), seen_once(objects))
+
+
+def seen_once(objects: Iterable[ObjectRecord]) -> int:
+    """The number of those that are not confirmed."""
+    return sum(not found.confirmed for found in objects)
+
+
+def counts_text(objects: int, once: int) -> str:
+    """`objects_text` for this many Objects, ``once`` of them seen once."""
+    return counted(objects - once, "object") + (f" + {once:,} seen once" if once else "")
+
+
+def _is_apart(first: KeyframeRecord, later: KeyframeRecord) -> bool:
+    if first.run != later.run or abs(later.timestamp - first.timestamp) > APART_S:
+        return True
+    if first.pose is None or later.pose is None:
+        return False
+    dx, dy = later.pose.x_um - first.pose.x_um, later.pose.y_um - first.pose.y_um
+    return dx * dx + dy * dy >= APART_UM * APART_UM

@@ -14,11 +14,10 @@ from projections.fold.exact import UM_PER_M
 from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
-from .confirmed import objects_text
 from .naming import ShortIds, things_of
 from .phrases import command_document, seen_times
 from .place_regions import place_regions
-from .records import ObjectRecord, body_fields
+from .records import ObjectRecord, body_fields, objects_text
 from .view import MapView
 
 

@@ -24,7 +24,7 @@ from projections.fold.place_types import PlaceType, place_type
 from projections.fold.settings import Settings
 
 from . import records
-from .confirmed import confirm
+from .records import confirm
 
 _T = TypeVar("_T")
 _RARELY: tuple[SkipKind, ...] = ("forgotten", "dropped", "scan_too_far")

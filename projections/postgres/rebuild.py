@@ -19,10 +19,10 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings
-from projections.map.confirmed import seen_once
 from projections.map.fold import read_ahead
 from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
+from projections.map.records import seen_once
 
 from .connection import Targets
 from .inputs import LogInputs, MapInputs, SettingsOf

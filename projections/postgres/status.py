@@ -7,13 +7,14 @@ has every event and *behind* when not. It is *other* when it was made from anoth
 settings or under other corrections than its commands give.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
+from eventsrc.record.log_info import LogInfo
 from projections.fold.map_errors import DatabaseError, ProjectionMismatch
 from projections.fold.settings import Settings
 
@@ -201,3 +202,16 @@ def _versions(connection: Connection) -> dict[str, str]:
         if version is not None:
             versions[name] = version
     return versions
+
+
+def status_document(info: LogInfo, found: Status) -> dict[str, Any]:
+    """The state of a log and its databases as JSON."""
+    return {
+        "log": {
+            "id": info.log_id,
+            "next_offset": info.events,
+            "rejected": info.rejected,
+            "lost": info.lost,
+        },
+        "sinks": {s.sink: asdict(s) for s in found.sinks},
+    }

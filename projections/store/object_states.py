@@ -7,7 +7,7 @@ An Object is what the last delta of each kind about it says. Where two kinds spe
 * Its class is that of its last classification; without one, that as which it was found.
 * The keyframes that should show it and do not are those of its last `ObjectMissing`; none once a
   later event has relocated it.
-* It is confirmed by the first event after which `projections.map.confirmed` says so.
+* It is confirmed by the first event after which `projections.map.records` says so.
 
 `projections.map.view` applies the same deltas one by one; property tests compare the two.
 """
@@ -20,8 +20,7 @@ import numpy as np
 
 from eventsrc.envelope.model import Offset
 from projections.fold.deltas import ObjectOrdinal
-from projections.map.confirmed import APART_S, APART_UM
-from projections.map.records import EstimatedPosition, ObjectRecord
+from projections.map.records import APART_S, APART_UM, EstimatedPosition, ObjectRecord
 
 from .columns import NONE, Array
 from .tables import Rows, Tables, last_rows

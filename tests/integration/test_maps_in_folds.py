@@ -16,8 +16,8 @@ from projections.fold.settings import Settings
 from projections.history import LogTimeline
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, fold_log
-from projections.map.one_floor import view_of_floor
 from projections.map.view import MapView
+from projections.surfaces.cli.folded_log import view_of_floor
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY

@@ -31,7 +31,6 @@ from projections.history.merge_reasons import (
     object_merge_document,
     refusal_document,
 )
-from projections.map.confirmed import confirm
 from projections.map.digest import map_digest
 from projections.map.fold import fold_events, new_map
 from projections.map.records import (
@@ -40,6 +39,7 @@ from projections.map.records import (
     ObservationRecord,
     PlaceRecord,
     RunRecord,
+    confirm,
 )
 from projections.map.state_output import state_document, state_text
 from projections.map.view import MapView

@@ -17,8 +17,7 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.grey_images import with_few_colours
 from projections.adapters import scene
 from projections.fold.deltas import PlacesMerged
-from projections.map.confirmed import objects_text
-from projections.map.records import ObjectRecord
+from projections.map.records import ObjectRecord, objects_text
 from projections.map.view import MapView
 from projections.store.history_records import Merge
 

@@ -65,8 +65,8 @@ SECTIONS: "Mapping[str, Mapping[str, str]]" = {
         "reembed": "reembed:reembed_log",
     },
     "Shell": {
-        "completion": "shell:completion",
-        "help": "shell:help_",
+        "completion": "program:completion",
+        "help": "program:help_",
     },
 }
 """The sections of ``--help``, with the commands of each. Beside each command stand its module here

@@ -15,11 +15,10 @@ from projections.postgres.embedded import EmbeddedServer
 from projections.postgres.labels import SinkName
 from projections.postgres.queries.candidate_search import question_error
 from projections.postgres.replaced_tables import roles_sql
-from projections.postgres.status import SinkStatus, Status, projection_status
+from projections.postgres.status import SinkStatus, Status, projection_status, status_document
 
 from .folded_log import LogSettings
-from .options import Databases, JsonOption
-from .replay_and_tail import OnlyOption, only_of
+from .options import Databases, JsonOption, OnlyOption, only_of
 from .terminal import display, emit, finish, say
 
 group = typer.Typer(
@@ -196,19 +195,6 @@ def _with_failure(document: dict[str, Any], failure: str | None) -> dict[str, An
 def _print_failure(failure: str | None) -> None:
     if failure is not None:
         display(f"questions cannot be answered: {failure}")
-
-
-def status_document(info: LogInfo, found: Status) -> dict[str, Any]:
-    """The state of a log and its databases as JSON."""
-    return {
-        "log": {
-            "id": info.log_id,
-            "next_offset": info.events,
-            "rejected": info.rejected,
-            "lost": info.lost,
-        },
-        "sinks": {s.sink: asdict(s) for s in found.sinks},
-    }
 
 
 def _print_status(info: LogInfo, found: Status) -> None:

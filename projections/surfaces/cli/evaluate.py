@@ -15,9 +15,8 @@ from projections.localize.evaluate.truth import read_truth
 from projections.localize.relocalize import Method
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
 
-from .folded_log import FoldSettings, W
-from .options import CameraOptions, JsonOption, check_picture, option
-from .relocalize import method_from
+from .folded_log import FoldSettings, W, warn_of_no_truth
+from .options import CameraOptions, JsonOption, check_picture, method_from, option
 from .terminal import display, emit, say
 
 _ROWS = (
@@ -241,19 +240,6 @@ def worst_text(found: _Scored) -> str:
         f"worst map: {worst.log}, {counted(int(worst.crops), 'crop')}: pose error p50"
         f" {worst.ours['p50']:.2f} m, the plain baseline's {worst.plain['p50']:.2f} m\n"
     )
-
-
-def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
-    """Warn if none of a map's keyframes and observations has truth; None stands for no scores."""
-    if scores is not None and not _has_truth(scores):
-        say(
-            f"no truth for any keyframe of {log}: its places and objects are not scored; see"
-            " --truth"
-        )
-
-
-def _has_truth(scores: Mapping[str, Any]) -> bool:
-    return bool(scores["places"]["rooms"] or scores["objects"]["instances"])
 
 
 def scores_text(scores: Mapping[str, Any]) -> str:

@@ -10,10 +10,16 @@ from pydantic import ValidationError
 
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.crops import CROP_SCHEMA, InvalidCrop, decode_crop
-from eventsrc.envelope.embeddings import InvalidEmbeddings, decode_embeddings
 from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMapEvent, read_map_head
-from eventsrc.envelope.system_events import EMBEDDINGS_KEY, MAP_KEY, REJECTED_KEY, RejectedPayload
+from eventsrc.envelope.system_events import (
+    EMBEDDINGS_KEY,
+    MAP_KEY,
+    REJECTED_KEY,
+    InvalidEmbeddings,
+    RejectedPayload,
+    decode_embeddings,
+)
 from eventsrc.log import Event, VerbatimEvent
 
 _SUMMARY_CHARS = 100

@@ -15,10 +15,10 @@ from eventsrc.base.text import counted
 from eventsrc.base.user_files import write_files
 from eventsrc.record.transport.config import is_loopback
 from projections.fold.corrections import map_fingerprint
-from projections.map.confirmed import objects_text
 from projections.map.fold import RecordedFold
-from projections.map.one_floor import view_of_floor
+from projections.map.records import objects_text
 from projections.store.history_recorder import map_after
+from projections.surfaces.cli.folded_log import view_of_floor
 
 from .folded_log import FoldToOption, KnownAtOption, LogSettings
 from .options import option

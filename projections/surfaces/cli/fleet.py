@@ -161,8 +161,8 @@ def status(
     Exit 3 when a site is not up to date, has lost something or cannot be read.
     """
     from projections.adapters.fleet.site_tasks import SiteStatus, StatusRequest, look_at_site
+    from projections.postgres.status import status_document
 
-    from .db import status_document
     from .log import info_document
 
     chosen = _chosen(settings)

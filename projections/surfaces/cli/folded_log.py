@@ -5,12 +5,13 @@ that ``--set`` changes it; ``--space NAME`` is ``--set embedding_model=NAME`` an
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
+from msgspec.structs import replace
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import advised, command_line, visible
@@ -23,11 +24,18 @@ from projections.fold.map_errors import SettingsError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings, preset_assignments, read_settings
 from projections.map.parsing import read_corrections
+from projections.map.view import MapView
 
 from .options import option
 from .terminal import say
 
 LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="The log's folder.")]
+MOST_LINES = 5
+"""Things of a kind that a text answer names without --all."""
+
+AllOption = Annotated[
+    bool, typer.Option("--all", help=f"List all changes, not only {MOST_LINES} of a kind.")
+]
 
 # Points of a log
 
@@ -41,6 +49,7 @@ def point(reader: LogReader, text: str) -> Offset:
 
 
 FoldToOption = Annotated[str, option("W", f"Fold to here: {W}.", "--at")]
+AtOption = Annotated[str, option("W", f"Use the map as of here: {W}.", "--at")]
 KnownAtOption = Annotated[
     str | None,
     option(
@@ -240,3 +249,48 @@ def classes_advice(log: Path) -> str:
     """One line for a log whose classes are all numbers."""
     named = command_line("edit", log, "relabel", "--labels", "FILE")
     return f"all classes are numbers: `{visible(named)}` names them"
+
+
+UNNAMED = "-"
+"""The value of `--floor` for the floor of poses whose envelopes name none."""
+
+
+def view_of_floor(view: MapView, floor: str) -> MapView:
+    """A view of the places, Objects and poses on a floor. Keyframes elsewhere are in it without
+    their pose, so all ordinals hold. Raises MisuseError for a floor that is not in the map."""
+    name = None if floor == UNNAMED and UNNAMED not in view.floors else floor
+    posed = [k for k in view.keyframes if k.pose is not None]
+    if all(k.floor != name for k in posed):
+        unnamed = [UNNAMED] if any(k.floor is None for k in posed) else []
+        known = ", ".join(map(visible, [*view.floors, *unnamed])) or "no floor"
+        raise MisuseError(f"no floor {floor!r} in this map; it has {known}")
+    found = MapView(view.settings, keep_embeddings=False, corrections=view.corrections)
+    found.advance(view.next_offset)
+    found.runs, found.observations = view.runs, view.observations
+    found.keyframes = [k if k.floor == name else replace(k, pose=None) for k in view.keyframes]
+    found.all_places, found.survivors = view.all_places, view.survivors
+    found.places = {p: each for p, each in view.places.items() if view.floor_of(p) == name}
+    found.all_objects, found.object_survivors = view.all_objects, view.object_survivors
+    found.objects = {
+        number: each
+        for number, each in view.objects.items()
+        if view.keyframes[view.observations[each.observations[0]].keyframe].floor == name
+    }
+    found.adjacency = {
+        (a, b): count
+        for (a, b), count in view.adjacency.items()
+        if a in found.places and b in found.places
+    }
+    if (given := view.maps_in_force().get(name)) is not None:
+        found.maps[None] = given  # the only floor is the first
+    found.floors, found.contents = view.floors, view.contents
+    return found
+
+
+def warn_of_no_truth(log: Path, scores: Mapping[str, Any] | None) -> None:
+    """Warn if none of a map's keyframes and observations has truth; None stands for no scores."""
+    if scores is not None and not (scores["places"]["rooms"] or scores["objects"]["instances"]):
+        say(
+            f"no truth for any keyframe of {log}: its places and objects are not scored; see"
+            " --truth"
+        )

@@ -9,8 +9,8 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.progress import working
 from eventsrc.base.text import counted, visible
-from projections.map.confirmed import objects_text
 from projections.map.digest import map_digest
+from projections.map.records import objects_text
 from projections.map.state_output import places_advice, space_advice, state_document, state_text
 from projections.map.view import MapView
 from projections.store.history_recorder import HistoryRecorder, map_after
@@ -97,7 +97,7 @@ def draw(
     from eventsrc.adapters.sim import build_house
     from projections.adapters.drawing import draw_map, plan_of
     from projections.adapters.drawing.map_picture import merge_marks
-    from projections.map.one_floor import view_of_floor
+    from projections.surfaces.cli.folded_log import view_of_floor
 
     check_picture(out)
     with source.opened(at, known_at) as (reader, end, _, corrections, settings):

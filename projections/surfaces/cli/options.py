@@ -10,11 +10,13 @@ import socket
 import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 
 import typer
 
+from eventsrc.base.errors import MisuseError
 from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
 from projections.fold.map_errors import QuestionError
@@ -22,9 +24,9 @@ from projections.fold.map_errors import QuestionError
 if TYPE_CHECKING:
     from eventsrc.record.transport.session import Session
     from projections.fold.settings import CameraConstants
-    from projections.localize.relocalize import Question
+    from projections.localize.relocalize import Method, Question
     from projections.postgres.connection import Targets
-from typing import Any
+    from projections.postgres.labels import SinkName
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
@@ -62,6 +64,23 @@ LiveDbOption = Annotated[
 VectorsOption = Annotated[
     str | None, option("URL", "The database of the vectors [default: --db].", "--vector-db")
 ]
+
+
+class Sinks(StrEnum):
+    """The values of ``--only``."""
+
+    graph = "graph"
+    vectors = "vectors"
+
+
+OnlyOption = Annotated[
+    Sinks | None, option("graph|vectors", "Only the graph or the vectors.", "--only")
+]
+
+
+def only_of(only: Sinks | None) -> "SinkName | None":
+    """The sink's name, None for both."""
+    return None if only is None else only.value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,3 +280,12 @@ def user_at_host() -> str:
     except (OSError, KeyError):  # a user id without a name
         name = str(os.getuid())
     return f"{name}@{socket.gethostname()}"
+
+
+def method_from(text: str) -> "Method":
+    """The method of re-localisation that an option names. Raises MisuseError."""
+    from projections.localize.relocalize import Method
+
+    if text in get_args(Method):
+        return cast("Method", text)
+    raise MisuseError(f"--method {text}: choose joint or plain")

@@ -9,7 +9,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, cast, get_args
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -40,7 +40,15 @@ from projections.map.state_output import camera_advice
 from projections.store.history_recorder import map_after
 
 from .folded_log import FoldSettings, W, point, say_defaults
-from .options import CameraOptions, Databases, JsonOption, OptionalQuestion, option, question_from
+from .options import (
+    CameraOptions,
+    Databases,
+    JsonOption,
+    OptionalQuestion,
+    method_from,
+    option,
+    question_from,
+)
 from .terminal import display, emit, emit_lines, say
 
 
@@ -144,13 +152,6 @@ def _question(query: str | None, classes: list[str] | None) -> Question:
     if query is not None:
         return question_from(query)
     return read_question([{"class": name} for name in classes or ()])
-
-
-def method_from(text: str) -> Method:
-    """The method an option names."""
-    if text in get_args(Method):
-        return cast("Method", text)
-    raise MisuseError(f"--method {text}: choose joint or plain")
 
 
 def _print_answer(answer: Answer, as_json: bool) -> None:

@@ -7,7 +7,6 @@ A replay prints how many events were left out, and why.
 import contextlib
 from collections.abc import Iterator
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +17,8 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.record.transport.config import parse_address
 from projections.fold.settings import Settings
-from projections.map.confirmed import counts_text
 from projections.map.parsed_log import DEFAULT_WORKERS, MAX_WORKERS
+from projections.map.records import counts_text
 from projections.map.state_output import places_advice
 from projections.postgres import (
     ForeignEmbedding,
@@ -30,11 +29,10 @@ from projections.postgres import (
     tail,
 )
 from projections.postgres.batch_writer import serving_tail_metrics
-from projections.postgres.labels import SinkName
 from projections.postgres.origin import command_line
 
 from .folded_log import LogSettings, W
-from .options import Databases, JsonOption, option
+from .options import Databases, JsonOption, OnlyOption, only_of, option
 from .signals import stop_on_signals
 from .terminal import Bar, emit, finish, say, say_metrics
 
@@ -104,16 +102,6 @@ def _settings_for(settings: Settings, first: ForeignEmbedding) -> Settings:
     return settings.model_copy(update=update)
 
 
-class Sinks(StrEnum):
-    """The values of ``--only``."""
-
-    graph = "graph"
-    vectors = "vectors"
-
-
-OnlyOption = Annotated[
-    Sinks | None, option("graph|vectors", "Only the graph or the vectors.", "--only")
-]
 WorkersOption = Annotated[
     int | None,
     option(
@@ -125,11 +113,6 @@ WorkersOption = Annotated[
         max=MAX_WORKERS,
     ),
 ]
-
-
-def only_of(only: Sinks | None) -> SinkName | None:
-    """The sink's name, None for both."""
-    return None if only is None else only.value
 
 
 def replay(

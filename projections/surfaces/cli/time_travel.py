@@ -33,17 +33,18 @@ from projections.history.rendering import (
 )
 from projections.store.history_records import Merge
 
-from .folded_log import CachedLog, KnownAtOption, W, known_point, point
+from .folded_log import (
+    MOST_LINES,
+    AllOption,
+    AtOption,
+    CachedLog,
+    KnownAtOption,
+    W,
+    known_point,
+    point,
+)
 from .options import JsonOption, check_picture, option
 from .terminal import Bar, display, emit, say
-
-MOST_LINES = 5
-"""Things of a kind that a text answer names without --all."""
-
-AllOption = Annotated[
-    bool, typer.Option("--all", help=f"List all changes, not only {MOST_LINES} of a kind.")
-]
-AtOption = Annotated[str, option("W", f"Use the map as of here: {W}.", "--at")]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,6 @@ from projections.map.parsing import read_commands
 from . import folded_log
 from .options import JsonOption, check_picture, option
 from .terminal import Bar, display, emit, say
-from .time_travel import MOST_LINES, AllOption, AtOption
 
 
 def whatif(
@@ -63,14 +62,14 @@ def whatif(
             "--without",
         ),
     ] = None,
-    at: AtOption = "end",
+    at: folded_log.AtOption = "end",
     known_at: folded_log.KnownAtOption = None,
     truth: Annotated[
         list[Path] | None,
         option("FILE", "Score places and objects against this ground truth.", "--truth"),
     ] = None,
     json_: JsonOption = False,
-    all_: AllOption = False,
+    all_: folded_log.AllOption = False,
     picture: Annotated[
         Path | None, option("FILE", "Draw the maps side by side (.png, .svg, .pdf).", "--picture")
     ] = None,
@@ -117,16 +116,14 @@ def whatif(
             truth=scored, processes=processes, progress=bar.show_fold,
             keep_views=picture is not None,
         )  # fmt: skip
-    from .evaluate import warn_of_no_truth  # here: it imports all of re-localisation
-
-    warn_of_no_truth(log, found.base.result.scores)
+    folded_log.warn_of_no_truth(log, found.base.result.scores)
     if picture is not None:
         _draw_maps(found, picture)
     if json_:
         emit(found.document())
     else:
         shorten_by(found.short_ids().text)
-        display(whatif_text(found, most=None if all_ else MOST_LINES))
+        display(whatif_text(found, most=None if all_ else folded_log.MOST_LINES))
 
 
 def _draw_maps(found: WhatIf, out: Path) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from eventsrc.envelope import commands
 from eventsrc.envelope.commands import Command, CorrectedPose, RigidTransform, encode_command
-from eventsrc.envelope.embeddings import NewVectors
 from eventsrc.envelope.model import DetId
 from eventsrc.envelope.system_events import (
     COMMAND_KEY,
@@ -21,6 +20,7 @@ from eventsrc.envelope.system_events import (
     LOSS_KEY,
     MAP_KEY,
     Loss,
+    NewVectors,
 )
 from eventsrc.log import NEVER, LogWriter, NewEvent, seal
 from eventsrc.record.append import append_payload
