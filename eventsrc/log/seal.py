@@ -33,22 +33,6 @@ from . import format as names
 from . import mcap_records as _mcap
 from .channels import is_verbatim
 from .durable_files import drop_cached, replace_durably, sync_file, unlink_quietly, write_all
-from .mcap_records import (
-    FRAME,
-    MAX_MESSAGES,
-    MESSAGE,
-    BadRecord,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Metadata,
-    MetadataIndex,
-    Opcode,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 from .sealed_segment import SEAL_METADATA
 
 CHUNK_BYTES = 1024 * 1024
@@ -136,7 +120,7 @@ def _edges(size: int, starts: list[int]) -> list[int]:
 
 def _parse(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[int, int]]]:
     """Heads and starts of all messages, and start and end of every other record."""
-    at, size, unpack, message = 0, len(body), MESSAGE.unpack_from, int(Opcode.MESSAGE)
+    at, size, unpack, message = 0, len(body), _mcap.MESSAGE.unpack_from, int(_mcap.Opcode.MESSAGE)
     rows: list[tuple[int, ...]] = []
     starts: list[int] = []
     others: list[tuple[int, int]] = []
@@ -145,17 +129,17 @@ def _parse(body: bytes) -> tuple[list[tuple[int, ...]], list[int], list[tuple[in
             if body[at] == message:
                 row = unpack(body, at)
                 rows.append(row)
-                if len(rows) > MAX_MESSAGES:
-                    raise BadRecord(f"a chunk of more than {MAX_MESSAGES:,} messages")
+                if len(rows) > _mcap.MAX_MESSAGES:
+                    raise _mcap.BadRecord(f"a chunk of more than {_mcap.MAX_MESSAGES:,} messages")
                 starts.append(at)
-                at += FRAME.size + row[1]
+                at += _mcap.FRAME.size + row[1]
             else:
-                start, at = at, at + FRAME.size + FRAME.unpack_from(body, at)[1]
+                start, at = at, at + _mcap.FRAME.size + _mcap.FRAME.unpack_from(body, at)[1]
                 others.append((start, at))
     except struct.error:
-        raise BadRecord("a record is cut short in a chunk") from None
+        raise _mcap.BadRecord("a record is cut short in a chunk") from None
     if at != size:
-        raise BadRecord("a record does not fit its chunk")
+        raise _mcap.BadRecord("a record does not fit its chunk")
     return rows, starts, others
 
 
@@ -204,7 +188,7 @@ def write_sealed(
         builder.check_end(plan)
         builder.finish()
         builder.sync()
-    except BadRecord as error:
+    except _mcap.BadRecord as error:
         unlink_quietly(temporary)
         raise LogDamaged(
             f"{names.segment_path(plan.log, plan.base, names.ACTIVE)}: {error}"
@@ -228,11 +212,11 @@ class _Builder:
         self._crc = 0
         self.sha256 = hashlib.sha256()
         self._compressor = _mcap.new_compressor()
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, _mcap.Schema] = {}
+        self._channels: dict[int, _mcap.Channel] = {}
         self._counts: dict[int, int] = defaultdict(int)
-        self._chunks: list[ChunkIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        self._chunks: list[_mcap.ChunkIndex] = []
+        self._metadata: list[_mcap.MetadataIndex] = []
         self._edges = [0]
         self._log_ns: list[int] = []
         self._stamp_ns: list[int] = []
@@ -244,7 +228,7 @@ class _Builder:
         head = names.head_metadata(plan.log_id, plan.base, values)
         start = names.file_head(head)
         length = len(_mcap.encode(head))
-        self._metadata.append(MetadataIndex(len(start) - length, length, head.name))
+        self._metadata.append(_mcap.MetadataIndex(len(start) - length, length, head.name))
         self._seal_name = names.metadata_name(SEAL_METADATA, plan.log_id, plan.base)
         self._write(start)
 
@@ -290,7 +274,7 @@ class _Builder:
             offsets[channel_id] = self._at
             self._write(_mcap.encode_message_index(channel_id, entries[channel_id]))
         self._chunks.append(
-            ChunkIndex(
+            _mcap.ChunkIndex(
                 chunk_length=len(head) + len(data),
                 chunk_start_offset=start,
                 compression="zstd",
@@ -307,19 +291,19 @@ class _Builder:
         """Raise BadRecord unless the chunks end at the plan's end."""
         reached = plan.base + self._edges[-1]
         if reached != plan.following:
-            raise BadRecord(
+            raise _mcap.BadRecord(
                 f"offsets {reached} to {plan.following - 1} were recorded and cannot be read"
             )
 
     def finish(self) -> None:
         """Write the seal, the end of data, the summary and the footer."""
         seal_record = _mcap.encode(self._seal())
-        self._metadata.append(MetadataIndex(self._at, len(seal_record), self._seal_name))
+        self._metadata.append(_mcap.MetadataIndex(self._at, len(seal_record), self._seal_name))
         self._write(seal_record)
-        self._write(_mcap.encode(DataEnd(self._crc)))
+        self._write(_mcap.encode(_mcap.DataEnd(self._crc)))
         self._write_summary()
 
-    def _seal(self) -> Metadata:
+    def _seal(self) -> _mcap.Metadata:
         return _mcap.metadata_with_crc(
             self._seal_name,
             {
@@ -332,27 +316,27 @@ class _Builder:
     def _write_summary(self) -> None:
         start = self._at
         summary = b""
-        groups: list[SummaryOffset] = []
+        groups: list[_mcap.SummaryOffset] = []
         for opcode, data in self._summary_groups():
-            groups.append(SummaryOffset(opcode, start + len(summary), len(data)))
+            groups.append(_mcap.SummaryOffset(opcode, start + len(summary), len(data)))
             summary += data
         offsets_start = start + len(summary)
         summary += _mcap.encode_all(groups)
-        footer = _mcap.encode(Footer(start, offsets_start, 0))
+        footer = _mcap.encode(_mcap.Footer(start, offsets_start, 0))
         crc = crc32(footer[:-4], crc32(summary))
-        self._write(summary + _mcap.encode(Footer(start, offsets_start, crc)) + _mcap.MAGIC)
+        self._write(summary + _mcap.encode(_mcap.Footer(start, offsets_start, crc)) + _mcap.MAGIC)
 
-    def _summary_groups(self) -> list[tuple[Opcode, bytes]]:
+    def _summary_groups(self) -> list[tuple[_mcap.Opcode, bytes]]:
         return [
-            (Opcode.SCHEMA, _mcap.encode_all(self._schemas.values())),
-            (Opcode.CHANNEL, _mcap.encode_all(self._channels.values())),
-            (Opcode.STATISTICS, _mcap.encode(self._statistics())),
-            (Opcode.CHUNK_INDEX, _mcap.encode_all(self._chunks)),
-            (Opcode.METADATA_INDEX, _mcap.encode_all(self._metadata)),
+            (_mcap.Opcode.SCHEMA, _mcap.encode_all(self._schemas.values())),
+            (_mcap.Opcode.CHANNEL, _mcap.encode_all(self._channels.values())),
+            (_mcap.Opcode.STATISTICS, _mcap.encode(self._statistics())),
+            (_mcap.Opcode.CHUNK_INDEX, _mcap.encode_all(self._chunks)),
+            (_mcap.Opcode.METADATA_INDEX, _mcap.encode_all(self._metadata)),
         ]
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
+    def _statistics(self) -> _mcap.Statistics:
+        return _mcap.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),

@@ -11,17 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
-from .messages import (
-    ODOMETRY,
-    POSE,
-    TF,
-    BadMessage,
-    Covariance,
-    StampedPose,
-    pose_of,
-    read,
-    transform_of,
-)
+from . import messages
 from .transforms import TimeSeries, Transform, TransformBuffer, compose, interpolate, rotate
 
 DEFAULT_WAIT_NS: Final = 1_000_000_000
@@ -117,7 +107,7 @@ _MOST_POSES: Final = 50_000
 _UPRIGHT: Final = 0.5
 """Least vertical component, at 30° from the horizontal, of a z axis that is no optical axis."""
 _METRES, _RADIANS = 6, 9
-_Found: TypeAlias = tuple[Transform | None, Transform | None, Covariance | None]
+_Found: TypeAlias = tuple[Transform | None, Transform | None, messages.Covariance | None]
 """The base, the camera and the error of the pose."""
 
 
@@ -131,7 +121,7 @@ class PicturePose:
     z: float
     yaw: float
     camera_yaw: float
-    covariance: Covariance | None
+    covariance: messages.Covariance | None
     has_base: bool
     camera: Transform | None
 
@@ -143,7 +133,7 @@ class PoseSource:
         self._stream = stream
         self._buffer = buffer
         self._counts = counts
-        self._given: TimeSeries[StampedPose] = TimeSeries()
+        self._given: TimeSeries[messages.StampedPose] = TimeSeries()
         self._frame: str | None = None
         self.received = 0
         """Number of messages added, without those that other streams added to a shared buffer."""
@@ -152,12 +142,12 @@ class PoseSource:
         """Add the transforms of a TFMessage; they are static if ``topic`` is the stream's
         ``tf_static``."""
         self.received += 1
-        _expect(type_name, TF)
+        _expect(type_name, messages.TF)
         static = topic == self._stream.tf_static
-        for each in read(lambda m: [*m.transforms], message):
+        for each in messages.read(lambda m: [*m.transforms], message):
             try:
-                parent, child, stamp_ns, pose = read(transform_of, each)
-            except BadMessage as error:
+                parent, child, stamp_ns, pose = messages.read(messages.transform_of, each)
+            except messages.BadMessage as error:
                 self._counts.refuse(topic, str(error))
                 continue
             if static:
@@ -168,15 +158,17 @@ class PoseSource:
     def add_pose(self, topic: str, type_name: str, message: Any) -> None:
         """Add a pose of odometry or of a localiser. Raises BadMessage."""
         self.received += 1
-        _expect(type_name, ODOMETRY, POSE)
-        pose = read(pose_of, message)
+        _expect(type_name, messages.ODOMETRY, messages.POSE)
+        pose = messages.read(messages.pose_of, message)
         if pose.fault is not None:
             self._counts.refuse(topic, pose.fault)
         frame = self.frame
         if frame is None:
             frame = self._frame = pose.parent
         if pose.parent != frame:
-            raise BadMessage(f"it is in the frame {pose.parent!r:.80}, not in {frame!r:.80}")
+            raise messages.BadMessage(
+                f"it is in the frame {pose.parent!r:.80}, not in {frame!r:.80}"
+            )
         self._given.add(pose.stamp_ns, pose)
         if len(self._given.stamps) > _MOST_POSES:
             self._given.forget_half()
@@ -258,7 +250,9 @@ def heading_of_camera(t: Transform, frame: str) -> float:
     return math.atan2(y, x)
 
 
-def _between(a: Covariance | None, b: Covariance | None, share: float) -> Covariance | None:
+def _between(
+    a: messages.Covariance | None, b: messages.Covariance | None, share: float
+) -> messages.Covariance | None:
     if a is None or b is None:
         return None
     return tuple((1.0 - share) * one + share * other for one, other in zip(a, b, strict=True))
@@ -266,4 +260,4 @@ def _between(a: Covariance | None, b: Covariance | None, share: float) -> Covari
 
 def _expect(type_name: str, *expected: str) -> None:
     if type_name not in expected:
-        raise BadMessage(f"it is {type_name:.80}, not {' or '.join(expected)}")
+        raise messages.BadMessage(f"it is {type_name:.80}, not {' or '.join(expected)}")

@@ -27,19 +27,7 @@ from typing import NamedTuple, TypeAlias
 from eventsrc.envelope.model import DetId, Offset
 
 from . import State, part, prefixed
-from .deltas import (
-    Delta,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectOrdinal,
-    ObjectSeen,
-    ObjectsMerged,
-    ObservationOrdinal,
-    Pose,
-    RunOrdinal,
-)
+from . import deltas as d
 from .evidence import EvidenceConstants
 from .evidence_objects import EvidenceObjects, MovedObject, ObjectDelta
 from .exact import log
@@ -61,12 +49,12 @@ _MOST = 128
 
 class _Candidate(NamedTuple):
     value: float
-    old: ObjectOrdinal
+    old: d.ObjectOrdinal
     look: float
 
 
 class _Newcomer(NamedTuple):
-    founded_by: ObservationOrdinal
+    founded_by: d.ObservationOrdinal
     due_at: int  # observations at the next comparison
 
 
@@ -76,11 +64,11 @@ class Relocations:
     def __init__(self, presence: Presence, objects: EvidenceObjects) -> None:
         self._presence = presence
         self._objects = objects
-        self._newcomers: dict[ObjectOrdinal, _Newcomer] = {}
-        self._class_of: dict[ObjectOrdinal, str] = {}
-        self._by_class: dict[str, dict[ObjectOrdinal, None]] = {}
+        self._newcomers: dict[d.ObjectOrdinal, _Newcomer] = {}
+        self._class_of: dict[d.ObjectOrdinal, str] = {}
+        self._by_class: dict[str, dict[d.ObjectOrdinal, None]] = {}
 
-    def fold(self, fused: Iterable[Delta]) -> list[MovedObject]:
+    def fold(self, fused: Iterable[d.Delta]) -> list[MovedObject]:
         """The Objects found to be relocated; the caller merges the two of each.
 
         ``fused`` are the deltas of fusion; `Presence` must have applied them.
@@ -115,28 +103,28 @@ class Relocations:
             for ordinal in ordinals:
                 self._classify(ordinal, name)
 
-    def _apply(self, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
+    def _apply(self, fused: Iterable[d.Delta]) -> list[d.ObjectOrdinal]:
         """Apply the deltas; the newcomers whose comparison is due."""
-        due: list[ObjectOrdinal] = []
+        due: list[d.ObjectOrdinal] = []
         for delta in fused:
-            if type(delta) is ObjectFound:
+            if type(delta) is d.ObjectFound:
                 self._classify(delta.object, delta.class_name)
                 self._newcomers[delta.object] = _Newcomer(delta.observation, _LEAST_NEW)
                 if len(self._newcomers) > _MOST:
                     del self._newcomers[next(iter(self._newcomers))]
-            elif type(delta) is ObjectClassified:
+            elif type(delta) is d.ObjectClassified:
                 self._classify(delta.object, delta.class_name)
-            elif type(delta) is ObjectSeen:
+            elif type(delta) is d.ObjectSeen:
                 newcomer = self._newcomers.get(delta.object)
                 if newcomer is not None and delta.obs_count >= newcomer.due_at:
                     due_at = 2 * delta.obs_count
                     self._newcomers[delta.object] = newcomer._replace(due_at=due_at)
                     due.append(delta.object)
-            elif type(delta) is ObjectsMerged:
+            elif type(delta) is d.ObjectsMerged:
                 self._forget(delta.absorbed)
         return [ordinal for ordinal in due if ordinal in self._newcomers]
 
-    def _newcomer_like(self, old: ObjectOrdinal) -> list[ObjectOrdinal]:
+    def _newcomer_like(self, old: d.ObjectOrdinal) -> list[d.ObjectOrdinal]:
         """The newcomer that looks most like an Object, of equal ones the latest; none if its ratio
         is too low."""
         own = self._by_class.get(self._objects.class_of(old), {})
@@ -151,7 +139,7 @@ class Relocations:
         alike = [(look, new) for look, new in looks if look is not None and look >= _LEAST_LOOK]
         return [max(alike)[1]] if alike else []
 
-    def _best(self, newcomer: ObjectOrdinal) -> _Candidate | None:
+    def _best(self, newcomer: d.ObjectOrdinal) -> _Candidate | None:
         """The older Object that the newcomer is; None if it is none."""
         own = self._by_class.get(self._objects.class_of(newcomer), {})
         observations_of = self._objects.observations_of
@@ -176,7 +164,7 @@ class Relocations:
         rival = max([look for look in (*older, *later_looks) if look is not None], default=0.0)
         return best if best.value - max(rival, 0.0) >= _ENOUGH else None
 
-    def _could_be(self, old: ObjectOrdinal, newcomer: ObjectOrdinal) -> bool:
+    def _could_be(self, old: d.ObjectOrdinal, newcomer: d.ObjectOrdinal) -> bool:
         """Whether the two can be one thing, apart from their looks."""
         before, now = self._presence.attendance[old], self._presence.attendance[newcomer]
         pairs = zip(now.estimate, before.estimate, strict=True)
@@ -192,7 +180,7 @@ class Relocations:
             and apart >= _APART_CHI2 * (xx * yy - xy * xy)
         )
 
-    def _classify(self, ordinal: ObjectOrdinal, class_name: str) -> None:
+    def _classify(self, ordinal: d.ObjectOrdinal, class_name: str) -> None:
         """Enter an Object as the latest of its class."""
         self._drop_class(ordinal)
         self._class_of[ordinal] = class_name
@@ -201,7 +189,7 @@ class Relocations:
         if len(own) > _MOST:
             self._drop_class(next(iter(own)))
 
-    def _drop_class(self, ordinal: ObjectOrdinal) -> None:
+    def _drop_class(self, ordinal: d.ObjectOrdinal) -> None:
         class_name = self._class_of.pop(ordinal, None)
         if class_name is not None:
             own = self._by_class[class_name]
@@ -209,12 +197,12 @@ class Relocations:
             if not own:
                 del self._by_class[class_name]
 
-    def _forget(self, ordinal: ObjectOrdinal) -> None:
+    def _forget(self, ordinal: d.ObjectOrdinal) -> None:
         self._drop_class(ordinal)
         self._newcomers.pop(ordinal, None)
 
 
-FusionDelta: TypeAlias = ObjectDelta | ObjectMissing
+FusionDelta: TypeAlias = ObjectDelta | d.ObjectMissing
 
 
 class EvidenceFusion:
@@ -230,9 +218,9 @@ class EvidenceFusion:
     def fold(
         self,
         offset: Offset,
-        run: RunOrdinal,
+        run: d.RunOrdinal,
         timestamp: float,
-        pose: Pose,
+        pose: d.Pose,
         camera: CameraConstants,
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
@@ -267,16 +255,16 @@ class EvidenceFusion:
 
 
 def _in_order(
-    fused: Sequence[ObjectDelta], absorbed: Container[ObjectOrdinal]
+    fused: Sequence[ObjectDelta], absorbed: Container[d.ObjectOrdinal]
 ) -> list[ObjectDelta]:
     """Classes and estimates last, ascending, the latest of each Object that is left."""
     others: list[ObjectDelta] = []
-    classes: dict[ObjectOrdinal, ObjectDelta] = {}
-    estimates: dict[ObjectOrdinal, ObjectDelta] = {}
+    classes: dict[d.ObjectOrdinal, ObjectDelta] = {}
+    estimates: dict[d.ObjectOrdinal, ObjectDelta] = {}
     for delta in fused:
-        if type(delta) is ObjectClassified:
+        if type(delta) is d.ObjectClassified:
             classes[delta.object] = delta
-        elif type(delta) is ObjectEstimated:
+        elif type(delta) is d.ObjectEstimated:
             estimates[delta.object] = delta
         else:
             others.append(delta)

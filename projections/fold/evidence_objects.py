@@ -33,20 +33,8 @@ from typing import NamedTuple, TypeAlias
 from eventsrc.envelope.model import DetId, Offset
 
 from . import State, part, prefixed
+from . import deltas as d
 from .agreement import Agreement, Slopes
-from .deltas import (
-    MergeEvidence,
-    ObjectClassified,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectOrdinal,
-    ObjectRelocated,
-    ObjectSeen,
-    ObjectsMerged,
-    ObservationOrdinal,
-    Pose,
-    RunOrdinal,
-)
 from .evidence import EvidenceConstants
 from .evidence_matching import Matching
 from .evidence_merging import Merging, turned_looks
@@ -61,7 +49,12 @@ from .thing_index import ThingIndex
 from .things import FusedThing, LabelCounts
 
 ObjectDelta: TypeAlias = (
-    ObjectFound | ObjectSeen | ObjectsMerged | ObjectRelocated | ObjectClassified | ObjectEstimated
+    d.ObjectFound
+    | d.ObjectSeen
+    | d.ObjectsMerged
+    | d.ObjectRelocated
+    | d.ObjectClassified
+    | d.ObjectEstimated
 )
 _SURE = 0.85
 
@@ -70,9 +63,9 @@ class MovedObject(NamedTuple):
     """The Object ``old`` stands where ``new`` was found, by ``observation``; ``look`` is the
     log-likelihood ratio of their looks."""
 
-    old: ObjectOrdinal
-    new: ObjectOrdinal
-    observation: ObservationOrdinal
+    old: d.ObjectOrdinal
+    new: d.ObjectOrdinal
+    observation: d.ObservationOrdinal
     look: float
 
 
@@ -89,7 +82,7 @@ class EvidenceObjects:
         self._slopes = Slopes()
         self._labels = LabelCounts()
         self._index = ThingIndex(constants)
-        self._object_of: dict[int, ObjectOrdinal] = {}  # group → its Object
+        self._object_of: dict[int, d.ObjectOrdinal] = {}  # group → its Object
         self._matching = Matching(
             Agreement(constants.range_m, constants.range_spread, self._index.reach_m),
             self._index,
@@ -104,9 +97,9 @@ class EvidenceObjects:
     def fold(
         self,
         offset: Offset,
-        run: RunOrdinal,
+        run: d.RunOrdinal,
         timestamp: float,
-        pose: Pose,
+        pose: d.Pose,
         camera: CameraConstants,
         sightings: Sequence[Sighting],
         error: PoseError | None = None,
@@ -124,9 +117,9 @@ class EvidenceObjects:
             run, pose, labels, looks, inverses, sights, sightings, self._object_of
         )
         deltas: list[ObjectDelta] = []
-        seen: list[ObjectOrdinal] = []
-        named: dict[ObjectOrdinal, str] = {}  # the classes before
-        to_unite: list[tuple[ObjectOrdinal, ObjectOrdinal]] = []
+        seen: list[d.ObjectOrdinal] = []
+        named: dict[d.ObjectOrdinal, str] = {}  # the classes before
+        to_unite: list[tuple[d.ObjectOrdinal, d.ObjectOrdinal]] = []
         index, groups, group, own = self._index, self._groups, None, None
         for k, sighting in enumerate(sightings):
             wanted, cosine, share = chosen[k]
@@ -151,7 +144,7 @@ class EvidenceObjects:
             index.solve(ordinal, thing, spot)
             seen.append(ordinal)
             deltas.append(
-                ObjectSeen(
+                d.ObjectSeen(
                     offset,
                     ordinal,
                     sighting.observation,
@@ -189,19 +182,21 @@ class EvidenceObjects:
         for ordinal in ascending:
             class_name = index.thing(ordinal).class_name
             if class_name != named[ordinal]:
-                deltas.append(ObjectClassified(offset, ordinal, class_name))
+                deltas.append(d.ObjectClassified(offset, ordinal, class_name))
         deltas += [index.estimated(offset, ordinal) for ordinal in ascending]
         return deltas
 
-    def class_of(self, ordinal: ObjectOrdinal) -> str:
+    def class_of(self, ordinal: d.ObjectOrdinal) -> str:
         """The class of most of an Object's observations."""
         return self._index.thing(ordinal).class_name
 
-    def observations_of(self, ordinal: ObjectOrdinal) -> int:
+    def observations_of(self, ordinal: d.ObjectOrdinal) -> int:
         """How many observations an Object has."""
         return self._index.thing(ordinal).count
 
-    def compare(self, one: ObjectOrdinal, others: Sequence[ObjectOrdinal]) -> list[float | None]:
+    def compare(
+        self, one: d.ObjectOrdinal, others: Sequence[d.ObjectOrdinal]
+    ) -> list[float | None]:
         """The log-likelihood ratio of the looks of an Object and of each of several others,
         whatever their headings (`turned_looks`); None where a command keeps them apart, or one of
         them has no look."""
@@ -222,7 +217,7 @@ class EvidenceObjects:
         thing, later = self._index.thing(moved.old), self._index.thing(moved.new)
         before, after = thing.where()[:2], later.where()[:2]
         dx, dy = after[0] - before[0], after[1] - before[1]
-        evidence = MergeEvidence(
+        evidence = d.MergeEvidence(
             round(moved.look * 1000.0),
             0,
             round(math.sqrt(dx * dx + dy * dy) * 1e6),
@@ -235,10 +230,10 @@ class EvidenceObjects:
         places = [round(number * 1e6) for number in (*before, *after)]
         deltas: list[ObjectDelta] = [
             merged,
-            ObjectRelocated(offset, moved.old, moved.observation, *places),
+            d.ObjectRelocated(offset, moved.old, moved.observation, *places),
         ]
         if thing.class_name != class_name:
-            deltas.append(ObjectClassified(offset, moved.old, thing.class_name))
+            deltas.append(d.ObjectClassified(offset, moved.old, thing.class_name))
         return [*deltas, self._index.estimated(offset, moved.old)]
 
     def dump(self) -> State:
@@ -253,15 +248,15 @@ class EvidenceObjects:
 
     def load(self, state: State) -> None:
         """Restore the state of `dump`."""
-        self._object_of = {group: ObjectOrdinal(ordinal) for group, ordinal in state["object_of"]}
+        self._object_of = {group: d.ObjectOrdinal(ordinal) for group, ordinal in state["object_of"]}
         self._scale.load(part("scale", state))
         self._slopes.load(part("slopes", state))
         self._labels.load(part("labels", state))
         self._index.load(part("things", state))
 
     def _allowed(
-        self, group: int, own: ObjectOrdinal | None, wanted: ObjectOrdinal | None
-    ) -> ObjectOrdinal | None:
+        self, group: int, own: d.ObjectOrdinal | None, wanted: d.ObjectOrdinal | None
+    ) -> d.ObjectOrdinal | None:
         """The wanted Object, unless a command keeps it apart; then the group's own one, if any."""
         if self._groups is None or wanted is None:
             return own
@@ -270,24 +265,24 @@ class EvidenceObjects:
         return own if wanted != own and self._groups.are_apart(inside, others) else wanted
 
     def _found(
-        self, offset: Offset, sighting: Sighting, pose: Pose, timestamp: float
-    ) -> tuple[ObjectOrdinal, ObjectFound]:
+        self, offset: Offset, sighting: Sighting, pose: d.Pose, timestamp: float
+    ) -> tuple[d.ObjectOrdinal, d.ObjectFound]:
         """Found an Object."""
         label, times = sighting.class_name, (timestamp, timestamp)
         thing = FusedThing(1, pose.x_um, pose.y_um, *times, label, {label: 1}, Spots())
         ordinal = self._index.add(thing)
         identity = object_id(sighting.det_id)
-        return ordinal, ObjectFound(offset, ordinal, identity, label, sighting.observation)
+        return ordinal, d.ObjectFound(offset, ordinal, identity, label, sighting.observation)
 
     def _unite(
         self,
         offset: Offset,
-        one: ObjectOrdinal,
-        other: ObjectOrdinal,
-        changed: set[ObjectOrdinal],
-        named: dict[ObjectOrdinal, str],
-        evidence: MergeEvidence | None,
-    ) -> ObjectsMerged:
+        one: d.ObjectOrdinal,
+        other: d.ObjectOrdinal,
+        changed: set[d.ObjectOrdinal],
+        named: dict[d.ObjectOrdinal, str],
+        evidence: d.MergeEvidence | None,
+    ) -> d.ObjectsMerged:
         """Merge two Objects; the one founded first survives."""
         survivor, absorbed = min(one, other), max(one, other)
         moved = self._index.thing(absorbed).groups
@@ -297,7 +292,7 @@ class EvidenceObjects:
         changed.discard(absorbed)
         changed.add(survivor)
         thing = self._index.thing(survivor)
-        return ObjectsMerged(
+        return d.ObjectsMerged(
             offset,
             survivor,
             absorbed,
@@ -310,7 +305,7 @@ class EvidenceObjects:
         )
 
 
-def _similarity(wanted: ObjectOrdinal | None, cosine: float | None) -> int | None:
+def _similarity(wanted: d.ObjectOrdinal | None, cosine: float | None) -> int | None:
     """The similarity of an observation that has a look, as in `ObjectSeen`."""
     if wanted is None:
         return Q40
@@ -318,7 +313,7 @@ def _similarity(wanted: ObjectOrdinal | None, cosine: float | None) -> int | Non
 
 
 def _count(
-    thing: FusedThing, ordinal: ObjectOrdinal, label: str, pose: Pose, timestamp: float
+    thing: FusedThing, ordinal: d.ObjectOrdinal, label: str, pose: d.Pose, timestamp: float
 ) -> None:
     """Add an observation to an Object's sums."""
     if thing.count >= MAX_IN_A_SUM:

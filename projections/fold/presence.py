@@ -29,17 +29,7 @@ import numpy as np
 from eventsrc.envelope.model import Offset
 
 from . import State
-from .deltas import (
-    Delta,
-    ObjectEstimated,
-    ObjectFound,
-    ObjectMissing,
-    ObjectOrdinal,
-    ObjectSeen,
-    ObjectsMerged,
-    Pose,
-    RunOrdinal,
-)
+from . import deltas as d
 from .exact import cos_sin
 from .settings import CameraConstants
 from .sights import half_field
@@ -73,11 +63,11 @@ class Attendance:
     ``seen`` the last that saw it. ``estimate`` is its position, metres, and the entries xx, xy, yy
     of the covariance, m². ``looks`` are hits and misses by cell in ``looks_run``."""
 
-    home: RunOrdinal
-    run: RunOrdinal
-    confirmed: RunOrdinal
-    seen: RunOrdinal
-    looks_run: RunOrdinal
+    home: d.RunOrdinal
+    run: d.RunOrdinal
+    confirmed: d.RunOrdinal
+    seen: d.RunOrdinal
+    looks_run: d.RunOrdinal
     estimate: tuple[float, ...] = (0.0,) * 5
     hits: int = 0
     misses: int = 0
@@ -87,7 +77,7 @@ class Attendance:
     looks: dict[_Cell, list[int]] = field(default_factory=dict)
     cells: set[_Cell] = field(default_factory=set)
 
-    def weight(self, run: RunOrdinal, cell: _Cell, is_hit: bool) -> int:
+    def weight(self, run: d.RunOrdinal, cell: _Cell, is_hit: bool) -> int:
         """Count a look from a cell and return its weight, in halves of a look."""
         if run != self.looks_run:
             self.looks_run = run
@@ -98,7 +88,7 @@ class Attendance:
             counts[is_hit] = before + 1
         return _WEIGHTS[before]
 
-    def enter(self, run: RunOrdinal) -> None:
+    def enter(self, run: d.RunOrdinal) -> None:
         """Begin a run, unless it is the current one. Odds above 1 are reset to 1."""
         if run != self.run:
             if self.odds >= 1.0:
@@ -111,20 +101,20 @@ class Presence:
     whose odds the last keyframe has lowered."""
 
     def __init__(self) -> None:
-        self.attendance: dict[ObjectOrdinal, Attendance] = {}
-        self.missed: list[ObjectOrdinal] = []
+        self.attendance: dict[d.ObjectOrdinal, Attendance] = {}
+        self.missed: list[d.ObjectOrdinal] = []
         # cell → Object → the first pose in it, or next to it, that the Object was seen from
-        self._vantages: dict[_Cell, dict[ObjectOrdinal, tuple[float, float]]] = {}
+        self._vantages: dict[_Cell, dict[d.ObjectOrdinal, tuple[float, float]]] = {}
         self._hits, self._misses = 0, 0
 
     def fold(
         self,
         offset: Offset,
-        run: RunOrdinal,
-        pose: Pose,
+        run: d.RunOrdinal,
+        pose: d.Pose,
         camera: CameraConstants,
-        fused: Iterable[Delta],
-    ) -> list[ObjectMissing]:
+        fused: Iterable[d.Delta],
+    ) -> list[d.ObjectMissing]:
         """Look for all Objects that this keyframe should see; ``fused`` are the deltas of fusion.
 
         One delta for each Object that is missing now or no longer is, ascending.
@@ -142,12 +132,12 @@ class Presence:
                     changed.append(ordinal)
             self._add_vantage(ordinal, known, pose)
         return [
-            ObjectMissing(offset, ordinal, run, known.run_misses, known.is_missing)
+            d.ObjectMissing(offset, ordinal, run, known.run_misses, known.is_missing)
             for ordinal in sorted(changed)
             for known in (self.attendance[ordinal],)
         ]
 
-    def relocate(self, old: ObjectOrdinal, new: ObjectOrdinal) -> None:
+    def relocate(self, old: d.ObjectOrdinal, new: d.ObjectOrdinal) -> None:
         """Forget the vantages of ``old``, which was relocated to where ``new``, now absorbed, was
         found."""
         self._unlist(old)
@@ -195,27 +185,27 @@ class Presence:
         for (column, row, ordinal), at in zip(state["cells"], state["poses"].tolist(), strict=True):
             self._list(ordinal, (column, row), (at[0], at[1]))
 
-    def _apply(self, run: RunOrdinal, fused: Iterable[Delta]) -> list[ObjectOrdinal]:
+    def _apply(self, run: d.RunOrdinal, fused: Iterable[d.Delta]) -> list[d.ObjectOrdinal]:
         """Apply estimates and merges; returns the Objects seen, ascending."""
-        attendance, seen = self.attendance, set[ObjectOrdinal]()
+        attendance, seen = self.attendance, set[d.ObjectOrdinal]()
         for delta in fused:
-            if type(delta) is ObjectSeen:
+            if type(delta) is d.ObjectSeen:
                 seen.add(delta.object)
-            elif type(delta) is ObjectEstimated:
+            elif type(delta) is d.ObjectEstimated:
                 attendance[delta.object].estimate = (
                     *(delta.x_um / 1e6, delta.y_um / 1e6),
                     *(delta.var_xx_um2 / 1e12, delta.var_xy_um2 / 1e12, delta.var_yy_um2 / 1e12),
                 )
-            elif type(delta) is ObjectFound:
+            elif type(delta) is d.ObjectFound:
                 attendance[delta.object] = Attendance(run, run, run, run, run)
-            elif type(delta) is ObjectsMerged:
+            elif type(delta) is d.ObjectsMerged:
                 self._merge(delta.survivor, delta.absorbed)
                 if delta.absorbed in seen:
                     seen.remove(delta.absorbed)
                     seen.add(delta.survivor)
         return sorted(seen)
 
-    def _merge(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
+    def _merge(self, survivor: d.ObjectOrdinal, absorbed: d.ObjectOrdinal) -> None:
         """Add up hits, misses and vantages. An Object was there in the runs that found either
         part."""
         known, other = self.attendance[survivor], self.attendance[absorbed]
@@ -229,15 +219,19 @@ class Presence:
         del self.attendance[absorbed]
 
     def _look(
-        self, run: RunOrdinal, pose: Pose, camera: CameraConstants, seen: Sequence[ObjectOrdinal]
-    ) -> list[ObjectOrdinal]:
+        self,
+        run: d.RunOrdinal,
+        pose: d.Pose,
+        camera: CameraConstants,
+        seen: Sequence[d.ObjectOrdinal],
+    ) -> list[d.ObjectOrdinal]:
         """Count hits and misses; returns the Objects that became missing."""
         self.missed = []
         cell = pose.x_um // _CELL_UM, pose.y_um // _CELL_UM
         near = self._vantages.get(cell)
         if not near:
             return []
-        missing: list[ObjectOrdinal] = []
+        missing: list[d.ObjectOrdinal] = []
         x, y = pose.x_um / 1e6, pose.y_um / 1e6
         cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
         half_cos, half_sin = half_field(camera.hfov_deg)
@@ -281,7 +275,7 @@ class Presence:
         self.missed.sort()
         return missing
 
-    def _add_vantage(self, ordinal: ObjectOrdinal, known: Attendance, pose: Pose) -> None:
+    def _add_vantage(self, ordinal: d.ObjectOrdinal, known: Attendance, pose: d.Pose) -> None:
         """Enter the pose in its cell and the three that are next to it."""
         left = (pose.x_um - _CELL_UM // 2) // _CELL_UM
         below = (pose.y_um - _CELL_UM // 2) // _CELL_UM
@@ -290,11 +284,11 @@ class Presence:
                 if (column, row) not in known.cells:
                     self._list(ordinal, (column, row), (pose.x_um / 1e6, pose.y_um / 1e6))
 
-    def _list(self, ordinal: ObjectOrdinal, cell: _Cell, at: tuple[float, float]) -> None:
+    def _list(self, ordinal: d.ObjectOrdinal, cell: _Cell, at: tuple[float, float]) -> None:
         self.attendance[ordinal].cells.add(cell)
         self._vantages.setdefault(cell, {})[ordinal] = at
 
-    def _unlist(self, ordinal: ObjectOrdinal, heir: ObjectOrdinal | None = None) -> None:
+    def _unlist(self, ordinal: d.ObjectOrdinal, heir: d.ObjectOrdinal | None = None) -> None:
         """Remove an Object's vantages; ``heir`` gets those in cells where it has none."""
         known = self.attendance[ordinal]
         for cell in known.cells:
@@ -306,7 +300,7 @@ class Presence:
         known.cells = set()
 
 
-def would_see(pose: Pose, camera: CameraConstants, at: Metres, vantage: Metres) -> bool:
+def would_see(pose: d.Pose, camera: CameraConstants, at: Metres, vantage: Metres) -> bool:
     """Whether a keyframe looks for a thing that was seen from another one, a vantage."""
     cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
     half_cos, half_sin = half_field(camera.hfov_deg)

@@ -30,19 +30,8 @@ import numpy as np
 from eventsrc.envelope.model import KeyframeId, Offset
 
 from . import State, packed
+from . import deltas as d
 from .corrections import Keyframe, PlaceName
-from .deltas import (
-    Delta,
-    KeyframeOrdinal,
-    KeyframePlaced,
-    ObjectMoved,
-    ObjectOrdinal,
-    PlaceNamed,
-    PlaceOrdinal,
-    PlacesLinked,
-    PlacesMerged,
-    RunOrdinal,
-)
 from .pair_groups import ObjectSurvivors, PlaceSurvivors
 from .standing import Standing
 
@@ -56,8 +45,8 @@ class PlaceNames:
     def __init__(self, names: Sequence[PlaceName]) -> None:
         self.names = names
         self.newest = {name.anchor: index for index, name in enumerate(names)}
-        self.given: dict[PlaceOrdinal, int] = {}
-        self._anchors: dict[KeyframeOrdinal, int] = {}
+        self.given: dict[d.PlaceOrdinal, int] = {}
+        self._anchors: dict[d.KeyframeOrdinal, int] = {}
 
     def followed_by(self, names: Sequence[PlaceName]) -> "PlaceNames":
         """These names and more, which come after them; `add_anchor` and `give` are still to be
@@ -68,21 +57,21 @@ class PlaceNames:
         more.newest = self.newest | {name.anchor: index for index, name in new}
         return more
 
-    def add_anchor(self, keyframe: KeyframeOrdinal, anchor: Keyframe) -> None:
+    def add_anchor(self, keyframe: d.KeyframeOrdinal, anchor: Keyframe) -> None:
         """Register a keyframe as an anchor, if it is one."""
         index = self.newest.get(anchor)
         if index is not None:
             self._anchors[keyframe] = index
 
-    def fold(self, offset: Offset, changes: Iterable[Delta]) -> list[PlaceNamed]:
+    def fold(self, offset: Offset, changes: Iterable[d.Delta]) -> list[d.PlaceNamed]:
         """Apply an event's changes of places and return the resulting names, by place."""
-        given, before = self.given, dict[PlaceOrdinal, int | None]()
+        given, before = self.given, dict[d.PlaceOrdinal, int | None]()
         for delta in changes:
-            if type(delta) is PlacesMerged:
+            if type(delta) is d.PlacesMerged:
                 for place in delta.absorbed:
                     if place in given:
                         self._give(delta.survivor, given.pop(place), before)
-            elif type(delta) is KeyframePlaced and delta.keyframe in self._anchors:
+            elif type(delta) is d.KeyframePlaced and delta.keyframe in self._anchors:
                 self._give(delta.place, self._anchors[delta.keyframe], before)
         return [
             self.named(offset, place)
@@ -90,7 +79,7 @@ class PlaceNames:
             if place in given and given[place] != before[place]
         ]
 
-    def changes_from(self, older: "PlaceNames", offset: Offset) -> list[PlaceNamed]:
+    def changes_from(self, older: "PlaceNames", offset: Offset) -> list[d.PlaceNamed]:
         """The deltas, by place, of replacing the names of ``older`` by these."""
         named = []
         for place in sorted(self.given.keys() | older.given.keys()):
@@ -99,25 +88,25 @@ class PlaceNames:
                 named.append(now)
         return named
 
-    def give(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
+    def give(self, keyframe: d.KeyframeOrdinal, place: d.PlaceOrdinal) -> None:
         """Give a place the name of an anchor in it."""
         self._give(place, self._anchors[keyframe], {})
 
     def _give(
-        self, place: PlaceOrdinal, index: int, before: dict[PlaceOrdinal, int | None]
+        self, place: d.PlaceOrdinal, index: int, before: dict[d.PlaceOrdinal, int | None]
     ) -> None:
         now = self.given.get(place)
         before.setdefault(place, now)
         if now is None or index > now:
             self.given[place] = index
 
-    def named(self, offset: Offset, place: PlaceOrdinal) -> PlaceNamed:
+    def named(self, offset: Offset, place: d.PlaceOrdinal) -> d.PlaceNamed:
         """A place's name as a delta."""
         index = self.given.get(place)
         if index is None:
-            return PlaceNamed(offset, place, None, None)
+            return d.PlaceNamed(offset, place, None, None)
         name = self.names[index]
-        return PlaceNamed(offset, place, name.name, name.offset)
+        return d.PlaceNamed(offset, place, name.name, name.offset)
 
 
 class LocatedIn:
@@ -126,16 +115,16 @@ class LocatedIn:
 
     def __init__(self, standing: Standing) -> None:
         self._standing = standing
-        self.votes: list[dict[PlaceOrdinal, int]] = []  # per Object: place → observations there
-        self.located: list[PlaceOrdinal | None] = []  # per Object
+        self.votes: list[dict[d.PlaceOrdinal, int]] = []  # per Object: place → observations there
+        self.located: list[d.PlaceOrdinal | None] = []  # per Object
         # place → Objects with votes there
-        self.voters: dict[PlaceOrdinal, dict[ObjectOrdinal, None]] = {}
+        self.voters: dict[d.PlaceOrdinal, dict[d.ObjectOrdinal, None]] = {}
         # keyframe without a place → Objects it saw
-        self.waiting: dict[KeyframeOrdinal, list[ObjectOrdinal]] = {}
+        self.waiting: dict[d.KeyframeOrdinal, list[d.ObjectOrdinal]] = {}
         self.survivors = ObjectSurvivors()
-        self._touched: dict[ObjectOrdinal, None] = {}
+        self._touched: dict[d.ObjectOrdinal, None] = {}
 
-    def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
+    def places_merged(self, survivor: d.PlaceOrdinal, absorbed: tuple[d.PlaceOrdinal, ...]) -> None:
         """Count the votes for absorbed places for the survivor."""
         for place in absorbed:
             self._touched.update(self._standing.place_absorbed(survivor, place))
@@ -147,7 +136,7 @@ class LocatedIn:
             if voters:
                 self.voters.setdefault(survivor, {}).update(voters)
 
-    def objects_merged(self, survivor: ObjectOrdinal, absorbed: ObjectOrdinal) -> None:
+    def objects_merged(self, survivor: d.ObjectOrdinal, absorbed: d.ObjectOrdinal) -> None:
         """Count the absorbed Object's votes, later ones too, for the survivor."""
         self.survivors.merge(survivor, (absorbed,))
         votes, others = self.votes[survivor], self.votes[absorbed]
@@ -160,13 +149,13 @@ class LocatedIn:
         if others:
             self._touched[survivor] = None
 
-    def keyframe_placed(self, keyframe: KeyframeOrdinal, place: PlaceOrdinal) -> None:
+    def keyframe_placed(self, keyframe: d.KeyframeOrdinal, place: d.PlaceOrdinal) -> None:
         """Count the votes of the Objects seen by a keyframe that had no place until now."""
         for ordinal in self.waiting.pop(keyframe, ()):
             self._vote(self.survivors.find(ordinal), place)
 
     def object_seen(
-        self, ordinal: ObjectOrdinal, keyframe: KeyframeOrdinal, place: PlaceOrdinal | None
+        self, ordinal: d.ObjectOrdinal, keyframe: d.KeyframeOrdinal, place: d.PlaceOrdinal | None
     ) -> None:
         """Count a vote of an Object observed from a keyframe that is in ``place``, or so far in
         none."""
@@ -178,7 +167,7 @@ class LocatedIn:
         else:
             self._vote(ordinal, place)
 
-    def object_left(self, ordinal: ObjectOrdinal) -> None:
+    def object_left(self, ordinal: d.ObjectOrdinal) -> None:
         """Drop the votes of an Object that was relocated, also pending ones of earlier
         keyframes."""
         for voted in self.votes[ordinal]:
@@ -196,7 +185,7 @@ class LocatedIn:
         """Decide where Objects stand whose estimate, or whose surroundings, changed."""
         self._touched.update(dict.fromkeys(self._standing.decide()))
 
-    def collect_moves(self, offset: Offset) -> list[ObjectMoved]:
+    def collect_moves(self, offset: Offset) -> list[d.ObjectMoved]:
         """Recount the Objects whose votes changed; returns those that moved, ascending."""
         if not self._touched:
             return []
@@ -207,7 +196,7 @@ class LocatedIn:
                 place = _winner(self.votes[ordinal])
             if place != self.located[ordinal]:
                 self.located[ordinal] = place
-                moved.append(ObjectMoved(offset, ordinal, place))
+                moved.append(d.ObjectMoved(offset, ordinal, place))
         self._touched.clear()
         return moved
 
@@ -229,9 +218,9 @@ class LocatedIn:
         self.waiting = dict(state["waiting"])
         for ordinal, votes in enumerate(self.votes):
             for place in votes:
-                self.voters.setdefault(place, {})[ObjectOrdinal(ordinal)] = None
+                self.voters.setdefault(place, {})[d.ObjectOrdinal(ordinal)] = None
 
-    def _vote(self, ordinal: ObjectOrdinal, place: PlaceOrdinal) -> None:
+    def _vote(self, ordinal: d.ObjectOrdinal, place: d.PlaceOrdinal) -> None:
         votes = self.votes[ordinal]
         before = votes.get(place, 0)
         votes[place] = before + 1
@@ -241,7 +230,7 @@ class LocatedIn:
         self._touched[ordinal] = None
 
 
-def _winner(votes: dict[PlaceOrdinal, int]) -> PlaceOrdinal | None:
+def _winner(votes: dict[d.PlaceOrdinal, int]) -> d.PlaceOrdinal | None:
     if len(votes) == 1:
         return next(iter(votes))
     return min(votes, key=lambda place: (-votes[place], place), default=None)
@@ -260,14 +249,16 @@ class SortedKeys:
 
     __slots__ = ("_blocks", "_firsts")
 
-    def __init__(self, keys: Iterable[int] = (), labels: Iterable[PlaceOrdinal] = ()) -> None:
+    def __init__(self, keys: Iterable[int] = (), labels: Iterable[d.PlaceOrdinal] = ()) -> None:
         """From ascending keys and their labels."""
         self._firsts: list[int] = []
-        self._blocks: list[tuple[array[int], MutableSequence[PlaceOrdinal]]] = []
+        self._blocks: list[tuple[array[int], MutableSequence[d.PlaceOrdinal]]] = []
         for key, label in zip(keys, labels, strict=True):
             self.add(key, label)
 
-    def add(self, key: int, label: PlaceOrdinal) -> tuple[PlaceOrdinal | None, PlaceOrdinal | None]:
+    def add(
+        self, key: int, label: d.PlaceOrdinal
+    ) -> tuple[d.PlaceOrdinal | None, d.PlaceOrdinal | None]:
         """Add a new key and return the labels of the keys just before and after it, None at the
         ends."""
         blocks = self._blocks
@@ -284,7 +275,7 @@ class SortedKeys:
         keys, labels = blocks[block]
         at = bisect_right(keys, key)
         earlier = labels[at - 1] if at else blocks[block - 1][1][-1] if block else None
-        after: PlaceOrdinal | None = None
+        after: d.PlaceOrdinal | None = None
         if at < len(keys):
             after = labels[at]
         elif block + 1 < len(blocks):
@@ -298,7 +289,7 @@ class SortedKeys:
             self._firsts.insert(block + 1, keys[cut])
         return earlier, after
 
-    def items(self) -> Iterator[tuple[int, PlaceOrdinal]]:
+    def items(self) -> Iterator[tuple[int, d.PlaceOrdinal]]:
         """All keys, ascending, and their labels."""
         for keys, labels in self._blocks:
             yield from zip(keys, labels, strict=True)
@@ -309,14 +300,14 @@ class Adjacency:
     `collect_changes`."""
 
     def __init__(self) -> None:
-        self.placed: dict[RunOrdinal, SortedKeys] = {}  # keyframe_id → place it joined
+        self.placed: dict[d.RunOrdinal, SortedKeys] = {}  # keyframe_id → place it joined
         self.survivors = PlaceSurvivors()
         # place → place → transitions, both ways round
-        self.edges: dict[PlaceOrdinal, dict[PlaceOrdinal, int]] = {}
+        self.edges: dict[d.PlaceOrdinal, dict[d.PlaceOrdinal, int]] = {}
         # changed edges, as they were
-        self._before: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
+        self._before: dict[tuple[d.PlaceOrdinal, d.PlaceOrdinal], int] = {}
 
-    def places_merged(self, survivor: PlaceOrdinal, absorbed: tuple[PlaceOrdinal, ...]) -> None:
+    def places_merged(self, survivor: d.PlaceOrdinal, absorbed: tuple[d.PlaceOrdinal, ...]) -> None:
         """Count the transitions of absorbed places for the survivor."""
         self.survivors.merge(survivor, absorbed)
         for place in absorbed:
@@ -327,7 +318,7 @@ class Adjacency:
             self.edges.pop(place, None)
 
     def keyframe_placed(
-        self, run: RunOrdinal, keyframe_id: KeyframeId, place: PlaceOrdinal
+        self, run: d.RunOrdinal, keyframe_id: KeyframeId, place: d.PlaceOrdinal
     ) -> None:
         """Count the transitions of a keyframe that had no place until now."""
         placed = self.placed.get(run)
@@ -344,7 +335,7 @@ class Adjacency:
         if after != place:
             self._add(place, after, 1)
 
-    def collect_changes(self, offset: Offset) -> list[PlacesLinked]:
+    def collect_changes(self, offset: Offset) -> list[d.PlacesLinked]:
         """The edges whose count changed since the last call, ascending."""
         if not self._before:
             return []
@@ -352,7 +343,7 @@ class Adjacency:
         for (a, b), before in sorted(self._before.items()):
             count = self.edges.get(a, {}).get(b, 0)
             if count != before:
-                linked.append(PlacesLinked(offset, a, b, count))
+                linked.append(d.PlacesLinked(offset, a, b, count))
         self._before.clear()
         return linked
 
@@ -383,7 +374,7 @@ class Adjacency:
             self.edges.setdefault(a, {})[b] = transitions
             self.edges.setdefault(b, {})[a] = transitions
 
-    def _add(self, a: PlaceOrdinal, b: PlaceOrdinal, change: int) -> None:
+    def _add(self, a: d.PlaceOrdinal, b: d.PlaceOrdinal, change: int) -> None:
         count = self.edges.get(a, {}).get(b, 0)
         self._before.setdefault((a, b) if a < b else (b, a), count)
         for one, other in ((a, b), (b, a)):

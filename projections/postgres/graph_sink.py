@@ -19,26 +19,10 @@ from projections.fold.map_errors import DatabaseError
 from projections.map.changes import BatchChanges
 from projections.map.view import MapView
 
-from . import map_table, replaced_tables
+from . import labels, map_table, replaced_tables
 from .connection import Connection, describe_connection, ensure_extension, statements
 from .cypher import PARENTS, add_policies, policies_apply
 from .graph_rows import GraphRows, Row, changed_rows, changing_rows, fixed_rows
-from .labels import (
-    CHANGING_EDGES,
-    COUNT_KEYS,
-    EDGE_LABELS,
-    GRAPH,
-    KEYS,
-    LABEL_IDS,
-    LABELS,
-    MAP_TABLE,
-    MATCHED,
-    NEXT_GRAPH,
-    OLD_GRAPH,
-    VERTEX_LABELS,
-    Label,
-    SinkName,
-)
 from .loader import Load, copy_to_graph, graph_statement, insert_into_graph, unnest_columns
 from .map_table import MapRow, map_rows
 from .replaced_tables import (
@@ -49,10 +33,10 @@ from .replaced_tables import (
 )
 from .sink import PreparedWrite
 
-EARLY: Final[frozenset[Label]] = frozenset({"Observation"})
+EARLY: Final[frozenset[labels.Label]] = frozenset({"Observation"})
 """Labels that a rebuild indexes before it writes them. That costs the server more than indexing
 afterwards, but the server has the time while the fold goes on."""
-LATE: Final = frozenset(LABELS) - EARLY
+LATE: Final = frozenset(labels.LABELS) - EARLY
 SMALL_BATCH: Final = 200
 """Below this many rows an INSERT, sent down the pipeline, beats COPY's extra round trips."""
 _MARK: Final = "mapfold"
@@ -61,20 +45,20 @@ _MARK: Final = "mapfold"
 class GraphSink:
     """Implements `Sink` for the graph ``semantic_map``."""
 
-    name: Final[SinkName] = "graph"
+    name: Final[labels.SinkName] = "graph"
 
     def ensure(self, connection: Connection) -> bool:
         """Create an empty graph if there is none, or one without labels."""
         ensure_extension(connection, "age")
-        _adopt_if_empty(connection, GRAPH)
-        if not graph_exists(connection, GRAPH):
-            create_graph(connection, GRAPH)
-        elif _is_bare(connection, GRAPH):
-            _add_labels(connection, GRAPH)
+        _adopt_if_empty(connection, labels.GRAPH)
+        if not graph_exists(connection, labels.GRAPH):
+            create_graph(connection, labels.GRAPH)
+        elif _is_bare(connection, labels.GRAPH):
+            _add_labels(connection, labels.GRAPH)
         else:
             map_table.refuse_missing(connection)
             return False
-        index_graph(connection, GRAPH)
+        index_graph(connection, labels.GRAPH)
         map_table.ensure(connection)
         map_table.replace(connection, [])
         return True
@@ -96,13 +80,13 @@ class GraphSink:
         copies = not is_small and not policies_apply(connection)
         load_of = copy_to_graph if copies else insert_into_graph
         for label, inserted in rows.inserted.items():
-            load_of(GRAPH, label, inserted)(connection)
+            load_of(labels.GRAPH, label, inserted)(connection)
         for label, upserted in rows.upserted.items():
-            kind = "upsert_vertex" if label in VERTEX_LABELS else "upsert_edge"
-            unnest_columns(kind, GRAPH, label, upserted)(connection)
+            kind = "upsert_vertex" if label in labels.VERTEX_LABELS else "upsert_edge"
+            unnest_columns(kind, labels.GRAPH, label, upserted)(connection)
         for label, replaced in rows.replaced.items():
             _delete(connection, label, [int(row[1]) for row in replaced], "delete_from")
-            insert_into_graph(GRAPH, label, replaced)(connection)
+            insert_into_graph(labels.GRAPH, label, replaced)(connection)
         for label, ids in rows.deleted.items():
             _delete(connection, label, ids)
         if maps is not None:
@@ -117,10 +101,10 @@ class GraphSink:
         """
         ensure_extension(connection, "age")
         with connection.transaction():
-            _adopt_if_empty(connection, GRAPH)
-            graph_exists(connection, GRAPH)
+            _adopt_if_empty(connection, labels.GRAPH)
+            graph_exists(connection, labels.GRAPH)
         if try_drop_lock(connection, self.name):
-            for graph in (OLD_GRAPH, NEXT_GRAPH):
+            for graph in (labels.OLD_GRAPH, labels.NEXT_GRAPH):
                 with connection.transaction():
                     drop_graph(connection, graph)
 
@@ -131,7 +115,7 @@ class GraphSink:
     def drop_replaced(self, connection: Connection) -> None:
         """Drop the replaced graph once its last reader has ended."""
         if wait_for_earlier_transactions(connection) and try_drop_lock(connection, self.name):
-            _drop_in_background(connection, OLD_GRAPH)
+            _drop_in_background(connection, labels.OLD_GRAPH)
 
 
 class GraphShadow:
@@ -139,8 +123,8 @@ class GraphShadow:
 
     def create(self, connection: Connection) -> None:
         """Create an empty graph and its early indexes."""
-        create_graph(connection, NEXT_GRAPH)
-        index_graph(connection, NEXT_GRAPH, EARLY)
+        create_graph(connection, labels.NEXT_GRAPH)
+        index_graph(connection, labels.NEXT_GRAPH, EARLY)
 
     def load(self, changes: BatchChanges, view: MapView) -> Load:
         """Returns a function that writes the fixed rows of new keyframes and observations."""
@@ -150,31 +134,31 @@ class GraphShadow:
         """Returns a function that writes the changing rows, builds the other indexes and compares
         numbers by label."""
         load, maps, counts = self._load(changing_rows(view)), map_rows(view), view.counts()
-        expected = {label: counts[COUNT_KEYS[label]] for label in LABELS}
+        expected = {label: counts[labels.COUNT_KEYS[label]] for label in labels.LABELS}
 
         def finish(connection: Connection) -> Mapping[str, int]:
             load(connection)
             map_table.ensure(connection)
             map_table.replace(connection, maps)
-            index_graph(connection, NEXT_GRAPH, LATE)
-            analyze_graph(connection, NEXT_GRAPH)
+            index_graph(connection, labels.NEXT_GRAPH, LATE)
+            analyze_graph(connection, labels.NEXT_GRAPH)
             found = _compared(connection, expected)
-            return {**found, MAP_TABLE: len(maps)} if maps else found
+            return {**found, labels.MAP_TABLE: len(maps)} if maps else found
 
         return finish
 
     def lock_readers(self, connection: Connection) -> None:
         """Keep readers away from the graph."""
         wait_for_drop(connection, GraphSink.name)
-        _lock(connection, GRAPH)
+        _lock(connection, labels.GRAPH)
 
     def swap_in(self, connection: Connection) -> None:
         """Put the shadow in the readers' place, open to the same roles."""
-        copy_privileges(connection, GRAPH, NEXT_GRAPH)
-        _swap_in(connection, NEXT_GRAPH)
+        copy_privileges(connection, labels.GRAPH, labels.NEXT_GRAPH)
+        _swap_in(connection, labels.NEXT_GRAPH)
 
-    def _load(self, rows_of: Mapping[Label, list[Row]]) -> Load:
-        loads = [copy_to_graph(NEXT_GRAPH, label, rows) for label, rows in rows_of.items()]
+    def _load(self, rows_of: Mapping[labels.Label, list[Row]]) -> Load:
+        loads = [copy_to_graph(labels.NEXT_GRAPH, label, rows) for label, rows in rows_of.items()]
 
         def load(connection: Connection) -> None:
             for send in loads:
@@ -184,17 +168,17 @@ class GraphShadow:
 
 
 def _delete(
-    connection: Connection, label: Label, ids: Sequence[int], statement: str = "delete"
+    connection: Connection, label: labels.Label, ids: Sequence[int], statement: str = "delete"
 ) -> None:
-    connection.execute(graph_statement(statement, GRAPH, label), [[str(i) for i in ids]])
+    connection.execute(graph_statement(statement, labels.GRAPH, label), [[str(i) for i in ids]])
 
 
-def _compared(connection: Connection, expected: Mapping[Label, int]) -> Mapping[str, int]:
+def _compared(connection: Connection, expected: Mapping[labels.Label, int]) -> Mapping[str, int]:
     """Rows by label. Raises DatabaseError where they are not as many as expected."""
-    found = count_graph(connection, NEXT_GRAPH)
+    found = count_graph(connection, labels.NEXT_GRAPH)
     wrong = [
         f"{label}: {found[label]} rows, {expected[label]} in the map"
-        for label in LABELS
+        for label in labels.LABELS
         if found[label] != expected[label]
     ]
     if wrong:
@@ -239,7 +223,7 @@ def _adopt_if_empty(connection: Connection, graph: str) -> None:
     row = connection.execute(run["state"], {"graph": graph}).fetchone()
     if row is None or not row[0] or row[1] or not _is_empty(connection, graph):
         return
-    if not _is_bare(connection, graph) and graph_exists(connection, OLD_GRAPH):
+    if not _is_bare(connection, graph) and graph_exists(connection, labels.OLD_GRAPH):
         return  # its place is taken until the next replay
     parents = sql.SQL(", ").join(sql.Identifier(graph, parent) for parent in PARENTS)
     connection.execute(run["lock"].format(tables=parents))
@@ -248,7 +232,7 @@ def _adopt_if_empty(connection: Connection, graph: str) -> None:
     _use_age(connection)
     connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
     if not _is_bare(connection, graph):
-        drop_later = {"graph": graph, "new_name": OLD_GRAPH}
+        drop_later = {"graph": graph, "new_name": labels.OLD_GRAPH}
         connection.execute(run["rename_graph"], drop_later)
         connection.execute(run["create_graph"], {"graph": graph})
         connection.execute(run["mark"].format(graph=sql.Identifier(graph)))
@@ -279,15 +263,15 @@ def _add_labels(connection: Connection, graph: str) -> None:
     """All labels of a graph that has none, in the order that gives them their constant ids."""
     _use_age(connection)
     run = statements("graph")
-    for label in LABELS:
-        kind = "create_vlabel" if label in VERTEX_LABELS else "create_elabel"
+    for label in labels.LABELS:
+        kind = "create_vlabel" if label in labels.VERTEX_LABELS else "create_elabel"
         connection.execute(run[kind], {"graph": graph, "label": label})
-    for name in LABELS:
+    for name in labels.LABELS:
         table = sql.Identifier(graph, name)
         connection.execute(run["no_statistics"].format(table=table))
     add_policies(connection, graph)
     found = _label_ids(connection, graph)
-    if any(found.get(label) != number for label, number in LABEL_IDS.items()):
+    if any(found.get(label) != number for label, number in labels.LABEL_IDS.items()):
         raise DatabaseError(
             f"{describe_connection(connection)}: this version of Apache AGE numbers labels in"
             f" another way ({found}); use AGE 1.5 to 1.8"
@@ -300,31 +284,35 @@ def _label_ids(connection: Connection, graph: str) -> dict[str, int]:
 
 
 def index_graph(
-    connection: Connection, graph: str, labels: Collection[Label] = frozenset(LABELS)
+    connection: Connection, graph: str, of: Collection[labels.Label] = frozenset(labels.LABELS)
 ) -> None:
     """Create the indexes for queries and upserts that AGE has not made itself."""
     rows = connection.execute(statements("graph")["indexed"], {"graph": graph}).fetchall()
     unique = {(table, column): is_unique for table, column, is_unique in rows}
 
-    def make(kind: str, label: Label, **parts: sql.Composable) -> None:
+    def make(kind: str, label: labels.Label, **parts: sql.Composable) -> None:
         connection.execute(graph_statement(kind, graph, label, **parts))
 
-    for label in filter(labels.__contains__, LABELS):
-        if (label in VERTEX_LABELS or label in CHANGING_EDGES) and not unique.get((label, "id")):
+    for label in filter(of.__contains__, labels.LABELS):
+        if (label in labels.VERTEX_LABELS or label in labels.CHANGING_EDGES) and not unique.get(
+            (label, "id")
+        ):
             make("index_unique", label, column=sql.Identifier("id"))
-        for end in ("start_id", "end_id") if label in EDGE_LABELS else ():
+        for end in ("start_id", "end_id") if label in labels.EDGE_LABELS else ():
             if (label, end) not in unique:
                 make("index", label, column=sql.Identifier(end))
-        if label in KEYS:
-            make("index_key", label, key=sql.Literal(f'"{KEYS[label]}"'))
-        if label in MATCHED:
+        if label in labels.KEYS:
+            make("index_key", label, key=sql.Literal(f'"{labels.KEYS[label]}"'))
+        if label in labels.MATCHED:
             make("index_match", label)
 
 
 def count_graph(connection: Connection, graph: str) -> dict[str, int]:
     """Rows by label."""
     select = sql.SQL("SELECT {}, count(*) FROM {}")
-    selects = [select.format(sql.Literal(each), sql.Identifier(graph, each)) for each in LABELS]
+    selects = [
+        select.format(sql.Literal(each), sql.Identifier(graph, each)) for each in labels.LABELS
+    ]
     return dict(connection.execute(sql.SQL(" UNION ALL ").join(selects)).fetchall())
 
 
@@ -332,7 +320,7 @@ def _lock(connection: Connection, graph: str) -> None:
     """Lock all tables of a graph exclusively, if it is there; another version's may have fewer."""
     if graph_exists(connection, graph):
         there = _label_ids(connection, graph)
-        names = [*PARENTS, *filter(there.__contains__, LABELS)]
+        names = [*PARENTS, *filter(there.__contains__, labels.LABELS)]
         tables = sql.SQL(", ").join(sql.Identifier(graph, name) for name in names)
         connection.execute(statements("graph")["lock"].format(tables=tables))
 
@@ -341,9 +329,11 @@ def _swap_in(connection: Connection, shadow: str) -> None:
     """Rename the readers' graph to `OLD_GRAPH` and ``shadow`` to the readers' name."""
     _use_age(connection)
     run = statements("graph")
-    if graph_exists(connection, GRAPH):
-        connection.execute(run["rename_graph"], {"graph": GRAPH, "new_name": OLD_GRAPH})
-    connection.execute(run["rename_graph"], {"graph": shadow, "new_name": GRAPH})
+    if graph_exists(connection, labels.GRAPH):
+        connection.execute(
+            run["rename_graph"], {"graph": labels.GRAPH, "new_name": labels.OLD_GRAPH}
+        )
+    connection.execute(run["rename_graph"], {"graph": shadow, "new_name": labels.GRAPH})
 
 
 def drop_graph(connection: Connection, graph: str) -> None:
@@ -371,7 +361,7 @@ def analyze_graph(connection: Connection, graph: str) -> None:
     shows.
     """
     connection.execute(statements("graph")["sample"])
-    for label in LABELS:
+    for label in labels.LABELS:
         connection.execute(graph_statement("analyze", graph, label))
 
 

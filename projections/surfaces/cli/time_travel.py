@@ -33,22 +33,13 @@ from projections.history.rendering import (
 )
 from projections.store.history_records import Merge
 
-from .folded_log import (
-    MOST_LINES,
-    AllOption,
-    AtOption,
-    CachedLog,
-    KnownAtOption,
-    W,
-    known_point,
-    point,
-)
+from . import folded_log
 from .options import JsonOption, check_picture, option
 from .terminal import Bar, display, emit, say
 
 
 @dataclass(frozen=True, kw_only=True)
-class PastLog(CachedLog):
+class PastLog(folded_log.CachedLog):
     """The log whose past is asked."""
 
     @contextlib.contextmanager
@@ -67,15 +58,15 @@ class PastLog(CachedLog):
     def known(self, at: str, known_at: str | None) -> Iterator[tuple[KnownHistory, Offset]]:
         """Its history under the commands of ``--known-at``, and the offset that W means."""
         with self.timeline() as timeline:
-            end = point(timeline.reader, at)
-            known = timeline.knowing(known_point(timeline.reader, known_at, end))
+            end = folded_log.point(timeline.reader, at)
+            known = timeline.knowing(folded_log.known_point(timeline.reader, known_at, end))
             shorten_by(partial(known.shortened, end=end))
             yield known, end
 
 
 def merges(
     *,
-    at: AtOption = "end",
+    at: folded_log.AtOption = "end",
     show: Annotated[
         int | None, option("N", "Merge number N alone, with links, objects and edges.", "--show")
     ] = None,
@@ -95,7 +86,7 @@ def merges(
     objects: Annotated[
         bool, typer.Option("--objects", help="Show instead the objects that became one, and why.")
     ] = False,
-    known_at: KnownAtOption = None,
+    known_at: folded_log.KnownAtOption = None,
     json_: JsonOption = False,
     past: PastLog,
 ) -> None:
@@ -193,8 +184,8 @@ def why(
             " name their files.",
         ),
     ] = None,
-    at: AtOption = "end",
-    known_at: KnownAtOption = None,
+    at: folded_log.AtOption = "end",
+    known_at: folded_log.KnownAtOption = None,
     json_: JsonOption = False,
     past: PastLog,
 ) -> None:
@@ -233,7 +224,7 @@ def _explanation(
 
 def diff(
     *,
-    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {W}.")],
+    first: Annotated[str, typer.Argument(metavar="W1", help=f"From here: {folded_log.W}.")],
     second: Annotated[str, typer.Argument(metavar="W2", help="To here, given as W1.")] = "end",
     known_at: Annotated[
         str | None,
@@ -245,7 +236,7 @@ def diff(
         ),
     ] = None,
     json_: JsonOption = False,
-    all_: AllOption = False,
+    all_: folded_log.AllOption = False,
     past: PastLog,
 ) -> None:
     """Show what changed from one moment of the map to another.
@@ -254,14 +245,14 @@ def diff(
     """
     with past.timeline() as timeline:
         reader = timeline.reader
-        span = point(reader, first), point(reader, second)
-        known = None if known_at is None else point(reader, known_at)
+        span = folded_log.point(reader, first), folded_log.point(reader, second)
+        known = None if known_at is None else folded_log.point(reader, known_at)
         found = timeline.diff(*span, known_at=known)
     if json_:
         emit(found.document())
     else:
         shorten_by(found.short_ids.text)
-        display(difference_text(found, most=None if all_ else MOST_LINES))
+        display(difference_text(found, most=None if all_ else folded_log.MOST_LINES))
 
 
 def changes(
@@ -286,7 +277,7 @@ def changes(
         ),
     ] = None,
     json_: JsonOption = False,
-    all_: AllOption = False,
+    all_: folded_log.AllOption = False,
     past: PastLog,
 ) -> None:
     """Say what changed in the building: what moved, is missing, new or back again.
@@ -296,12 +287,12 @@ def changes(
     with past.timeline() as timeline:
         end = timeline.moment(until, is_end=True, note=say)
         start = None if since is None else timeline.moment(since, is_end=False, note=say)
-        known = None if known_at is None else point(timeline.reader, known_at)
+        known = None if known_at is None else folded_log.point(timeline.reader, known_at)
         found = timeline.changes(start, end, known_at=known)
     if json_:
         emit(found.document())
         return
-    display(changes_text(found, most=None if all_ else MOST_LINES))
+    display(changes_text(found, most=None if all_ else folded_log.MOST_LINES))
     if found.unsure:
         shows = visible(advised("diff", past.log, found.since, found.until))
         say(f"+ {counted(found.unsure, 'change')} not sure; `{shows}` shows them")
@@ -310,27 +301,27 @@ def changes(
 def bisect(
     *,
     expression: Annotated[str, typer.Argument(metavar="EXPR", help="The condition.")],
-    start: Annotated[str, option("W", f"Search from here: {W}.", "--from")] = "0",
+    start: Annotated[str, option("W", f"Search from here: {folded_log.W}.", "--from")] = "0",
     end: Annotated[str, option("W", "Search to here.", "--to")] = "end",
     scan: Annotated[
         bool,
         typer.Option("--scan", help="List every turn to true and to false, not only the first."),
     ] = False,
-    known_at: KnownAtOption = None,
+    known_at: folded_log.KnownAtOption = None,
     json_: JsonOption = False,
-    all_: AllOption = False,
+    all_: folded_log.AllOption = False,
     past: PastLog,
 ) -> None:
     with _columns_shown(), past.timeline() as timeline:
         asked = Expression(expression)
-        span = point(timeline.reader, start), point(timeline.reader, end)
-        known = timeline.knowing(known_point(timeline.reader, known_at, span[1]))
+        span = folded_log.point(timeline.reader, start), folded_log.point(timeline.reader, end)
+        known = timeline.knowing(folded_log.known_point(timeline.reader, known_at, span[1]))
         shorten_by(partial(known.shortened, end=span[1]))
         found = known.bisect(asked, *span, scan=scan)
     if json_:
         emit(found.document())
     else:
-        display(search_text(found, most=None if all_ else MOST_LINES))
+        display(search_text(found, most=None if all_ else folded_log.MOST_LINES))
 
 
 bisect.__doc__ = f"""Find the first event that made a condition over the map true.
