@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from eventsrc.base.text import counted, table
 from eventsrc.envelope.model import Offset
 from projections.ask.object_changes import ObjectAbsence, ObjectMove, ObjectRow
-from projections.localize.evaluate.scores import Regrouping
+from projections.map.partitions import Regrouping
 from projections.map.phrases import command_title
 
 from .diff import Difference, PlaceRow, place_shift_m

@@ -12,8 +12,8 @@ from eventsrc.envelope.model import DetId, Offset
 from projections.fold.corrections import Corrections, RecordedCommand, compile_corrections
 from projections.fold.map_errors import SettingsError
 from projections.fold.settings import Settings, assignment_texts
-from projections.localize.evaluate.scores import PartitionComparison, Regrouping, compare_partitions
 from projections.map.naming import NoSuchThing, ShortIds
+from projections.map.partitions import PartitionComparison, Regrouping, compare_partitions
 from projections.map.phrases import command_document, command_name
 from projections.store.history import NEVER
 

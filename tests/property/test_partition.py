@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from projections.localize.evaluate.scores import compare_partitions
+from projections.map.partitions import compare_partitions
 
 labels = st.sampled_from([None, "a", "b", "c"])
 labellings = st.lists(st.tuples(labels, labels), max_size=24)
