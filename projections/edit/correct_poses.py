@@ -14,6 +14,7 @@ from typing import NamedTuple
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted
 from eventsrc.envelope import commands
+from eventsrc.envelope.commands import MAX_COMMAND_BYTES
 from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
 
@@ -140,10 +141,10 @@ def by_trajectory(
     _note_left(note, run_id, trajectory, laid, slack_s)
     command = build(commands.CorrectPoses, stamp, run_id=run_id, poses=laid.poses)
     size = len(commands.encode_command(command))
-    if size > commands.MAX_COMMAND_BYTES:
+    if size > MAX_COMMAND_BYTES:
         raise MisuseError(
             f"{trajectory.name}: {counted(len(laid.poses), 'pose')} make a command of {size:,}"
-            f" bytes, more than {commands.MAX_COMMAND_BYTES:,}; give it in parts with --from and"
+            f" bytes, more than {MAX_COMMAND_BYTES:,}; give it in parts with --from and"
             " --to"
         )
     return command
