@@ -7,11 +7,7 @@ and ``_x``/``_y`` values are metres, correctly rounded. Times are robot seconds.
 """
 
 import math
-<<<<<<< HEAD
-from collections.abc import Iterable, Mapping, Sequence
-=======
 from collections.abc import Collection, Iterable, Mapping, Sequence
->>>>>>> 00c60520 (Let no command import another: shared options, --method and the warning of no truth in the modules they share)
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Self

@@ -108,11 +108,11 @@ class StoredView(MapView):
         if self._cache is not None and not self._is_changed:
             self._cache.keep_digest(self.next_offset, digest)
 
-    def seen_by(self, found: ObjectRecord) -> list[KeyframeOrdinal]:
+    def seen_by(self, found: ObjectRecord) -> list[d.KeyframeOrdinal]:
         """The ordinals of `sightings`."""
         if self._is_changed or not found.observations:
             return super().seen_by(found)
-        keyframes: list[KeyframeOrdinal]
+        keyframes: list[d.KeyframeOrdinal]
         keyframes = self._moment.column("observation", "keyframe")[found.observations].tolist()
         return keyframes
 
