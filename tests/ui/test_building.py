@@ -301,8 +301,8 @@ def test_the_type_of_each_place_is_that_of_state(
     for at in (445, 150, 60):
         go(page, at)
         for place in places_of(mapfold, SAMPLE, at, *WIDE):
-            name = re.compile(rf"\b{_short(place)}\b")
-            row = page.locator("table.rooms tbody tr").filter(has_text=name)
+            name = page.locator("th", has_text=re.compile(rf"\b{_short(place)}$"))
+            row = page.locator("table.rooms tbody tr").filter(has=name)
             kind, share = place.get("type"), place.get("type_probability")
             types_seen.add((kind is None, share is None))
             expect(row).to_contain_text(_short(place) if kind is None else kind)
