@@ -320,6 +320,7 @@ def test_the_type_of_each_place_is_that_of_state(
         assert moment(page) == at
     assert {(False, False), (True, False)} <= types_seen
     go(page, 445)
+    whole(page)
     expect(page.locator("table.rooms")).to_contain_text("kitchen")
     assert any(text.endswith("· kitchen") for text in labels(picture(page)))
 
