@@ -345,9 +345,8 @@ class MapView:
     }
 
     def counts(self) -> dict[str, int]:
-        """Counts by name; the eight in capitals are of the graph's edges by label. What corrections
-        leave out, scans too far away and pictures of a camera that nothing states come at the end,
-        if they count."""
+        """Counts by name; the eight in capitals are of the graph's edges by label. Those that are
+        rare, and pictures of a camera that nothing states, come at the end, if they count."""
         posed, fused, foreign = self._sums()
         unstated = self.without_camera() if self.settings.wants_camera else 0
         placed = sum(p.keyframe_count for p in self.places.values())

@@ -147,10 +147,9 @@ class CandidateSearch:
         values |= {f"crop_{i}": crop.vector for i, crop in enumerate(crops)}
         with _query_errors(self._targets.vector_url):
             size = max((len(crop.vector) for crop in crops if crop.vector is not None), default=1)
-            name = "near_and_graph" if one else "near"
-            statement = _statement(name, len(crops), neighbours, size)
+            searching = ("near_and_graph" if one else "near", len(crops), neighbours, size)
             values |= self._known.parameters
-            rows = self._vectors.execute(statement, values, binary=True).fetchall()
+            rows = self._vectors.execute(_statement(*searching), values, binary=True).fetchall()
         near, origin = self._near(rows)
         model = next((row[-1] for row in near), None)
         for crop in crops:
@@ -242,12 +241,9 @@ class CandidateSearch:
 
 @lru_cache(maxsize=128)
 def _statement(name: str, crops: int = 0, neighbours: int = 0, dimension: int = 1) -> bytes:
-    """The text of a statement. In those that search, ``crops`` is the number of crops, all of one
-    ``dimension``, and ``neighbours`` that of observations for each.
-
-    Without comments and line breaks: psycopg reads a short statement once, a long one for every
-    question.
-    """
+    """The text of a statement, short, as psycopg reads a long one anew for every question. In those
+    that search, ``crops`` is the number of crops, all of one ``dimension``, and ``neighbours`` that
+    of observations for each."""
     rows = [
         sql.SQL("({}::int, {}::vector)").format(sql.Literal(i), sql.Placeholder(f"crop_{i}"))
         for i in range(crops)
@@ -295,8 +291,7 @@ def _query_errors(url: str) -> Iterator[None]:
 
 
 _CANDIDATES = max(200, NEIGHBOURS)
-"""As many are found by the index, in its `ef_search`, and compared by their whole vectors. At
-300,000 observations 0.992 of the ten nearest are among them, of 150 0.979 (75 crops)."""
+"""From the index, compared by whole vectors: at 300,000 observations 0.992 of the ten nearest."""
 
 
 def relocalize(

@@ -71,8 +71,7 @@ def create_app(
     *,
     secured: bool = False,
 ) -> FastAPI:
-    """The ASGI application. The caller closes the pools and the queue. ``secured`` describes that
-    a token is required, which `Guard` checks."""
+    """The ASGI app; the caller closes pools and queue. ``secured``: `Guard` checks a token."""
     counted = metrics or ServiceMetrics(answerer, queue)
     app = FastAPI(
         title="mapfold",
