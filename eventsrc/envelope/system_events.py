@@ -7,7 +7,7 @@
 ``mapfold/ros``       how envelopes are made of the messages of ROS behind it
                       (`eventsrc.ros.derivation`)
 ``mapfold/map``       an occupancy grid: where walls are (`.occupancy_map`)
-``mapfold/embeddings``  vectors of another space for older detections (`.embeddings`)
+``mapfold/embeddings``  vectors of another space for older detections (`NewVectors`)
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """

@@ -10,10 +10,10 @@ driven one, then free floor of an occupancy map, both with a free line of sight.
 
 Of the poses that saw it the best one has most others that saw it around it, for one detection may
 be of a thing beside it, and is some `_BEST_M` away. It counts against a pose how few those are (up
-to 1, `_flaws`), each metre that it is nearer or farther (`_A_METRE`) or off the ground of the last
-run (`_OFF_LAST`), that a later run saw the Object too (`_EARLIER`), that another Object stands
-there and that a wall is in the line of sight, for estimates err (`_BLOCKED` each). Of the others
-the best one is as far away as the Object is seen from usually. Of equal ones the earliest.
+to 1, `_flaws`), each metre that it is nearer or farther (`_A_METRE`) or, up to one, off the ground
+of the last run (`_OFF_LAST`), that a later run saw the Object too (`_EARLIER`), that another Object
+stands there and that a wall is in the line of sight, for estimates err (`_BLOCKED` each). Of the
+others the best one is as far away as the Object is seen from usually. Of equal ones the earliest.
 """
 
 import heapq

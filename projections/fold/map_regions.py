@@ -14,8 +14,9 @@ Everything is in integers.
     A region becomes one with a wider one, the widest possible, if the passage is at least `PASSAGE`
     of its own width, or of the larger usual width of the two, if they have any; or if it is
     narrower than `MIN_WIDTH_M` and so no room. Else the passage is a *narrow place*, and the two
-    stay apart. Two that become one keep the larger usual width; if neither has one and both
-    together come to `USUAL_M2`, it is the passage.
+    stay apart. Two of which neither has a usual width, too small as yet to be told apart, become
+    one. Two that become one keep the larger usual width; if neither has one and both together come
+    to `USUAL_M2`, it is the passage.
 
 So there is no fixed width of doors: a door of 0.9 m parts a room from a corridor of 1.2 m, a
 passage of two metres parts two halls, and a corridor, which is wider beside doors and where another
@@ -79,9 +80,9 @@ def regions(walls: Walls, cell_m: float) -> Labels:
     labels = np.full(flat.size, NOWHERE, np.int32)
     floor = np.flatnonzero(flat)
     own = merged[basins[floor]]
-    first = np.zeros(len(merged), np.int64)
-    first[own[::-1]] = floor[::-1]  # of equal indices the last one counts
-    kept = np.unique(own)
+    first = np.full(len(merged), flat.size, np.int64)
+    np.minimum.at(first, own, floor)
+    kept = np.flatnonzero(first < flat.size)
     numbers = np.zeros(len(merged), np.int32)
     numbers[kept[np.argsort(first[kept])]] = np.arange(len(kept), dtype=np.int32)
     labels[floor] = numbers[own]

@@ -48,6 +48,8 @@ _PARTS: Final = 4
 _SECTORS: Final = 1 << 11
 WIDEST: Final = 4
 """Sectors: at `REACH_M` one cell."""
+_FARTHER_MM: Final = 2**15 - 1
+"""More than `REACH_M`."""
 
 Odds: TypeAlias = NDArray[np.int8]
 
@@ -105,16 +107,21 @@ class ScannedFloor:
         )
         most = int(min(REACH_M, scan.range_max) * 1000)
         seen = np.minimum(np.where(ranges == NO_RETURN_MM, most, ranges), REACH_M * 1000)
+        known = ranges != UNKNOWN_MM
         half = math.ceil(min(abs(scan.angle_step) * (_SECTORS / _TURN) / 2, WIDEST))
-        beside = np.array(sorted(range(-half, half + 1), key=abs, reverse=True))[:, None]
-        free_mm = np.zeros(_SECTORS, np.int16)  # of the beam nearest to each
+        # By the beam that is nearest to each sector, of several the shortest.
+        free_mm = np.zeros(_SECTORS, np.int16)
         sectors = (numbers * _SECTORS + _DIRECTIONS // 2) // _DIRECTIONS
-        free_mm[(sectors + beside) & (_SECTORS - 1)] = seen - CELL_MM
+        for beside in sorted(range(-half, half + 1), key=abs, reverse=True):
+            found = (sectors + beside) & (_SECTORS - 1)
+            free_mm[found] = _FARTHER_MM
+            np.minimum.at(free_mm, found[known], (seen[known] - CELL_MM).astype(np.int16))
+        free_mm[free_mm == _FARTHER_MM] = 0  # of beams that say nothing
         parts = (at * _PARTS // CELL_UM % _PARTS for at in (x_um, y_um))
         sector, far_mm = _around(*parts)
         touched = PASSED * (far_mm <= free_mm.take(sector, mode="wrap")).view(np.int8)
         flat = touched.ravel()
-        ends = (ranges != UNKNOWN_MM) & (ranges < REACH_M * 1000) & (ranges != NO_RETURN_MM)
+        ends = known & (ranges < REACH_M * 1000) & (ranges != NO_RETURN_MM)
         far = ranges[ends].astype(np.int64)
         columns = (ax + cosines[ends] * far // CELL_MM) >> _BITS
         rows = (ay + sines[ends] * far // CELL_MM) >> _BITS

@@ -224,6 +224,30 @@ def test_a_search_with_conditions_as_documented_finds_what_is_nearest(
             assert [each for (each,) in found] == [rows[n][0] for n in best]
 
 
+def test_the_documented_search_goes_through_the_index(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    page = PROJECTIONS.read_text()
+    start = page.index("SELECT det_id, embedding <=> $query AS distance FROM (")
+    rebuild(write_log(tmp_path / "log", walk(300)), one_database, SETTINGS)
+    with psycopg.connect(one_database.vector_url, autocommit=True) as connection:
+        register_vector(connection)
+        assert build_hnsw(connection, threshold=1).built
+        connection.execute("SET enable_seqscan = off")
+        rows = connection.execute(
+            "SELECT det_id, embedding::real[] FROM detection_embeddings"
+        ).fetchall()
+        vectors = np.array([row[1] for row in rows])
+        search = page[start : page.index(";", start)].replace("$query", "%(query)s")
+        search = search.replace("halfvec(512)", f"halfvec({vectors.shape[1]})")
+        query = np.random.default_rng(1).normal(size=vectors.shape[1]).astype(np.float32)
+        plan = connection.execute(f"EXPLAIN {search}", {"query": query}).fetchall()
+        assert "detection_embeddings_halves" in str(plan)
+        found = connection.execute(search, {"query": query}).fetchall()
+        best = np.argsort(-(vectors @ query))[:10]
+        assert [det_id for det_id, _ in found] == [rows[n][0] for n in best]
+
+
 @pytest.mark.slow
 def test_the_dimension_follows_the_map(tmp_path: Path, one_database: Targets) -> None:
     empty = write_log(tmp_path / "log", [envelope(0)])

@@ -219,6 +219,31 @@ def test_a_run_that_drives_on_has_no_large_step() -> None:
     assert steps(simulated().envelopes) == []
 
 
+@pytest.mark.parametrize("count", [20, 32, 80])
+def test_a_large_step_of_a_short_run_is_seen(count: int) -> None:
+    documents = jumped("a", count // 2)[:count]
+    assert [each.stretch.first for each in steps(documents)] == [
+        documents[count // 2]["keyframe_id"]
+    ]
+
+
+def test_a_robot_that_was_parked_before_and_after_has_one_large_step() -> None:
+    parked = [
+        {**each, "map_x": 6.0 * (n >= 20), "map_y": 0.0, "map_yaw": 0.0}
+        for n, each in enumerate(simulated().envelopes[:40])
+    ]
+    assert [each.step_m for each in steps(parked)] == [6.0]
+
+
+def test_a_stretch_too_short_to_be_compared_is_not_left_out() -> None:
+    documents = jumped("a", 200, 205)
+    found = steps(documents)
+    assert [each.stretch.first for each in found] == [
+        documents[number]["keyframe_id"] for number in (200, 205)
+    ]
+    assert found[0].found is None
+
+
 @pytest.mark.parametrize("back", [None, pytest.param(320, marks=pytest.mark.slow)])
 def test_the_tail_behind_a_jump_is_brought_back(back: int | None) -> None:
     documents = jumped("a", 200, back)

@@ -26,6 +26,8 @@ from .matching import Floats, moved
 
 _USUALLY_PERCENT, _MORE_THAN_USUAL = 98, 2.5
 _LEAST_STEP_M, _LEAST_S = 1.0, 0.1
+_LEAST_USUAL: Final = 0.01
+"""Of a parked robot's steps and speeds, in m and m/s."""
 _MOST_STEPS: Final = 3
 """The most steps of a run that are looked into, the largest ones."""
 _LEAST_KEYFRAMES: Final = 10
@@ -60,7 +62,8 @@ class Stretch(NamedTuple):
 
 class LargeStep(NamedTuple):
     """A step too large to be driven, of ``step_m`` metres, and the stretch behind it. ``found`` is
-    the stretch's transform into the frame of everything else; ``is_jump``: it explains the step."""
+    the stretch's transform into the frame of everything else, None where there is nothing to
+    compare; ``is_jump``: it explains the step."""
 
     stretch: Stretch
     step_m: float
@@ -114,10 +117,10 @@ def find_jumps(
     steps = _large_steps([each[1] for each in known], poses)
     for number, step in enumerate(steps, start=1):
         end = steps[number].to if number < len(steps) else len(known)
-        if min(step.to, end - step.to) < _LEAST_KEYFRAMES:
-            continue
         stretch = Stretch(ids[step.to], None if end == len(known) else ids[end - 1])
-        first, second = everything_else(stretch), alone(stretch)
+        first = second = None
+        if min(step.to, end - step.to) >= _LEAST_KEYFRAMES:
+            first, second = everything_else(stretch), alone(stretch)
         found = None if first is None or second is None else align(first, second)
         before, after = poses[step.to - 1], poses[step.to]
         is_jump = found is not None and _explains(found, step, before, after)
@@ -125,14 +128,20 @@ def find_jumps(
 
 
 def _large_steps(stamps: Sequence[float], poses: Sequence[Pose]) -> list[_Step]:
-    """The steps that are much longer or faster than is usual, by keyframe."""
+    """The steps that are much longer or faster than is usual, by keyframe. What is usual does not
+    depend on the `_MOST_STEPS` largest, which may be jumps."""
     if len(poses) < 2 * _LEAST_KEYFRAMES:
         return []
     xy: Floats = np.array([(pose.x_m, pose.y_m) for pose in poses])
     lengths = np.hypot(*np.diff(xy, axis=0).T)
     seconds = np.maximum(np.diff(stamps), _LEAST_S)
-    usual = np.percentile(lengths, _USUALLY_PERCENT)
-    usual_speed = np.percentile(lengths / seconds, _USUALLY_PERCENT)
+    usual, usual_speed = (
+        max(
+            _LEAST_USUAL,
+            min(np.percentile(each, _USUALLY_PERCENT), np.sort(each)[-_MOST_STEPS - 1]),
+        )
+        for each in (lengths, lengths / seconds)
+    )
     longest = np.maximum(usual, usual_speed * seconds)
     excess = np.maximum(lengths / usual, lengths / seconds / usual_speed)
     is_large = (lengths > _LEAST_STEP_M) & (excess > _MORE_THAN_USUAL)

@@ -33,7 +33,7 @@ _NAMED = 5
 _SEVERAL = 3
 """Runs of a log that are all aligned, where none is named."""
 _EVERYWHERE = Span(None, None)
-_NO_JUMP = "no step is larger than the robot's usual ones: no frame jumped"
+_NO_JUMP = "no step in a run of 20 keyframes or more is larger than usual: no frame jumped"
 
 
 @dataclass(frozen=True, slots=True)

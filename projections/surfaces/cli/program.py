@@ -25,8 +25,11 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from enum import StrEnum
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn, TextIO
+
+import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 
@@ -36,10 +39,6 @@ from .terminal import EXIT_FAILED, OutputLost, ReadingBar, output_begins, say
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
-from enum import StrEnum
-from typing import Annotated
-
-import typer
 
 EXIT_INTERRUPTED: Final = 130
 EXIT_READER_GONE: Final = 141
