@@ -52,7 +52,7 @@ def test_moments_settings_and_conditions_are_compared_and_found(
     last = mapfold("merges", log, *SETTINGS, "--json").json[-1]
     at = last["offset"] + 1
     page = visit(server, f"#at={at}&panel=compare&with={at - 1}")
-    expect(page.locator(".changes")).to_contain_text("place gone")
+    expect(page.locator("ul.changes")).to_contain_text("place gone")
     page.get_by_text("Two settings").click()
     page.get_by_role("slider", name="ε, metres").fill("0.5")
     expect(page.locator("canvas.map")).to_have_count(2)

@@ -11,6 +11,7 @@ from playwright.sync_api import Page, expect
 
 from tests.support.commands import Commands
 from tests.support.ui_page import UiServer, showing
+from tests.ui.browser import digest
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import go, moment
 
@@ -41,7 +42,8 @@ def shown(page: Page) -> None:
 def check(page: Page, mapfold: Commands, log: Path, at: int, *words: str) -> None:
     """The digest shown is that of ``state``."""
     said = mapfold("state", log, *WIDE, "--at", str(at), *words, "--digest").out.strip()
-    expect(page.locator(".digest code")).to_have_attribute("data-digest", said)
+    digest(page)
+    expect(page.locator(".facts code")).to_have_attribute("data-digest", said)
 
 
 def test_the_map_is_that_of_state_as_known_then_and_as_known_now(

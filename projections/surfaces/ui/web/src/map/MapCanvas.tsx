@@ -26,12 +26,12 @@ type Zoomed = ZoomBehavior<HTMLCanvasElement, unknown>;
 export const painted = new Set<() => void>();
 let moved = false;
 
-/** The view that shows the whole map. */
 /** What the counts at the top left cover: a column, on a phone a row. */
 const FACTS_WIDE_PX = 212;
 const FACTS_HIGH_PX = 44;
 const NARROW_PX = 520;
 
+/** The view that shows the whole map. */
 export function fitView() {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
   const bounds = store.drawnBounds.value;

@@ -82,12 +82,12 @@ const CHANGES = {
 } as const;
 
 /** What became of an object, in a line; `changes` has the whole sentence. */
-export function ChangeLine({ change, history }: { change: MapChange; history: History }) {
+export function ChangeLine({ change, history, id, current }: { change: MapChange; history: History; id?: string; current?: boolean }) {
   const [sign, says] = CHANGES[change.kind];
   const place = change.place_id === null ? -1 : findPlace(history, change.place_id);
   const where = change.place_name ?? change.place_type ?? (place < 0 ? "in no place" : shortPlace(history, place));
   return (
-    <li title={label(change.sentence, 300)}>
+    <li id={id} class={current ? "now" : undefined} aria-current={current ? "true" : undefined} title={label(change.sentence, 300)}>
       <span class={`sign-${change.kind}`} aria-hidden="true">{sign}</span>
       <p>
         <ThingLink thing={{ kind: "object", id: change.object_id }}>{label(change.class_name, 28)}</ThingLink> {says}

@@ -1,14 +1,14 @@
 /** Corrections: the list with undo, and a form with a preview and a reason. */
 
 import { signal } from "@preact/signals";
-import { useEffect, useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { hasToken, postJson } from "../api/client";
 import { label } from "../model/names";
 import { useAnswer } from "../state/answers";
 import { grow, sentence } from "../state/loading";
 import { showNotice } from "../state/pointer";
 import * as store from "../state/store";
-import { type Parameter, KINDS, proposal, propose } from "./proposals";
+import { type Parameter, KINDS, proposal, propose, proposed } from "./proposals";
 import { Answer, CommandLine, Moment } from "./AnswerParts";
 
 interface Correction {
@@ -56,7 +56,7 @@ export function Correct() {
                       <b>{each.kind}</b> <bdi>{label(each.what, 120)}</bdi>
                     </p>
                     <p class="dim">
-                      <bdi>{label(each.issued_by, 60)}</bdi>: <bdi>{label(each.reason, 300)}</bdi>
+                      <bdi>{label(each.issued_by, 60)}</bdi>{each.reason !== "" && <>: <bdi>{label(each.reason, 300)}</bdi></>}
                     </p>
                     {each.undone_by !== null && <p class="dim">undone by <bdi>{label(each.undone_by, 40)}</bdi></p>}
                     {each.repeats !== undefined && <p class="dim">not counted: {each.repeats} has the same id</p>}
@@ -77,6 +77,9 @@ export function Correct() {
   );
 }
 
+/** For how many proposals the form has taken the focus. */
+let focused = 0;
+
 function Form() {
   const wanted = proposal.value ?? { kind: "name-place", arguments: [] };
   const kind = KINDS[wanted.kind];
@@ -84,18 +87,31 @@ function Form() {
   const [preview, setPreview] = useState<Outcome | null>(null);
   const [failed, setFailed] = useState<string | null>(null);
   const [busy, setBusy] = useState(false);
+  /** The command that was recorded last, to be undone. */
+  const [done, setDone] = useState<string | null>(null);
   const given = kind.parameters.map((_, index) => wanted.arguments[index] ?? "");
   const key = JSON.stringify(wanted);
+  const id = useRef("");
   useEffect(() => {
+    id.current = Array.from(crypto.getRandomValues(new Uint8Array(16)), (each) => each.toString(16).padStart(2, "0")).join("");
     setPreview(null);
     setFailed(null);
   }, [key]);
+  const form = useRef<HTMLFormElement>(null);
+  const asked = proposed.value;
+  useEffect(() => {
+    if (asked === focused) return;
+    focused = asked;
+    const fields = [...(form.current?.querySelectorAll<HTMLInputElement>("input[type=text]") ?? [])];
+    (fields.find((each) => each.value === "") ?? fields[0])?.focus();
+  }, [asked]);
   const needsReason = !["name-place", "relabel"].includes(wanted.kind);
   const whole = given.every((each) => each.trim() !== "");
   const set = (index: number, value: string) => {
     proposal.value = { kind: wanted.kind, arguments: given.map((each, at) => (at === index ? value : each)) };
   };
   const send = async (dry: boolean) => {
+    setDone(null);
     setBusy(true);
     setFailed(null);
     try {
@@ -104,11 +120,12 @@ function Form() {
         arguments: given,
         reason,
         dry_run: dry,
-        command_id: preview?.command_id, // recorded once, also when its answer is lost and it is sent again
+        command_id: id.current, // recorded once, also when its answer is lost and it is sent again
       });
       if (dry) setPreview(outcome);
       else {
         showNotice(`Recorded at offset ${outcome.offset}. It changes ${outcome.effect_text ?? "the map"}.`);
+        setDone(wanted.kind === "undo" ? null : (outcome.command_id ?? null));
         proposal.value = null;
         setReason("");
         setPreview(null);
@@ -121,12 +138,27 @@ function Form() {
       setBusy(false);
     }
   };
+  const undo = async (command: string) => {
+    setBusy(true);
+    try {
+      await postJson<Outcome>("/api/edit", { kind: "undo", arguments: [command], reason: "a mistake, undone in the page", dry_run: false });
+      setDone(null);
+      showNotice("Undone.");
+      await grow();
+      recorded.value++;
+    } catch (error) {
+      setFailed(sentence(error));
+    } finally {
+      setBusy(false);
+    }
+  };
   return (
     <form
+      ref={form}
       class="correction"
       onSubmit={(event) => {
         event.preventDefault();
-        void send(preview === null);
+        void send(preview === null && needsReason);
       }}
     >
       <label for="correction-kind">
@@ -142,10 +174,10 @@ function Form() {
       {kind.parameters.map((parameter, index) => (
         <ParameterField key={`${wanted.kind} ${parameter.name}`} parameter={parameter} value={given[index]} onChange={(value) => set(index, value)} />
       ))}
-      {preview !== null && (
+      {preview !== null && needsReason && (
         <label>
           Reason
-          <input type="text" maxLength={2000} required={needsReason} value={reason} placeholder={needsReason ? "Why is it so?" : "Not needed for a name"} onInput={(event) => setReason(event.currentTarget.value)} />
+          <input type="text" maxLength={2000} required value={reason} placeholder="Why is it so?" onInput={(event) => setReason(event.currentTarget.value)} />
         </label>
       )}
       {failed !== null && <p class="error" role="alert">{failed}</p>}
@@ -159,9 +191,21 @@ function Form() {
       {preview !== null && <CommandLine command={preview.command} />}
       <div class="form-row">
         {preview === null ? (
-          <button class="button main" type="submit" disabled={busy || !whole}>
-            {busy ? "Folding …" : "Preview"}
-          </button>
+          <>
+            {!needsReason && (
+              <button class="button main" type="submit" disabled={busy || !whole}>
+                {busy ? "Recording …" : "Record it"}
+              </button>
+            )}
+            <button class={needsReason ? "button main" : "button quiet"} type={needsReason ? "submit" : "button"} disabled={busy || !whole} onClick={() => needsReason || void send(true)}>
+              {busy && needsReason ? "Folding …" : "Preview"}
+            </button>
+            {done !== null && (
+              <button class="button quiet" type="button" title="Undo what was just recorded" disabled={busy} onClick={() => void undo(done)}>
+                Undo it
+              </button>
+            )}
+          </>
         ) : (
           <>
             <button class="button main" type="submit" disabled={busy || (needsReason && reason.trim() === "")}>

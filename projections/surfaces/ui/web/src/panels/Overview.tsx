@@ -40,6 +40,7 @@ function Changed({ history, at }: { history: History; at: number }) {
   const known = store.log.value?.fusion === "evidence" && runs.length > 1;
   const asked = useAnswer<MapChanges>(known ? address("/api/changes", { until: at, known_at: store.knownAt(at) }) : null, history.state);
   const found = asked.value;
+  if (asked.error !== null) return <Answer asked={asked}>{() => null}</Answer>;
   if (found === null || found.since === 0) return null;
   const { offset, run } = history.keyframes;
   const compare = () => {
@@ -184,9 +185,9 @@ function Objects({ history, facts: { at, rooms, crops } }: { history: History; f
       <Answer asked={found}>
         {({ answers, count }) => (
           <>
+            {count > answers.length && <p class="dim">These are the first {answers.length.toLocaleString("en")}; ask for a class or a room to see others.</p>}
             {answers.length > 0 && <ObjectTable answers={answers} history={history} crops={crops} most={all ? MOST_OBJECTS : FEW_OBJECTS} />}
             {answers.length > FEW_OBJECTS && <button type="button" class="link" onClick={() => setAll(!all)}>{all ? "fewer" : `all ${answers.length.toLocaleString("en")}`}</button>}
-            {all && count > answers.length && <span class="dim"> and {(count - answers.length).toLocaleString("en")} more; ask for a class or a room</span>}
           </>
         )}
       </Answer>

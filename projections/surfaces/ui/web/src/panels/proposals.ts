@@ -29,9 +29,13 @@ export const KINDS: Record<string, { says: string; parameters: Parameter[] }> = 
 
 export const proposal = signal<Proposal | null>(null);
 
+/** How often a correction was proposed: each time its form takes the focus. */
+export const proposed = signal(0);
+
 export function propose(wanted: Proposal) {
   batch(() => {
     proposal.value = wanted;
+    proposed.value++;
     openPanel("correct");
   });
 }

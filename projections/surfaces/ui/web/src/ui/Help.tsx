@@ -11,6 +11,7 @@ const KEYS: [string, string][] = [
   ["← →", "one event back or on"],
   ["Shift ← →", "to the change before or after"],
   ["M, Shift M", "to the next or previous merge"],
+  ["↑ ↓", "through the changes that Compare lists"],
   ["Home, End", "to the beginning or the end of the log"],
   ["L", "follow the end of the log"],
   ["/", "search"],

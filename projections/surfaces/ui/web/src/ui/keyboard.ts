@@ -1,6 +1,7 @@
 /** Keys of the whole page. */
 
 import { changeView, fitView } from "../map/MapCanvas";
+import { walkChanges } from "../panels/CompareMoments";
 import { copyCommand } from "../panels/TakeAway";
 import { goLive, goTo, openPanel, select, stepBy, togglePlay } from "../state/actions";
 import { menu } from "../state/pointer";
@@ -21,6 +22,7 @@ export function keepKeys() {
   document.addEventListener("keydown", (event) => {
     if (event.defaultPrevented || event.ctrlKey || event.metaKey || document.querySelector("dialog[open]")) return;
     if (isTyping(event.target) && event.key !== "Escape") return;
+    if (event.target instanceof Element && event.target.closest("[role=menu]") !== null) return; // its own keys
     if (event.key === " " && event.target instanceof HTMLElement && event.target.closest("button, summary, label, [role=tab]")) return;
     if (press(event)) event.preventDefault();
   });
@@ -36,16 +38,19 @@ function press({ key, shiftKey, altKey, target }: KeyboardEvent): boolean {
     if (pan !== undefined) changeView(1, ...pan);
     return pan !== undefined;
   }
-  const inTabs = target instanceof HTMLElement && target.closest("[role=tablist], fieldset") !== null;
+  const within = (what: string) => target instanceof HTMLElement && target.closest(what) !== null;
   switch (key) {
     case " ":
       togglePlay();
       return true;
     case "ArrowLeft":
     case "ArrowRight":
-      if (inTabs) return false;
+      if (within("[role=tablist], fieldset")) return false;
       stepBy(shiftKey ? "change" : "event", key === "ArrowRight" ? 1 : -1);
       return true;
+    case "ArrowUp":
+    case "ArrowDown":
+      return store.panel.value === "compare" && !within("fieldset") && walkChanges(key === "ArrowDown" ? 1 : -1);
     case "m":
     case "M":
       stepBy("merge", shiftKey ? -1 : 1);
