@@ -42,6 +42,15 @@ def test_pictures(sample: UiServer, visit: Visit, pictures: Path, size: str, sch
         expect(page.locator("#panel .error")).to_have_count(0)
 
 
+def test_the_picture_of_the_readme(rooms: UiServer, visit: Visit, pictures: Path) -> None:
+    """``docs/images/ui.png`` is a copy of it."""
+    viewport = {"width": 1440, "height": 900}
+    page = visit(rooms, "#at=305&select=merge:304&panel=why", viewport=viewport)
+    expect(page.locator(".summary")).to_contain_text("p0 absorbed p4")
+    _settled(page, "merge")
+    page.screenshot(path=pictures / "readme.png")
+
+
 def _settled(page: Page, state: str) -> None:
     if state in ("merge", "why", "diff"):
         page.locator("#panel .command").wait_for()
