@@ -36,6 +36,7 @@ from projections.map.view import MapView
 from .goal_pose import GoalPose
 
 CLEARANCE_M: Final = 0.3
+_MOST_OFF_M: Final = 10.0
 Floats = NDArray[np.float64]
 Spot = tuple[float, float]
 """Metres in the map frame."""
@@ -109,7 +110,9 @@ class DrivenGround:
         self._starts: list[int] = np.searchsorted(links, np.arange(count + 1) * count).tolist()
 
     def nearest(self, spot: Spot, among: Iterable[int] | None = None) -> int:
-        """The node that is nearest to a spot in a straight line. Raises MisuseError for none."""
+        """The node that is nearest to a spot in a straight line. Raises MisuseError for none, and
+        without ``among`` for a spot more than `_MOST_OFF_M` away from all."""
+        is_limited = among is None
         if among is None:
             with np.errstate(over="ignore"):
                 away = np.hypot(*(self._metres - spot).T)
@@ -120,6 +123,12 @@ class DrivenGround:
         found = min(among, key=lambda n: (math.dist(self.spots[n], spot), n), default=None)
         if found is None:
             raise MisuseError("this map has no driven ground: no keyframe has a pose")
+        away_m = math.dist(self.spots[found], spot)
+        if is_limited and away_m > _MOST_OFF_M:
+            raise MisuseError(
+                f"{spot[0]:g},{spot[1]:g} is {away_m:.3g} m from where robots have driven; give a"
+                f" point within {_MOST_OFF_M:g} m"
+            )
         return found
 
     def keyframe(self, node: int) -> KeyframeRecord:

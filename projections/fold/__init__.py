@@ -7,7 +7,11 @@ of an Object: `Objects.fold`, or `Matching.choose` by evidence. `semantic_map` r
 
 from array import array
 from collections.abc import MutableSequence
-from typing import Any, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
+
+FOLD_VERSION: Final = 13
+"""To be raised with every change of the reducers that changes the map of some log: what was kept of
+the maps of another version, and databases with them, are made again."""
 
 State: TypeAlias = dict[str, Any]
 """The state of a reducer as it is kept: named values, each a numpy array or JSON."""

@@ -10,6 +10,7 @@ from psycopg import sql
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.log import Event
+from projections.fold import FOLD_VERSION
 from projections.fold.map_errors import (
     CheckpointMoved,
     DatabaseError,
@@ -22,9 +23,9 @@ from .labels import SINKS, SinkName
 from .sink import Checkpoint
 
 _OURS: Final = "mapfold"
-_OF_THIS_VERSION: Final = "mapfold 2:"
-"""The beginning of the schema's comment. Another number is another layout of the tables, the graph
-or the vectors, which nothing but a replay reads."""
+_OF_THIS_VERSION: Final = f"mapfold 2.{FOLD_VERSION}:"
+"""The beginning of the schema's comment. Another first number is another layout of the tables, the
+graph or the vectors, another second one stands for other rules of the map: only a replay helps."""
 FOLLOWING: Final = "mapfold tail"
 REFOLDING: Final = "mapfold tail, refolding"
 """The names of a tail's sessions."""
@@ -96,7 +97,9 @@ def _made_by(connection: Connection) -> str | None:
 def ensure_schema(connection: Connection) -> None:
     """Create the schema ``mapfold`` and its tables."""
     if not has_schema(connection):
-        connection.execute(statements("checkpoint")["create"])
+        made_by = f"{_OF_THIS_VERSION} progress of the projections; made and removed by mapfold"
+        create = statements("checkpoint")["create"]
+        connection.execute(create.format(made_by=sql.Literal(made_by)))
 
 
 def drop_other_version(connection: Connection) -> None:

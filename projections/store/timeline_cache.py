@@ -39,7 +39,7 @@ from eventsrc.log import (
     segment_signatures,
     write_cache_file,
 )
-from projections.fold import State, part, prefixed
+from projections.fold import FOLD_VERSION, State, part, prefixed
 from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
@@ -50,8 +50,6 @@ from .columns import Stripe, joined_short
 from .kept_files import FORMAT, MalformedState, PartFile, Unwritable, pack, read_state, write_part
 from .tables import DamagedPart
 
-FOLD_VERSION: Final = 13
-"""To be raised with every change of the reducers that changes the map of some log."""
 MIN_EVENTS: Final = 2_000
 """Events; folding fewer takes about as long as starting Python."""
 MOST_KEPT: Final = 4

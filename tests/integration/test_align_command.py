@@ -112,6 +112,11 @@ def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
     assert "--jumps takes neither --to nor --picture" in said.err
 
 
+def test_a_log_without_runs_says_so(mapfold: Commands) -> None:
+    said = mapfold("align", log_of(mapfold, "empty"), "--run", "x", code=2)
+    assert "has no run that could be aligned" in said.err
+
+
 @pytest.mark.slow
 def test_runs_that_are_not_there_are_named_with_those_that_are(mapfold: Commands) -> None:
     log = log_of(mapfold, "log", lines("a", HERE), lines("b", HERE))

@@ -198,6 +198,10 @@ def test_a_map_of_another_version_is_refused_until_it_is_made_again(
         tail(log, one_database, SETTINGS, once=True)
     with pytest.raises(ProjectionMismatch, match=again):
         check(log, one_database, SETTINGS)
+    with psycopg.connect(one_database.vector_url, autocommit=True) as connection:
+        connection.execute("COMMENT ON SCHEMA mapfold IS 'mapfold 2.12: of older rules'")
+    with pytest.raises(ProjectionMismatch, match=again):
+        tail(log, one_database, SETTINGS, once=True)
     status = projection_status(log, one_database, SETTINGS)
     assert [sink.condition for sink in status.sinks] == ["other", "other"]
     rebuild(log, one_database, SETTINGS)

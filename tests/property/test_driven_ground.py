@@ -4,9 +4,11 @@ import math
 from itertools import pairwise
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 from projections.ask.driven_ground import DrivenGround
@@ -75,6 +77,14 @@ def lengths_by_hand(view: MapView) -> tuple[list[KeyframeRecord], list[list[floa
                 longer = lengths[a][middle] + lengths[middle][b]
                 lengths[a][b] = min(lengths[a][b], longer)
     return nodes, lengths
+
+
+def test_a_point_far_from_driven_ground_is_refused() -> None:
+    view = Folded.start(Settings()).extend([envelope(n, n / 4) for n in range(9)]).view
+    ground = DrivenGround(view)
+    assert ground.spots[ground.nearest((2.0, 9.9))] == (2.0, 0.0)
+    with pytest.raises(MisuseError, match="2,-50 is 50 m from where robots have driven"):
+        ground.nearest((2.0, -50.0))
 
 
 @given(poses=POSES)

@@ -7,7 +7,7 @@ SELECT coalesce(obj_description(oid, 'pg_namespace'), '') FROM pg_namespace WHER
 
 -- name: create
 CREATE SCHEMA mapfold;
-COMMENT ON SCHEMA mapfold IS 'mapfold 2: progress of the projections; made and removed by mapfold';
+COMMENT ON SCHEMA mapfold IS {made_by};
 CREATE TABLE mapfold.checkpoint (
     sink         text PRIMARY KEY,
     log_id       text NOT NULL,

@@ -166,12 +166,14 @@ class _Frames(CachedLog):
 
         reader, end, _, corrections, settings = opened
         runs = [run.run_id for run in self._view(opened).runs]
-        target = runs[0] if self.to is None and runs else self.to
+        if not runs:
+            raise MisuseError(f"{self.log} has no run that could be aligned")
+        target = runs[0] if self.to is None else self.to
         if target in runs:
             moved = [self._moved(runs, RunId(target))]
             others = set(runs) - {target}
             frame = map_of_runs(reader, end, corrections, settings, others)
-        elif target is not None and Path(target).is_dir():
+        elif Path(target).is_dir():
             moved = runs if self.run is None else [self._known(runs, self.run)]
             with LogReader(Path(target)) as other:
                 known = read_corrections(other, other.next_offset)
@@ -179,10 +181,10 @@ class _Frames(CachedLog):
                 frame = map_of_runs(other, other.next_offset, known, own, ())
         else:
             raise MisuseError(
-                f"--to {visible(str(target))}: neither a run of {self.log} nor a log; {_runs(runs)}"
+                f"--to {visible(target)}: neither a run of {self.log} nor a log; {_runs(runs)}"
             )
         rest = set(runs) - set(moved)
-        return frame, map_of_runs(reader, end, corrections, settings, rest), str(target), moved
+        return frame, map_of_runs(reader, end, corrections, settings, rest), target, moved
 
     def _moved(self, runs: list[RunId], target: RunId) -> RunId:
         """The run that gets the frame of the run ``target``."""
@@ -238,7 +240,7 @@ def align(
     alone, by evidence, and objects are compared by looks and distances. A transform is sure,
     likely, or not found: with few things in common right and wrong look alike.
 
-    Exit 3 when none is found, or --write would need --yes; with --jumps when one is not corrected.
+    Exit 3 when one cannot be told or --write would need --yes; with --jumps also when one is left.
     """
     check_picture(picture)
     if jumps and (picture is not None or frames.to is not None):
@@ -254,31 +256,32 @@ def align(
             f"mapfold align needs {error.name}, which is not installed; pip install"
             " 'mapfold[align]'"
         ) from None
+    if not json_:
+        contradictions = map(str, several[1]) if several is not None else ()
+        lines = [*(each.text for each in proposals), *contradictions]
+        display("\n".join(lines) or _NO_JUMP)
     who = user_at_host() if issued_by is None else issued_by
     wanted = ("sure", "likely" if yes else "sure")
-    made, left = [], [each for each in proposals if each.transform is not None]
+    recorded, left = list[dict[str, Any]](), [each for each in proposals if each.transform]
     if write:
         usable = [each for each in left if each.verdict in wanted]
         left = [each for each in left if each.verdict not in wanted]
-        made = [_record(frames, zenoh, run, each, who) for each in usable for run in each.runs]
-    recorded = [recorded_document(each) for each in made]
+        for proposal, run in ((each, run) for each in usable for run in each.runs):
+            made = _record(frames, zenoh, run, proposal, who)
+            recorded.append(recorded_document(made))
+            if not json_:
+                display(recorded_text(made))
     documents = [each.document for each in proposals]
     if json_ and several is not None:
         against = [each._asdict() for each in several[1]]
         emit({"runs": documents, "contradictions": against, "recorded": recorded})
     elif json_:
         emit(({"steps": documents} if jumps else documents[0]) | {"recorded": recorded})
-    else:
-        contradictions = map(str, several[1]) if several is not None else ()
-        lines = [*(each.text for each in proposals), *contradictions]
-        display("\n".join(lines) or _NO_JUMP)
-        for each in made:
-            display(recorded_text(each))
-        if left:
-            also = " --yes" if all(each.verdict == "likely" for each in left) else ""
-            what = "what is not sure is not" if made else "nothing is"
-            say(f"{what} written; --write{also} records the correction of its poses")
-    is_unknown = not jumps and any(each.verdict == "unknown" for each in proposals)
+    elif left:
+        also = " --yes" if all(each.verdict == "likely" for each in left) else ""
+        what = "what is not sure is not" if recorded else "nothing is"
+        say(f"{what} written; --write{also} records the correction of its poses")
+    is_unknown = any(each.verdict == "unknown" for each in proposals)
     finish(findings=is_unknown or (bool(left) and (write or jumps)))
 
 

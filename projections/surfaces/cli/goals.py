@@ -33,7 +33,8 @@ GoalOption = Annotated[
     ),
 ]
 ClearanceOption = Annotated[
-    float, option("METRES", "Least distance of goals from walls.", "--clearance", min=0.0)
+    float,
+    option("METRES", "Least distance of goals from walls.", "--clearance", min=0.0, max=100.0),
 ]
 
 
