@@ -72,7 +72,7 @@ def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> Non
     assert "correct-poses" not in mapfold("edits", log).out
     mapfold("align", log, "--write", "--yes")
     assert mapfold("edits", log).out.count("correct-poses") == 1
-    few = "".join(lines("b", FRAME).splitlines(keepends=True)[:6])
+    few = "".join(lines("b", FRAME).splitlines(keepends=True)[: 14 // stride(2)])
     part = log_of(mapfold, "part", lines("a", HERE), few)
     said = mapfold("align", part, "--write", "--yes", code=3)
     assert "sim-7-b into the frame of sim-7-a: cannot tell: " in said.out

@@ -52,8 +52,10 @@ def test_the_picture_of_the_readme(rooms: UiServer, visit: Visit, pictures: Path
 
 
 def _settled(page: Page, state: str) -> None:
-    if state in ("merge", "why", "diff"):
+    if state in ("merge", "why"):
         page.locator("#panel .command").wait_for()
+    if state == "diff":
+        page.get_by_text("How the two maps differ").wait_for()
     if state == "whatif":
         page.locator("table").wait_for()
     page.wait_for_timeout(250)
