@@ -37,6 +37,14 @@ def test_an_empty_log_that_begins(mapfold: Commands, tmp_path: Path) -> None:
         assert until(heard, lambda d: d["through"] == 3)["problems"] == []
 
 
+def test_a_log_that_has_settings_only(mapfold: Commands, tmp_path: Path) -> None:
+    mapfold("import", tmp_path / "log", "-", "--preset", "full", stdin=b"")
+    with showing(mapfold, tmp_path / "log") as server:
+        (said,) = problems(server)
+        assert said.startswith("none of the 1 event is a keyframe, so there is no map; `mapfold r")
+        assert "FILE` reads a file" in said
+
+
 def test_a_log_without_poses(mapfold: Commands, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", [envelope(k, None) for k in range(3)])
     with showing(mapfold, log) as server:

@@ -200,16 +200,15 @@ class LogMap:
                 f"the timeline marks the first {MOST_REPORTS:,} rejected payloads and losses,"
                 f" not the {left_out:,} after them"
             )
+        record, read = (f"`{command_line(name, self.opened.log)}" for name in ("record", "import"))
+        how = f"{record}` records a robot, {read} FILE` reads a file"
         if self.through == 0 and not found:
-            record, read = (
-                f"`{command_line(name, self.opened.log)}" for name in ("record", "import")
-            )
-            how = f"{record}` records a robot, {read} FILE` reads a file"
             return [f"the log has no events yet; this page shows them as they are recorded: {how}"]
         history = self.timeline.history
         if self.through and not history.keyframes:
             found.append(
-                f"none of the {counted(self.through, 'event')} is a keyframe, so there is no map"
+                f"none of the {counted(self.through, 'event')} is a keyframe, so there is no map;"
+                f" {how}"
             )
         elif history.keyframes and all(k.pose is None for k in history.keyframes):
             found.append(
