@@ -291,7 +291,7 @@ def _query_errors(url: str) -> Iterator[None]:
 
 
 _CANDIDATES = max(200, NEIGHBOURS)
-"""From the index, compared by whole vectors: at 300,000 observations 0.992 of the ten nearest."""
+"""From the index, compared by whole vectors: at 300,000 observations 0.991 of the ten nearest."""
 
 
 def relocalize(
