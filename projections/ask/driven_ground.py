@@ -324,8 +324,9 @@ class DrivenGround:
 
 
 def _squares(poses: Poses) -> tuple[NDArray[np.int64], int]:
-    """The square of each pose as a number, and by how much that grows from one column to the next;
-    `_REACH` squares around those of a floor are nobody's."""
+    """The square of each pose as a number, and by how much that grows from one column to the next.
+    Between the squares of two floors there are `_REACH` empty ones, so none of them is beside one
+    of another floor."""
     cells = poses.positions_um // metres_to_um(_CELL_M)
     columns, rows = (cells - cells.min(axis=0, initial=0)).T
     wide = int(rows.max(initial=0)) + 1 + _REACH

@@ -68,10 +68,10 @@ def clearance(walls: Walls, cap: int) -> NDArray[np.int32]:
     return limited
 
 
-def regions(walls: Walls, cell_m: float) -> Labels:
-    """The region of each cell, numbered from 0 in the order of their first cells; `NOWHERE` for
-    walls."""
-    wide = np.pad(clearance(walls, clearance_cap(cell_m)), 1)  # a border of wall
+def regions(near: NDArray[np.int32], cell_m: float) -> Labels:
+    """The region of each cell by its clearance, up to `clearance_cap`; numbered from 0 in the order
+    of their first cells, `NOWHERE` for walls."""
+    wide = np.pad(near, 1)  # a border of wall
     least, enough = math.floor((MIN_WIDTH_M / cell_m) ** 2), math.ceil(USUAL_M2 / cell_m**2)
     flat, stride = wide.ravel(), wide.shape[1]
     basins, summits = _basins(flat, stride)

@@ -63,9 +63,9 @@ class OccupancyGrid:
         block_m = self.block * source.resolution
         self.walls = walls & _cells(kept, self.block, walls.shape)
         self._rows = [row.tobytes() for row in self.walls.astype(np.uint8)]
-        self.inside: Labels = regions(kept, block_m)
-        """The region of each block, `NOWHERE` for those with a wall."""
         near = clearance(kept, clearance_cap(block_m))
+        self.inside: Labels = regions(near, block_m)
+        """The region of each block, `NOWHERE` for those with a wall."""
         self._small = _small_regions(self.inside, near, self.block * self.side_um)
         self.regions: Labels = _spread(self.inside, _SPREAD)
 

@@ -15,6 +15,7 @@ from projections.fold.map_regions import (
     Labels,
     Walls,
     clearance,
+    clearance_cap,
     regions,
 )
 from tests.support.thorough import examples
@@ -36,6 +37,10 @@ def test_clearance_is_the_distance_to_the_nearest_wall(walls: Walls, cap: int) -
     for row, column in np.ndindex(walls.shape):
         squares = [(row - r) ** 2 + (column - c) ** 2 for r, c in at]
         assert found[row, column] == min([cap * cap, *squares])
+
+
+def _regions(walls: Walls, cell_m: float) -> Labels:
+    return regions(clearance(walls, clearance_cap(cell_m)), cell_m)
 
 
 def _slow_regions(walls: Walls, cell_m: float) -> Labels:
@@ -93,13 +98,13 @@ def _slow_regions(walls: Walls, cell_m: float) -> Labels:
 @settings(max_examples=examples(500))
 @given(grids, st.sampled_from([0.05, 0.1, 0.3]))
 def test_regions_are_those_of_the_rules(walls: Walls, cell_m: float) -> None:
-    assert np.array_equal(regions(walls, cell_m), _slow_regions(walls, cell_m))
+    assert np.array_equal(_regions(walls, cell_m), _slow_regions(walls, cell_m))
 
 
 @settings(max_examples=examples(500))
 @given(grids)
 def test_every_cell_that_is_no_wall_has_a_region(walls: Walls) -> None:
-    assert np.array_equal(regions(walls, 0.1) == NOWHERE, walls)
+    assert np.array_equal(_regions(walls, 0.1) == NOWHERE, walls)
 
 
 def _plan(text: str) -> Walls:
@@ -116,7 +121,7 @@ def _room(wide: int, high: int) -> Walls:
 def test_a_door_parts_two_rooms(door: int) -> None:
     walls = np.concatenate([_room(30, 30), _room(40, 30)[:, 1:]], axis=1)
     walls[12 : 12 + door, 31] = False
-    found = regions(walls, 0.1)
+    found = _regions(walls, 0.1)
     assert set(found[~walls].tolist()) == {0, 1}
     assert len(set(found[1:-1, 1:28].ravel().tolist())) == 1
     assert found[15, 5] != found[15, 60]
@@ -125,7 +130,7 @@ def test_a_door_parts_two_rooms(door: int) -> None:
 def test_a_wide_opening_parts_nothing() -> None:
     walls = np.concatenate([_room(30, 30), _room(40, 30)[:, 1:]], axis=1)
     walls[2:30, 31] = False
-    assert set(regions(walls, 0.1)[~walls].tolist()) == {0}
+    assert set(_regions(walls, 0.1)[~walls].tolist()) == {0}
 
 
 def test_a_corridor_is_one_region_beside_its_rooms() -> None:
@@ -134,7 +139,7 @@ def test_a_corridor_is_one_region_beside_its_rooms() -> None:
     walls[32:50, 1:99] = False  # a corridor of 1.8 m
     for door in (12, 45, 80):
         walls[31, door : door + 9] = False
-    found = regions(walls, 0.1)
+    found = _regions(walls, 0.1)
     corridor = set(found[41, 1:99].tolist())
     rooms = {int(found[15, column]) for column in (15, 50, 80)}
     assert len(corridor) == 1
@@ -150,7 +155,7 @@ def test_a_corridor_is_one_region_though_wider_at_doors_and_where_another_crosse
     walls[1:83, 110:128] = True
     walls[1:83, 111:127] = False  # a corridor of 1.6 m
     walls[32:52, 1:169] = False  # one of 2 m across
-    found = regions(walls, 0.1)
+    found = _regions(walls, 0.1)
     corridor = set(found[41, 1:169].tolist())
     assert len(corridor) == 1
     assert set(found[2:82, 119].tolist()) == corridor
@@ -162,9 +167,9 @@ def test_what_is_too_narrow_for_a_room_is_part_of_what_it_opens_to() -> None:
     niche = np.ones((32, 8), bool)
     niche[10:15, 0:6] = False  # half a metre wide
     both = np.concatenate([walls[:, :-1], niche], axis=1)
-    assert set(regions(both, 0.1)[~both].tolist()) == {0}
+    assert set(_regions(both, 0.1)[~both].tolist()) == {0}
 
 
 def test_a_map_without_walls_is_one_region_and_one_of_walls_is_none() -> None:
-    assert set(regions(np.zeros((20, 30), bool), 0.1).ravel().tolist()) == {0}
-    assert set(regions(np.ones((20, 30), bool), 0.1).ravel().tolist()) == {NOWHERE}
+    assert set(_regions(np.zeros((20, 30), bool), 0.1).ravel().tolist()) == {0}
+    assert set(_regions(np.ones((20, 30), bool), 0.1).ravel().tolist()) == {NOWHERE}

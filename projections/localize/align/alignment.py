@@ -225,16 +225,23 @@ def decision_text(found: Alignment | None) -> str:
             f"cannot tell: {counted(number, 'common thing')}; {USUALLY_ENOUGH} are usually enough"
         )
     common = counted(len(found.pairs), "common thing")
+    move = move_text(found.transform, found.se_m, found.verdict, found.is_one_frame)
     if found.is_one_frame:
-        return f"already in one frame, within {2.0 * found.se_m:.2f} m: {common}"
-    x, y, angle = found.transform
-    sure = "" if found.verdict == "sure" else ", but not surely"
+        return f"{move}: {common}"
     return (
-        f"moved by ({x:.2f}, {y:.2f}) m and turned by {math.degrees(angle):.1f}°, "
-        f"± {found.se_m:.2f} m{sure}: {common}, "
-        f"{found.matched} of {found.expected} that should be seen, score {found.score:.0f}, "
-        f"the next best {found.second:.0f}"
+        f"{move}: {common}, {found.matched} of {found.expected} that should be seen, score"
+        f" {found.score:.0f}, the next best {found.second:.0f}"
     )
+
+
+def move_text(transform: Transform, se_m: float, verdict: Verdict, is_one_frame: bool) -> str:
+    """What a transform that was found does, with its standard error, in words."""
+    if is_one_frame:
+        return f"already in one frame, within {2.0 * se_m:.2f} m"
+    x, y, angle = transform
+    sure = "" if verdict == "sure" else ", but not surely"
+    turned = f"turned by {math.degrees(angle):.1f}°, ± {se_m:.2f} m{sure}"
+    return f"moved by ({x:.2f}, {y:.2f}) m and {turned}"
 
 
 def _candidates(both: Comparison) -> list[Transform]:

@@ -18,7 +18,7 @@ import numpy as np
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 
-from .alignment import LIKELY, SURE, Alignment, Verdict, align
+from .alignment import LIKELY, SURE, Alignment, Verdict, align, move_text
 from .framed_things import FramedThings
 from .matching import Floats, Transform, jacobians, least_cut, moved, rotation
 
@@ -57,14 +57,9 @@ class PlacedRun:
         into = f"{visible(self.run)} into the frame of {visible(self.frame)}"
         if self.verdict == "unknown":
             return f"{into}: cannot tell, for pairs of runs contradict each other"
-        if self.is_one_frame:
-            return f"{into}: already in one frame, within {2.0 * self.se_m:.2f} m"
-        x, y, angle = self.transform
-        sure = "" if self.verdict == "sure" else ", but not surely"
-        return (
-            f"{into}: moved by ({x:.2f}, {y:.2f}) m and turned by {math.degrees(angle):.1f}°, "
-            f"± {self.se_m:.2f} m{sure}: by {counted(self.pairs, 'pair')} of runs"
-        )
+        move = move_text(self.transform, self.se_m, self.verdict, self.is_one_frame)
+        by = "" if self.is_one_frame else f": by {counted(self.pairs, 'pair')} of runs"
+        return f"{into}: {move}{by}"
 
     def document(self) -> dict[str, Any]:
         """The run as JSON."""

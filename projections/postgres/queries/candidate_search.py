@@ -241,9 +241,9 @@ class CandidateSearch:
 
 @lru_cache(maxsize=128)
 def _statement(name: str, crops: int = 0, neighbours: int = 0, dimension: int = 1) -> bytes:
-    """The text of a statement, short, as psycopg reads a long one anew for every question. In those
-    that search, ``crops`` is the number of crops, all of one ``dimension``, and ``neighbours`` that
-    of observations for each."""
+    """The text of a statement, without comments and line breaks, as psycopg parses long texts again
+    for each question. Those that search are for so many ``crops``, all of one ``dimension``, and
+    find ``neighbours`` observations for each."""
     rows = [
         sql.SQL("({}::int, {}::vector)").format(sql.Literal(i), sql.Placeholder(f"crop_{i}"))
         for i in range(crops)

@@ -57,8 +57,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
         if came.get():
             stop.set()
 
-    # A handler may interrupt this thread while it holds a lock: that of `stop`, or one that is
-    # taken to start a thread. `SimpleQueue.put` may be called all the same.
+    # A handler may interrupt this thread while it holds a lock, that of `stop` or one that starting
+    # a thread needs, and must not wait for it. `SimpleQueue.put` is reentrant.
     came = SimpleQueue[bool]()
     threading.Thread(target=set_when_it_came, name="stop", daemon=True).start()
     for number in usual:

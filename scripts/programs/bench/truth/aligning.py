@@ -32,7 +32,7 @@ _FAR_M, _TURNED_DEG = 1.0, 10.0
 _REACH_M = 20.0
 _BACK_M: Final = 0.5
 _COMMON: Final = (0, 8, 12, 20)
-"""Least numbers of common things by which parts of runs are told apart."""
+"""Thirds of runs stand in the row of the largest of these numbers of common things they reach."""
 
 
 @dataclass(frozen=True, slots=True)
