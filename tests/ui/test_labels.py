@@ -5,7 +5,7 @@ from itertools import combinations
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page
+from playwright.sync_api import Page, expect
 
 from tests.support.commands import Commands
 from tests.support.envelopes import detection, envelope
@@ -112,3 +112,8 @@ def test_far_off_places_have_names_without_what_all_ids_begin_with(
     names = [text.strip("\u2068\u2069") for text, *_ in texts_of(page)]
     assert len(names) >= 10
     assert {name[:3] for name in names} <= {"a_p", "b_p"}
+    page.get_by_role("button", name=f"all {ROOMS}").click()
+    rows = page.locator("table.rooms tbody th button").all_inner_texts()
+    assert set(names) <= {row.strip("\u2068\u2069") for row in rows}
+    page.get_by_label("Search places").fill(names[0])
+    expect(page.get_by_role("option").first).to_contain_text(names[0])

@@ -61,6 +61,24 @@ def test_rooms_and_objects_are_those_of_the_commands(
     expect(page.locator(".thing .kind")).to_have_text("place")
 
 
+def test_while_it_loads_the_panel_says_so_and_never_that_there_are_no_rooms(
+    rooms: UiServer, visit: Visit
+) -> None:
+    page = visit(rooms, wait=False)
+    asked: list[str] = []
+    page.on("request", lambda r: asked.append(r.url) if "/api/overview" in r.url else None)
+    page.route("**/api/overview*", lambda route: None)  # unanswered for now
+    page.reload()
+    panel = page.locator("#panel")
+    expect(panel).to_have_text("Loading rooms and objects …")
+    page.unroute("**/api/overview*")
+    page.reload()
+    expect(panel.locator("h2").first).to_have_text("8 rooms")
+    through = rooms.api("log")["through"]
+    assert asked
+    assert all(f"at={through}" in url for url in asked)
+
+
 def test_objects_are_sorted_and_filtered(rooms: UiServer, visit: Visit) -> None:
     page = visit(rooms)
     page.get_by_role("button", name="all 49").click()

@@ -4,7 +4,7 @@
  */
 
 import { floorOfPlace } from "../model/floors";
-import { isolated, label, labelOfPlace, objectClass } from "../model/names";
+import { isolated, label, shortPlace, objectClass } from "../model/names";
 import { isPlaceLit, litObject } from "./lit";
 import { placeColour, withAlpha } from "./palette";
 import type { Scene } from "./scene";
@@ -76,7 +76,7 @@ function placeLabels(scene: Scene): Wanted[] {
     x: screenX(view, map.x[place]),
     y: screenY(view, map.y[place]),
     away: 0,
-    text: isolated(label(map.name[place] ?? labelOfPlace(history, place), near ? 28 : 16)),
+    text: isolated(label(map.name[place] ?? shortPlace(history, place), near ? 28 : 16)),
     second: near || isPlaceLit(scene, place) ? [map.size[place], map.name[place] === null && scene.types.get(history.placeIds[place])?.type].filter(Boolean).join(" · ") : undefined,
     font: near ? PLACE_FONT : FAR_FONT,
     strays: near,

@@ -39,34 +39,21 @@ export const findObject = (history: History, id: string) => numberOf(objectNumbe
 
 const shortPlaces = new WeakMap<History, string[]>();
 
-/** `p7` where no other place has this number, else the whole id. */
+/** `p7` where no other place has this number, else the id without what all ids begin with: `a_p7` for `house-a_p7`. */
 export function shortPlace(history: History, place: number): string {
   let found = shortPlaces.get(history);
   if (found === undefined) {
-    const numbers = history.placeIds.map((id) => /_(p\d+)$/.exec(id)?.[1] ?? id);
+    const ids = history.placeIds;
+    const numbers = ids.map((id) => /_(p\d+)$/.exec(id)?.[1] ?? id);
     const used = new Map<string, number>();
     for (const each of numbers) used.set(each, (used.get(each) ?? 0) + 1);
-    found = numbers.map((each, number) => (used.get(each) === 1 ? each : history.placeIds[number]));
+    let same = 0;
+    while (ids.length > 1 && same < ids[0].length && ids.every((id) => id[same] === ids[0][same])) same++;
+    const start = (/^.*[-_:/.]/.exec(ids[0]?.slice(0, same) ?? "")?.[0] ?? "").length;
+    found = numbers.map((each, number) => (used.get(each) === 1 ? each : ids[number].slice(start)));
     shortPlaces.set(history, found);
   }
   return found[place];
-}
-
-const commonStarts = new WeakMap<History, number>();
-
-/** The short id without what all ids of places begin with: `a_p7` for `house-a_p7`. */
-export function labelOfPlace(history: History, place: number): string {
-  const short = shortPlace(history, place);
-  const ids = history.placeIds;
-  if (short !== ids[place]) return short;
-  let start = commonStarts.get(history);
-  if (start === undefined) {
-    let same = 0;
-    while (same < ids[0].length && ids.every((id) => id[same] === ids[0][same])) same++;
-    start = (/^.*[-_:/.]/.exec(ids[0].slice(0, same))?.[0] ?? "").length;
-    commonStarts.set(history, start);
-  }
-  return short.slice(start);
 }
 
 /** `obj-` and six digits, as in commands. */

@@ -22,7 +22,7 @@ const ASK_AFTER_MS = 250;
 export function Overview({ history }: { history: History }) {
   const facts = store.mapFacts.value;
   const at = store.restedAt.value;
-  if (facts === null || at > history.through) return <p class="dim" role="status">Asking …</p>;
+  if (facts === null || at > history.through) return <p class="dim" role="status">Loading rooms and objects …</p>;
   return (
     <section class={store.mapFactsNow.value === null ? "story stale" : "story"}>
       <Changed history={history} at={facts.at} />

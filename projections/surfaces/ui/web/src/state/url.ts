@@ -43,7 +43,7 @@ export function applyAddress(hash: string) {
     store.floor.value = found.floor === null ? null : floors.indexOf(found.floor);
     const through = store.history.value?.through ?? 0;
     const at = found.at === null ? through : Math.max(0, Math.min(through, Math.round(found.at)));
-    store.at.value = at;
+    store.at.value = store.restedAt.value = at;
     store.live.value = found.at === null;
   });
 }
