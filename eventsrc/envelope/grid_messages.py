@@ -1,11 +1,12 @@
 """Occupancy maps from nav_msgs/OccupancyGrid messages, as JSON or in CDR.
 
-CDR is how bridges send the message and bags hold it; docs/decisions/map-messages.md says why this
-one has a reader of its own. The JSON has the fields of the ROS message: ``info`` with
-``resolution``, ``width``, ``height`` and ``origin`` (``position`` and the quaternion
-``orientation``), and ``data``, row by row from the origin: -1 for unknown, else 0 to 100.
-``header`` is optional, and so is ``floor``, which ROS does not have: the floor that the map shows,
-as in envelopes.
+CDR is how bridges send the message and bags hold it. This one has a reader of its own, as rosbags
+is an extra: its fields are fixed, and CDR's rules are three.
+
+The JSON has the fields of the ROS message: ``info`` with ``resolution``, ``width``, ``height`` and
+``origin`` (``position`` and the quaternion ``orientation``), and ``data``, row by row from the
+origin: -1 for unknown, else 0 to 100. ``header`` is optional, and so is ``floor``, which ROS does
+not have: the floor that the map shows, as in envelopes.
 """
 
 import math
