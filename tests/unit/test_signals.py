@@ -120,6 +120,35 @@ def test_signals_that_come_at_once_leave_no_traceback(kind: str, codes: set[int]
     assert (done.returncode in codes, done.stderr) == (True, b"")
 
 
+_IN_CALLBACK = """
+import signal, sys, threading, weakref
+from projections.surfaces.cli.program import run_app
+
+class Thing:
+    pass
+
+def command():
+    thing = Thing()
+    seen = weakref.ref(thing, lambda _: signal.raise_signal(int(sys.argv[1])))
+    del thing  # what the callback raises is ignored
+    threading.Event().wait(50.0)
+    raise AssertionError("the signal was lost")
+
+run_app(command)
+"""
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_within_a_callback_of_a_weak_reference_ends_the_command(
+    sent: signal.Signals, code: int
+) -> None:
+    done = prefork.run(
+        _IN_CALLBACK, ["-c", str(int(sent))], env={**os.environ}, cwd=prefork.ROOT, timeout=60.0
+    )
+    assert done.returncode == code, done.stderr
+    assert b"Traceback" not in done.stderr
+
+
 @pytest.mark.usefixtures("unhandled")
 def test_a_signal_that_is_ignored_stays_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup

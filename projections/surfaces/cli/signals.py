@@ -12,6 +12,7 @@ from typing import Final, Self
 
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _POLL_S: Final = 0.25
+_AGAIN_S: Final = 0.01
 
 
 class _PollingEvent(threading.Event):
@@ -77,6 +78,9 @@ def unwind_on_signals() -> Iterator[None]:
 
     Further ones are ignored, so that they do not interrupt these blocks. Where one of them is
     handled or ignored already, that stays so.
+
+    Python calls a handler in the middle of a finalizer or a callback of a weak reference too, and
+    ignores what is raised there. That is raised once more, a moment later.
     """
     ours = [
         number
@@ -89,11 +93,27 @@ def unwind_on_signals() -> Iterator[None]:
             signal.signal(number, _ignore)
         sys.exit(128 + signum)
 
+    usual = sys.unraisablehook
+
+    def raise_later(ignored: "sys.UnraisableHookArgs") -> None:
+        error = ignored.exc_value
+        if not isinstance(error, SystemExit | KeyboardInterrupt):
+            usual(ignored)
+            return
+
+        def raise_again(_number: int, _frame: FrameType | None) -> None:
+            raise error
+
+        signal.signal(signal.SIGALRM, raise_again)
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
     for number in ours:
         signal.signal(number, leave)
+    sys.unraisablehook = raise_later
     try:
         yield
     finally:
+        sys.unraisablehook = usual
         for number in ours:
             signal.signal(number, signal.SIG_DFL)
 
