@@ -8,6 +8,8 @@ import { Stamps, momentsOf, neighbour, playedTo } from "../src/model/moments";
 import { findKeyframe, keyframeId, label, shortPlace } from "../src/model/names";
 import { foundHit, searchLocally } from "../src/model/search";
 import { completions, quoted } from "../src/panels/completion";
+import { Axis, busySpans, lengthOf } from "../src/timeline/axis";
+import { lanesOf } from "../src/timeline/lanes";
 import { objectsText } from "../src/ui/summary";
 import { encoded, randomTables } from "./histories";
 
@@ -39,6 +41,36 @@ describe("moments", () => {
       const last = Math.max(-1, ...Array.from(offset).filter((_, row) => stamp[row] <= time));
       expect(stamps.at(time)).toBe(time >= stamps.last ? history.through : last + 1);
     }
+  });
+});
+
+describe("the axis of time", () => {
+  const [march, november] = [1_774_357_200, 1_795_000_000];
+  const stamps = Array.from({ length: 600 }, (_, each) => march + each);
+  const spans = busySpans([...stamps, november]);
+  it("folds what was idle, and leaves a pause that is short beside the rest", () => {
+    expect(spans).toEqual([[march, march + 599], [november, november]]);
+    expect(busySpans(stamps.filter((each) => each < march + 200 || each > march + 250))).toHaveLength(1);
+    expect(busySpans([])).toEqual([]);
+  });
+  it("is the same both ways, and keeps order", () => {
+    const axis = new Axis(spans, 10, 1000);
+    for (const each of [...stamps, november]) expect(axis.valueOf(axis.xOf(each))).toBeCloseTo(each, 3);
+    expect(axis.xOf(march + 599) - axis.xOf(march)).toBeGreaterThan(900);
+    expect([axis.xOf(0), axis.xOf(2 * november)]).toEqual([10, 1010]);
+    expect(axis.folds.map(({ seconds }) => lengthOf(seconds))).toEqual(["8 months"]);
+    for (const { x } of axis.timeTicks(76)) expect(x).toBeGreaterThanOrEqual(10);
+  });
+});
+
+describe("lanes", () => {
+  it("are of one run each while there are few, and then of runs that are not at the same time", () => {
+    const run = Int32Array.from({ length: 80 }, (_, each) => each >> 1);
+    const keyframes = { ...history.keyframes, run, offset: Int32Array.from(run.keys()), stamp: Float64Array.from(run, (each, row) => 100 * each + 50 * (row % 2)) };
+    const lanes = (runs: number) => lanesOf({ ...history, keyframes, runIds: Array.from({ length: runs }, String) }).map(({ lane }) => lane);
+    expect(lanes(40).every((lane) => lane === 0)).toBe(true);
+    const few = { ...keyframes, run: run.slice(0, 8), offset: keyframes.offset.slice(0, 8) };
+    expect(lanesOf({ ...history, keyframes: few, runIds: ["a", "b", "c", "d"] }).map(({ lane }) => lane)).toEqual([0, 1, 2, 3]);
   });
 });
 

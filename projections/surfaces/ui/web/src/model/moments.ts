@@ -90,38 +90,42 @@ export function playedTo(history: History, moments: Moments, at: number, seconds
   return Math.max(at, to === 0 ? 0 : offset[to - 1] + 1);
 }
 
-/** W as a time: up to and including the last event stamped then or earlier, wherever it stands. */
+/** W as a time: up to and including the last event stamped then or earlier, wherever it stands; with a run the last keyframe of that. */
 export class Stamps {
-  private readonly stamps: Float64Array;
+  /** Of all events that have one, ascending. */
+  readonly sorted: Float64Array;
   private readonly through: Int32Array;
   readonly first: number;
   readonly last: number;
 
-  constructor(private readonly history: History) {
-    const { offset, stamp } = history.events;
-    const rows = Array.from(offset.keys()).filter((row) => !Number.isNaN(stamp[row]) && stamp[row] > 0);
+  constructor(
+    private readonly history: History,
+    private readonly run: number | null = null,
+  ) {
+    const { offset, stamp } = run === null ? history.events : history.keyframes;
+    const rows = Array.from(offset.keys()).filter((row) => stamp[row] > 0 && (run === null || history.keyframes.run[row] === run));
     rows.sort((a, b) => stamp[a] - stamp[b]);
-    this.stamps = Float64Array.from(rows, (row) => stamp[row]);
+    this.sorted = Float64Array.from(rows, (row) => stamp[row]);
     this.through = new Int32Array(rows.length);
     let most = 0;
     rows.forEach((row, index) => {
       most = Math.max(most, offset[row] + 1);
       this.through[index] = most;
     });
-    this.first = this.stamps[0] ?? 0;
-    this.last = this.stamps[this.stamps.length - 1] ?? 0;
+    this.first = this.sorted[0] ?? 0;
+    this.last = this.sorted[this.sorted.length - 1] ?? 0;
   }
 
   get any(): boolean {
-    return this.stamps.length > 1 && this.last > this.first;
+    return this.sorted.length > 1 && this.last > this.first;
   }
 
   at(stamp: number): number {
-    if (stamp >= this.last) return this.history.through;
-    let [low, high] = [0, this.stamps.length];
+    if (stamp >= this.last && this.run === null) return this.history.through;
+    let [low, high] = [0, this.sorted.length];
     while (low < high) {
       const middle = (low + high) >> 1;
-      if (this.stamps[middle] <= stamp) low = middle + 1;
+      if (this.sorted[middle] <= stamp) low = middle + 1;
       else high = middle;
     }
     return low === 0 ? 0 : this.through[low - 1];
@@ -131,8 +135,15 @@ export class Stamps {
   of(at: number): number {
     const { offset, stamp } = this.history.events;
     for (let row = rowsBefore(offset, at) - 1; row >= 0; row--) {
-      if (!Number.isNaN(stamp[row]) && stamp[row] > 0) return stamp[row];
+      if (stamp[row] > 0) return stamp[row];
     }
     return this.first;
+  }
+
+  /** The run whose keyframe is the last event before W; -1 if that is no keyframe. */
+  runOf(at: number): number {
+    const { offset, run } = this.history.keyframes;
+    const row = rowsBefore(offset, at) - 1;
+    return row >= 0 && offset[row] === at - 1 ? run[row] : -1;
   }
 }

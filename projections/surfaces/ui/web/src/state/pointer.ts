@@ -14,6 +14,8 @@ export interface Tip {
 
 export const tip = signal<Tip | null>(null);
 export const markTip = signal<{ x: number; y: number; lines: string[] } | null>(null);
+/** W under the pointer on the timeline. */
+export const pointedAt = signal<number | null>(null);
 export const menu = signal<{ x: number; y: number; thing: Thing | null } | null>(null);
 /** A line about what just happened, such as "Copied the link."; gone after a while. */
 export const notice = signal<string | null>(null);

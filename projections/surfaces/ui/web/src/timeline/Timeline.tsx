@@ -4,7 +4,7 @@ import { effect, untracked } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { DARK, LIGHT } from "../map/palette";
 import { goTo, select, showEvent, stepBy, togglePlay } from "../state/actions";
-import { markTip } from "../state/pointer";
+import { markTip, pointedAt } from "../state/pointer";
 import * as store from "../state/store";
 import { Icon, type IconName } from "../ui/icons";
 import { MarkLegend } from "../ui/Legend";
@@ -60,7 +60,7 @@ function Transport() {
           <input class="at" inputMode="numeric" value={String(at)} size={7} title="Number of events that the map covers" onChange={(event) => goTo(Number(event.currentTarget.value.replace(/\D/g, "") || at))} />
         </label>
         <span class="dim">of {(history?.through ?? 0).toLocaleString("en")} events</span>
-        <span class="dim time">{history !== null && stamps !== null && at > 0 ? when(stamps.of(at)) : ""}</span>
+        <Clock />
       </div>
       <MarkLegend />
       <span class="space" />
@@ -89,15 +89,34 @@ function Transport() {
   );
 }
 
+/** The time of the last event before W; of the event under the pointer, with its number, where that is on the track. */
+function Clock() {
+  const [at, stamps] = [pointedAt.value ?? store.at.value, store.stamps.value];
+  const time = stamps === null || at <= 0 ? "" : when(stamps.of(at)).replace(/\.000$/, "");
+  return (
+    <span class="dim time">
+      {pointedAt.value === null ? "" : `event ${(at - 1).toLocaleString("en")}  `}
+      {time}
+    </span>
+  );
+}
+
 function TrackView() {
   const root = useRef<HTMLDivElement>(null);
   const head = useRef<HTMLDivElement>(null);
   const other = useRef<HTMLDivElement>(null);
+  const pointed = useRef<HTMLDivElement>(null);
   useEffect(() => {
     const host = root.current as HTMLDivElement;
     const track = new Track(host);
     const place = () => {
-      (head.current as HTMLDivElement).style.transform = `translateX(${track.xOf(store.at.value)}px)`;
+      const line = head.current as HTMLDivElement;
+      line.style.transform = `translateX(${track.xOf(store.at.value)}px)`;
+      const lane = track.laneY(store.at.value);
+      line.style.setProperty("--lane", lane === null ? "-20px" : `${lane}px`);
+      const hair = pointed.current as HTMLDivElement;
+      hair.hidden = pointedAt.value === null;
+      if (pointedAt.value !== null) hair.style.transform = `translateX(${track.xOf(pointedAt.value)}px)`;
       const mark = other.current as HTMLDivElement;
       const moment = store.panel.value === "compare" && store.compareMode.value === "moments" ? store.compareWith.value : null;
       mark.hidden = moment === null;
@@ -123,7 +142,7 @@ function TrackView() {
     };
   }, []);
   const history = store.history.value;
-  const text = `${store.at.value} of ${history?.through ?? 0} events`;
+  const text = [`${store.at.value} of ${history?.through ?? 0} events`, when(store.stamps.value?.of(store.at.value) ?? Number.NaN).slice(0, 19)].filter(Boolean).join(", ");
   return (
     <div
       class="track"
@@ -138,6 +157,7 @@ function TrackView() {
       aria-valuetext={text}
     >
       <div class="other-head" ref={other} hidden />
+      <div class="pointed" ref={pointed} hidden />
       <div class="head" ref={head} />
     </div>
   );
@@ -167,18 +187,21 @@ function followPointer(host: HTMLElement, track: Track): () => void {
     }
     dragging = true;
     host.setPointerCapture(event.pointerId);
-    goTo(track.atOf(x));
+    goTo(track.atOf(x, y));
   };
   const move = (event: PointerEvent) => {
     const [x, y] = at(event);
     if (dragging) {
-      goTo(track.atOf(x));
+      pointedAt.value = null;
+      goTo(track.atOf(x, y));
       return;
     }
     const marks = track.marksAt(x, y);
     host.classList.toggle("over-mark", marks.length > 0);
     const history = store.history.value;
-    if (marks.length === 0 || history === null) markTip.value = null;
+    pointedAt.value = marks[0] === undefined ? track.atOf(x, y) : marks[0].offset + 1;
+    const idle = track.foldAt(x);
+    if (marks.length === 0 || history === null) markTip.value = idle === null ? null : { x: event.clientX, y: event.clientY, lines: [`${idle} without an event`] };
     else {
       const lines = marks.slice(0, 5).map((mark) => `${mark.offset}  ${markText(history, mark)}`);
       if (marks.length > 5) lines.push(`and ${marks.length - 5} more`);
@@ -189,7 +212,7 @@ function followPointer(host: HTMLElement, track: Track): () => void {
     dragging = false;
   };
   const leave = () => {
-    markTip.value = null;
+    markTip.value = pointedAt.value = null;
   };
   host.addEventListener("pointerdown", down);
   host.addEventListener("pointermove", move);
