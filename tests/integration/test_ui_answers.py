@@ -1,6 +1,7 @@
 """`mapfold ui` over HTTP against the commands, which are asked as a person would."""
 
 import json
+import math
 import random
 import shlex
 import shutil
@@ -198,6 +199,20 @@ class TestTexts:
         pose = whole["pose"]
         assert (pose["x"] - x) ** 2 + (pose["y"] - y) ** 2 < 1.5**2
         assert sum(weight for *_, weight in whole["poses"]) == pytest.approx(1.0)
+        shares = [spot["share"] for spot in whole["spots"]]
+        assert shares == sorted(shares, reverse=True)
+        assert 0.9 < sum(shares) <= 1.0 + 1e-9
+        assert math.hypot(whole["spots"][0]["x"] - x, whole["spots"][0]["y"] - y) < 1.5
+
+    def test_a_keyframe_to_ask_with_is_picked(self, server: UiServer) -> None:
+        end = server.api("log")["through"]
+        picked = server.api("question")
+        assert (picked["ask_at"], picked["whole"]) == (end, True)  # no map is older than the run
+        seen = [server.api("keyframe", number=each) for each in range(0, 445, 20)]
+        most = max(len(each["detections"]) for each in seen)
+        assert len(picked["question"]["crops"]) >= most
+        x, y, _ = picked["truth"]
+        assert server.api("question", near=f"{x},{y}")["truth"][:2] == [x, y]
 
 
 def test_search(server: UiServer) -> None:
@@ -271,6 +286,8 @@ def test_changes_are_those_of_the_command(mapfold: Commands, tmp_path: Path) -> 
         (f"history?from={NINES}", 400, "bad_question", "from is '9999"),
         (f"why?what=keyframe:sim-7-a/{NINES}", 404, "not_found", "no keyframe"),
         (f"why?what=merge:{NINES}", 400, "bad_question", "names no offset"),
+        ("question?near=1", 400, "bad_question", "near is '1'; give it as X,Y"),
+        ("question?near=nan,2", 400, "bad_question", "near is 'nan,2'"),
         (f"keyframe?number={NINES}", 400, "bad_question", "number is '9999"),
         (f"diff?from=1&to={NINES}", 400, "bad_question", "is beyond the end"),
         ("digest?at=tomorrow", 400, "bad_question", "tomorrow"),

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlparse
 
 import pytest
 from playwright.sync_api import Page, expect
@@ -160,20 +161,75 @@ def two_runs(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield server
 
 
-def test_a_lost_robot_is_found_by_the_map_before_its_run(two_runs: UiServer, visit: Visit) -> None:
-    page = visit(two_runs, "#panel=lost")
-    plain = pixels(visit(two_runs, "#at=445&panel=lost"))
+def test_a_lost_robot_is_found_by_the_map_before_its_run(
+    two_runs: UiServer, visit: Visit, pictures: Path
+) -> None:
+    page = visit(two_runs, "#at=700&panel=lost")
+    plain = pixels(page)
     keyframe, question = _question(two_runs)
     page.get_by_label("A keyframe whose crops").fill(keyframe)
     page.get_by_role("button", name="Where is it?").click()
     expect(page.locator(".ranked > li")).not_to_have_count(0)
-    assert moment(page) == 445  # the map of the first run only
+    assert moment(page) == 700
+    expect(page.locator("#panel .note")).to_contain_text("that of 445 events")  # the first run
     got = two_runs.ask("/api/relocalize", method="POST", body=json.dumps(question).encode(), at=445)
     found = got.json
     expect(page.locator(".ranked > li").first).to_contain_text(f"{found['places'][0]['score']:.3f}")
     expect(page.locator(".summary")).to_contain_text("The true pose is")
     page.mouse.move(2, 2)
     other_pixels(page, plain)
+    page.screenshot(path=pictures / "lost.png")
+    page.get_by_role("button", name="Show it").click()
+    assert moment(page) == 445
+
+
+def test_lost_opens_with_crops_of_the_last_run_of_which_some_are_chosen(
+    two_runs: UiServer, visit: Visit
+) -> None:
+    page = visit(two_runs, "#panel=lost")
+    picked = two_runs.api("question")
+    assert picked["keyframe"].startswith("sim-7-b/")
+    crops = picked["question"]["crops"]
+    assert len(crops) > 2
+    expect(page.get_by_label("A keyframe whose crops")).to_have_value(picked["keyframe"])
+    buttons = page.locator(".choose button")
+    expect(buttons).to_have_count(len(crops))
+    for button in buttons.all()[1:]:
+        button.click()
+    expect(page.locator(".choose")).to_contain_text(f"1 crop of {len(crops)}")
+    with page.expect_request("**/api/relocalize*") as asked:
+        page.get_by_role("button", name="Where is it?").click()
+    assert [each["det_id"] for each in asked.value.post_data_json["crops"]] == [crops[0]["det_id"]]
+    expect(page.locator(".summary")).to_be_visible()
+    buttons.first.click()
+    expect(page.get_by_role("button", name="Where is it?")).to_be_disabled()
+
+
+def test_a_click_on_the_map_asks_from_there(two_runs: UiServer, visit: Visit) -> None:
+    page = visit(two_runs, "#panel=lost")
+    answered(page)
+    field = page.get_by_label("A keyframe whose crops")
+    before = field.input_value()
+    with page.expect_request("**/api/question?near=*") as asked:
+        page.locator("canvas.map").click(position={"x": 300, "y": 240})
+    expect(page.locator(".summary")).to_be_visible()
+    near = parse_qs(urlparse(asked.value.url).query)["near"][0]
+    assert field.input_value() == two_runs.api("question", near=near)["keyframe"] != before
+    expect(page.get_by_role("tab", name="Lost")).to_have_attribute("aria-selected", "true")
+
+
+def test_with_one_run_the_whole_map_is_asked_and_the_page_says_so(
+    rooms: UiServer, visit: Visit, pictures: Path
+) -> None:
+    page = visit(rooms, "#panel=lost")
+    through = moment(page)
+    expect(page.locator("#panel .note")).to_contain_text("so the whole map is asked")
+    with page.expect_request("**/api/relocalize*") as asked:
+        page.get_by_role("button", name="Where is it?").click()
+    assert asked.value.url.endswith(f"at={through}")
+    expect(page.locator(".ranked > li")).not_to_have_count(0)
+    assert moment(page) == through
+    page.screenshot(path=pictures / "lost-one-run.png")
 
 
 def _question(server: UiServer) -> tuple[str, Any]:

@@ -238,6 +238,8 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
         question_answer,
         "number",
         "keyframe",
+        "near",
+        "floor",
         *_AT_W,
     )
 

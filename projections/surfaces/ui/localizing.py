@@ -5,6 +5,7 @@ The search needs the map with its embeddings, which histories do not have, so a 
 another W folds the log again. The last such map is kept if it is small.
 """
 
+import math
 import re
 import sys
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from eventsrc.envelope.model import Offset
 from eventsrc.log import Event
 from eventsrc.log.seek import resolve
 from projections.fold.corrections import map_fingerprint
+from projections.fold.deltas import KeyframeOrdinal
 from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import (
     ExactIndex,
@@ -33,6 +35,7 @@ from projections.localize.relocalize import (
 )
 from projections.localize.relocalize.layout import Hypotheses
 from projections.map.parsing import read_corrections
+from projections.store.columns import NONE
 from projections.store.history_recorder import map_after
 
 from .log_map import LogMap, Opened, PrefixReader
@@ -44,6 +47,12 @@ _KEPT_OBSERVATIONS: Final = 20_000
 """Most observations of a map whose search matrix is kept: at 512 dimensions it takes 80 MB."""
 _MOST_TOP: Final = 20
 _MATCHES: Final = 8
+_AS_NEAR_M: Final = 1.0
+"""Keyframes this much farther from a point than the nearest count as near as that."""
+_APART_M: Final = 1.5
+_MOST_SPOTS: Final = 5
+_LEAST_SHARE: Final = 0.02
+"""Alternatives are this far apart, metres, at most so many, each of this share of the weight."""
 
 
 class Localizer:
@@ -76,6 +85,7 @@ class Localizer:
             **found.document(),
             "poses": _poses(found.hypotheses),
             **_floors(found.hypotheses),
+            "spots": _spots(found.hypotheses),
             "crops": [
                 _crop(crop, matches, candidates)
                 for crop, matches in zip(crops, candidates.matches, strict=True)
@@ -119,6 +129,27 @@ def _poses(found: Hypotheses | None) -> list[list[float]]:
     return rows
 
 
+def _spots(found: Hypotheses | None) -> list[dict[str, Any]]:
+    """Where the robot may be, likeliest first: a pose with the weight of all about it, each of
+    which counts for the first such pose only."""
+    if found is None:
+        return []
+    spots = list[dict[str, Any]]()
+    weights = found.weights.copy()
+    floors = np.array([name or "" for name in found.floors])
+    while len(spots) < _MOST_SPOTS and weights.any():
+        best = int(weights.argmax())
+        offsets = found.poses[:, :2] - found.poses[best, :2]
+        about = (np.hypot(*offsets.T) <= _APART_M) & (floors == floors[best])
+        x, y, _ = found.poses[best].tolist()
+        spots.append(
+            {"x": x, "y": y, "floor": found.floors[best], "share": float(weights[about].sum())}
+        )
+        weights[about] = 0.0
+    spots.sort(key=lambda spot: -spot["share"])
+    return [spot for spot in spots if spot["share"] >= _LEAST_SHARE]
+
+
 def _floors(found: Hypotheses | None) -> dict[str, Any]:
     """The floor of each of the poses, where any has a name."""
     named = found is not None and any(name is not None for name in found.floors)
@@ -152,11 +183,14 @@ def _match(match: Match, candidates: MapCandidates) -> dict[str, Any]:
 def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
     """The crops of a mapped keyframe as a question, and its pose in the map, the ``truth``.
 
-    ``ask_at`` is a W at which the map lacks the keyframe's run, or the keyframe.
+    The keyframe is that of ``number`` or ``keyframe``; with ``near`` the one that has crops nearest
+    to a point of the ``floor``, of several one of the latest run; without any of them the one of
+    the last run with most crops. ``ask_at`` is the W before its run began, if there was a place by
+    then, else the end: ``whole`` says that it is the map which has these very crops.
     """
     asked = AskedPoint.of(shown, query)
     history = asked.known.history
-    ordinal = keyframe_of(history, query)
+    ordinal = _keyframe_to_ask(asked, query)
     keyframe = history.keyframes[ordinal]
     pose = keyframe.pose
     first = next(k.offset for k in history.keyframes if k.run == keyframe.run)
@@ -169,12 +203,14 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
             f"keyframe {keyframe.run_id}:{keyframe.keyframe_id} has no detection, so nothing can be"
             " asked with it; pick another"
         )
+    whole = all(place.formed.offset >= first for place in history.places)
     return {
         **asked.document(),
         "keyframe": f"{keyframe.run_id}/{keyframe.keyframe_id}",
         "number": ordinal,
         "offset": keyframe.offset,
-        "ask_at": first or keyframe.offset,
+        "ask_at": shown.through if whole else first,
+        "whole": whole,
         "question": {"crops": crops},
         "truth": None if pose is None else [pose.x_m, pose.y_m, pose.yaw_rad],
         "command": command_line(
@@ -182,6 +218,45 @@ def question_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
             str(keyframe.offset + 1),
         ),
     }  # fmt: skip
+
+
+def _keyframe_to_ask(asked: AskedPoint, query: QueryParams) -> KeyframeOrdinal:
+    """The keyframe that `question_answer` is asked for, or that it picks."""
+    history, near = asked.known.history, query.get("near")
+    if near is None and (query.get("number") or query.get("keyframe")):
+        return keyframe_of(history, query)
+    observed = history.tables.integers("observation", "keyframe")
+    counts = np.bincount(observed, minlength=len(history.keyframes))
+    looks = observed[history.tables.integers("observation", "crc") != NONE]
+    if len(looks):
+        counts = np.bincount(looks, minlength=len(history.keyframes))
+    posed = history.tables.column("keyframe", "pose") != 0
+    usable = np.flatnonzero((counts > 0) & posed)
+    if not len(usable):
+        raise QuestionError("no keyframe with a pose has a detection, so nothing can be asked")
+    runs = history.tables.integers("keyframe", "run")
+    if near is None:
+        last = usable[runs[usable] == runs[usable].max()]
+        return KeyframeOrdinal(int(last[counts[last].argmax()]))
+    x, y = _point(near)
+    if floor := query.get("floor"):
+        here = [each for each in usable.tolist() if history.keyframes[each].floor == floor]
+        usable = np.array(here or usable, np.int64)
+    at = [history.keyframes[each].pose for each in usable.tolist()]
+    away = np.array([math.inf if p is None else math.hypot(p.x_m - x, p.y_m - y) for p in at])
+    close = away <= away.min() + _AS_NEAR_M
+    latest = close & (runs[usable] == runs[usable[close]].max())
+    return KeyframeOrdinal(int(usable[np.where(latest, away, math.inf).argmin()]))
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        x = y = math.nan
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise QuestionError(f"near is {text[:40]!r}; give it as X,Y in metres")
+    return x, y
 
 
 def _crops_of(event: Event) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ import { select as d3select } from "d3-selection";
 import { type D3ZoomEvent, type ZoomBehavior, zoom, zoomIdentity } from "d3-zoom";
 import { useEffect, useRef } from "preact/hooks";
 import { select } from "../state/actions";
-import { shownBridge, shownLost } from "../state/overlays";
+import { lostPoint, shownBridge, shownLost } from "../state/overlays";
 import { walls } from "../state/walls";
 import { menu, tip } from "../state/pointer";
 import { shownObjects } from "../model/map_at";
@@ -18,7 +18,7 @@ import { dotRadius } from "./keyframes";
 import { paint } from "./paint";
 import { DARK, LIGHT } from "./palette";
 import { type Picked, pick } from "./pick";
-import { fitted } from "./view";
+import { fitted, mapX, mapY } from "./view";
 
 type Zoomed = ZoomBehavior<HTMLCanvasElement, unknown>;
 
@@ -203,7 +203,10 @@ function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
   };
   const click = (event: MouseEvent) => {
     menu.value = null;
-    select(at(event)?.thing ?? null, true);
+    if (store.panel.value === "lost" && store.view.value !== null) {
+      const box = canvas.getBoundingClientRect();
+      lostPoint.value = { x: mapX(store.view.value, event.clientX - box.left), y: mapY(store.view.value, event.clientY - box.top) };
+    } else select(at(event)?.thing ?? null, true);
   };
   const context = (event: MouseEvent) => {
     event.preventDefault();

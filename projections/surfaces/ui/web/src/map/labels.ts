@@ -54,7 +54,7 @@ export function drawLabels(on: Surface, scene: Scene) {
 function reserved({ bridge, lost, difference, view, controls }: Scene): Box[] {
   const spots = [
     ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
-    ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.evidence]),
+    ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.others, ...lost.evidence]),
   ];
   const gone = difference === null ? [] : goneAt(difference).map(([x, y]) => ({ x: screenX(view, x) - 55, y: screenY(view, y) + 13, width: 110, height: 18 }));
   const marked = spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));

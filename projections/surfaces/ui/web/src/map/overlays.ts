@@ -154,7 +154,7 @@ export function drawLikely(on: Surface, scene: Scene) {
 export function drawLost(on: Surface, scene: Scene) {
   const { lost, view, palette } = scene;
   if (lost === null) return;
-  const { pose, truth } = lost;
+  const { pose, truth, others } = lost;
   const taken: Box[] = [];
   if (pose !== null) {
     const [px, py] = [screenX(view, pose.x), screenY(view, pose.y)];
@@ -185,6 +185,17 @@ export function drawLost(on: Surface, scene: Scene) {
     on.stroke();
     if (pose.yaw !== null) drawArrow(on, px, py, pose.yaw, 13, palette.accent, palette.ground);
     text(on, scene, px, py + 24, "answer", palette.accent, taken);
+  }
+  for (const { x, y, share } of others) {
+    const [ox, oy] = [screenX(view, x), screenY(view, y)];
+    on.beginPath();
+    on.arc(ox, oy, 9, 0, ROUND);
+    on.strokeStyle = palette.accent;
+    on.lineWidth = 1.4;
+    on.setLineDash([3, 3]);
+    on.stroke();
+    on.setLineDash([]);
+    text(on, scene, ox, oy + 19, `or here ${Math.round(100 * share)} %`, palette.accent, taken);
   }
   if (truth !== null) {
     const [tx, ty] = [screenX(view, truth.x), screenY(view, truth.y)];

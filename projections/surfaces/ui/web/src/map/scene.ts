@@ -23,6 +23,8 @@ export interface Bridge {
 export interface LostOverlay {
   cells: { x: number; y: number; size: number; share: number }[];
   pose: { x: number; y: number; yaw: number | null; spread: number } | null;
+  /** Other spots where it may be, and how likely. */
+  others: { x: number; y: number; share: number }[];
   truth: { x: number; y: number; yaw: number | null } | null;
   evidence: { x: number; y: number; text: string; place: number }[];
   places: Set<number>;

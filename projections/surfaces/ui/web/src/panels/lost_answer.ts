@@ -20,6 +20,8 @@ export interface LostAnswer {
   seconds: number;
   /** The weighed poses: x, y, yaw and weight. */
   poses: [number, number, number | null, number][];
+  /** Where it may be, likeliest first: each with the weight of all poses about it. */
+  spots: { x: number; y: number; floor: string | null; share: number }[];
   /** The floor of each of them, where floors have names. */
   pose_floors?: (string | null)[];
 }
@@ -53,6 +55,7 @@ export function overlayOf(answer: LostAnswer, truth: Truth | null, history: Hist
   return {
     cells: cellsOf(answer.poses.filter((_, each) => named(answer.pose_floors?.[each])), history),
     pose: answer.pose === null || answer.pose === undefined || !named(answer.pose.floor) ? null : { x: answer.pose.x - ox, y: answer.pose.y - oy, yaw: answer.pose.yaw, spread: answer.pose.spread_m },
+    others: answer.spots.slice(1).filter((spot) => named(spot.floor)).map(({ x, y, share }) => ({ x: x - ox, y: y - oy, share })),
     truth: truth === null || !here(truth.floor) ? null : { ...truth, x: truth.x - ox, y: truth.y - oy },
     evidence: unique(evidence),
     places: new Set(answer.places.slice(0, 1).map((place) => findPlace(history, place.place_id))),

@@ -9,6 +9,8 @@ import { comparedMap, history, map, panel } from "./store";
 
 /** Of the selected merge. */
 export const bridge = signal<Bridge | null>(null);
+/** Where on the map a question was just asked from, metres. */
+export const lostPoint = signal<{ x: number; y: number } | null>(null);
 export const lostOverlay = signal<LostOverlay | null>(null);
 
 /** What changed between the two moments compared; null where that is not known. */
