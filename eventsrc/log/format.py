@@ -40,6 +40,8 @@ PREVIOUS = "previous_sha256"
 FOLLOWING = "following"
 """In the head of a sealed segment: the offset after its last event, so that a file that was cut
 tells what is missing."""
+REDACTED = "redacted"
+"""In the head of a redacted segment: the hashes that it had before, separated by commas."""
 MARK_SEED = "mark_seed"
 """In the head of an active segment, in hex: see `mcap_records.encode_mark`."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")

@@ -36,6 +36,8 @@ class SealedFile(SegmentFile):
     def __init__(self, path: Path, base: Offset) -> None:
         super().__init__(path, base)
         self.channels: dict[int, _mcap.Channel] = {}
+        self.index_at = 0
+        """The byte behind the chunks, at which the seal begins."""
         self.schemas: dict[int, _mcap.Schema] = {}
         """The schemas of verbatim messages, by id."""
         try:
@@ -98,6 +100,7 @@ class SealedFile(SegmentFile):
             elif opcode == _mcap.Opcode.METADATA_INDEX:
                 index = _mcap.decode_as(_mcap.MetadataIndex, content)
                 if is_metadata_of(SEAL_METADATA, index.name):
+                    self.index_at = index.offset
                     seal = self._metadata(index, size)
         if statistics is None or seal is None:
             raise _mcap.BadRecord("no statistics or no seal")

@@ -2,18 +2,23 @@
 
 In the files: magic, checksums, hash chain, dense offsets, torn ends. In the events, see
 `verify_events`: invalid payloads, duplicate keyframes, clocks that ran backwards, losses.
+
+An archive is verified by its manifest, segment by segment, without the log.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from eventsrc.base.errors import LogDamaged, LogError, NotALog
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog, ObjectMissing
+from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
+from .archive import Archive, ManifestEntry, chain_faults
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
 from .scan import scan_active, scan_sealed, scanned_events
@@ -237,3 +242,61 @@ def _log_id_of(segments: list[names.SegmentPath], end: SealedEnd | None) -> str 
     if not carried and end is not None:
         return end.log_id
     return own_log_id(carried, None if end is None else end.log_id)
+
+
+@dataclass(frozen=True, slots=True)
+class ArchiveVerification:
+    """The result of `verify_archive`: how much was read, the findings, and the objects that no
+    entry of the manifest names: what a killed archiver left."""
+
+    url: str
+    log_id: str
+    segments: int
+    events: int
+    size_bytes: int
+    findings: tuple[Finding, ...]
+    unnamed: tuple[str, ...]
+
+
+def verify_archive(store: ObjectStore) -> ArchiveVerification:
+    """Read every byte of an archive; compare it with the manifest, and the heads of its segments
+    with the chain. Needs no log, and reads no event. Raises ArchiveError."""
+    archive = Archive(store)
+    entries = archive.read_entries()
+    found: list[Finding] = []
+    there = store.sizes("segments/")
+    for number, (each, fault) in enumerate(zip(entries, chain_faults(entries), strict=True)):
+        report_progress("verifying", number, len(entries), "segments")
+        wrong = [fault] if fault is not None else []
+        wrong += _archived_faults(archive, each)
+        found += [_archive_finding(kind, text, each) for kind, text in wrong]
+    report_progress("verifying", max(len(entries), 1), max(len(entries), 1), "segments")
+    return ArchiveVerification(
+        store.url,
+        archive.log_id,
+        len(entries),
+        max((each.following for each in entries), default=0),
+        sum(each.size for each in entries),
+        tuple(found),
+        tuple(sorted(there.keys() - {each.object for each in entries})),
+    )
+
+
+def _archived_faults(archive: Archive, entry: ManifestEntry) -> Iterator[tuple[Kind, str]]:
+    """What is wrong with an archived segment."""
+    try:
+        archive.check(entry)
+        head = archive.head_of(entry)
+    except ObjectMissing as error:
+        yield "gap", str(error)
+    except (ArchiveError, LogDamaged, NotALog) as error:
+        yield "crc", str(error)
+    else:
+        said = (entry.log_id, entry.previous_sha256, entry.replaces_sha256)
+        if said != (head["log_id"], head.get(names.PREVIOUS), head.get(REPLACES, "")):
+            yield "chain", f"the manifest contradicts the segment's head ({entry.name})"
+
+
+def _archive_finding(kind: Kind, message: str, entry: ManifestEntry) -> Finding:
+    first, last = Offset(entry.base), Offset(entry.following - 1)
+    return Finding(kind, message, entry.object, first, last, last - first + 1)

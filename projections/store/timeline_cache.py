@@ -129,8 +129,8 @@ class TimelineCache:
         return next((fold for fold in found if fold is not None), None)
 
     def _fold_ends(self) -> list[Offset]:
-        names = [_FOLD.fullmatch(path.name) for path in self._paths() if self._is_own(_FOLD, path)]
-        return sorted(Offset(int(name[2])) for name in names if name is not None)
+        found = (path.stem for path in self._paths() if self._is_own(_FOLD, path))
+        return sorted(Offset(int(stem.partition("-")[2])) for stem in found)
 
     def fold_at(self, end: Offset) -> SemanticMap | None:
         """The fold after ``end`` events; None if it is not cached."""
@@ -143,6 +143,14 @@ class TimelineCache:
 
         loaded = self._loaded(self._fold_path(end), end, load)
         return None if loaded is None else with_vectors(loaded, self._reader)
+
+    def names_before(self, limit: Offset) -> list[str]:
+        """The files' names of the latest cached fold of at most ``limit`` events."""
+        end = max((each for each in self._fold_ends() if each <= limit), default=FIRST_OFFSET)
+        parts = self._parts_to(end, "npz")
+        paths = [file.path for file in parts] + [self._fold_path(end), self._digest_path(end)]
+        whole = parts and parts[-1].start == FIRST_OFFSET
+        return [path.name for path in paths if whole and path.exists()]
 
     def digest_at(self, end: Offset) -> str | None:
         """The digest of the map after ``end`` events; None if it is not cached."""
@@ -159,10 +167,8 @@ class TimelineCache:
             found = [path for path in self._paths() if self._is_own(_DIGEST, path)]
             for path in sorted(found, key=_age_s)[MOST_DIGESTS:]:
                 path.unlink(missing_ok=True)
-        except OSError as error:
-            self._say(f"{self.folder}: no digest was kept: {error.strerror}")
-        except LogError as error:
-            self._say(f"{self.folder}: no digest was kept: {error}")
+        except (OSError, LogError) as error:
+            self._say(f"{self.folder}: no digest was kept: {getattr(error, 'strerror', error)}")
 
     def _loaded(self, path: Path, end: Offset, load: Callable[[State], _T]) -> _T | None:
         """``load`` applied to a file about the first ``end`` events; None if there is none or it is
@@ -190,7 +196,7 @@ class TimelineCache:
         self._kept_at = end = semantic_map.next_offset
         with self._writing("npz"):
             make_cache_folder(self._reader.path)
-            self._keep_fold(semantic_map)
+            self._write_state(self._fold_path(end), end, prefixed("map", semantic_map.dump()))
             self._keep_part(stripes, "npz")
             self._tidy(end)
 
@@ -208,8 +214,8 @@ class TimelineCache:
         try:
             yield
         except (OSError, Unwritable, LogError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            self._say(f"{self.folder}: no history was kept: {why}; --no-cache goes without one")
+            why = f"no history was kept: {getattr(error, 'strerror', error)}"
+            self._say(f"{self.folder}: {why}; --no-cache goes without one")
         except DamagedPart as damage:
             self.forget(damage, kind)
 
@@ -242,10 +248,6 @@ class TimelineCache:
             self.folder / f"{self._key}-{start:020d}-{end:020d}.{kind}",
             lambda file: write_part(file, self._about(start, end), new),
         )
-
-    def _keep_fold(self, semantic_map: SemanticMap) -> None:
-        end = semantic_map.next_offset
-        self._write_state(self._fold_path(end), end, prefixed("map", semantic_map.dump()))
 
     def _write_state(self, path: Path, end: Offset, state: State) -> None:
         data = pack(prefixed("about", self._about(FIRST_OFFSET, end)) | state)
@@ -341,15 +343,18 @@ class TimelineCache:
 
     def _tidy_parts(self, end: Offset, kind: PartKind) -> None:
         """Delete the parts that those of the first ``end`` events replace."""
-        needed, at = set(), end
-        files = self._files(kind)
-        while at > FIRST_OFFSET and (before := [file for file in files if file.end == at]):
-            first = min(before, key=lambda file: file.start)
-            needed.add(first.path)
-            at = first.start
-        for file in files:
+        needed = {file.path for file in self._parts_to(end, kind)}
+        for file in self._files(kind):
             if file.path not in needed and file.end <= end:
                 file.path.unlink(missing_ok=True)
+
+    def _parts_to(self, end: Offset, kind: PartKind) -> list[_File]:
+        """The parts that lead to ``end`` events, the last one first."""
+        files, found, at = self._files(kind), list[_File](), end
+        while at > FIRST_OFFSET and (before := [file for file in files if file.end == at]):
+            found.append(min(before, key=lambda file: file.start))
+            at = found[-1].start
+        return found
 
     def _limit(self) -> None:
         """Delete histories beyond `MOST_KEPT` and `MOST_BYTES`, those unused for longest first."""

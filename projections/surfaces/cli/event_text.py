@@ -20,7 +20,7 @@ from eventsrc.envelope.system_events import (
     RejectedPayload,
     decode_embeddings,
 )
-from eventsrc.log import Event, VerbatimEvent
+from eventsrc.log import Event, Finding, VerbatimEvent
 
 _SUMMARY_CHARS = 100
 
@@ -116,3 +116,12 @@ def _map_text(head: OccupancyMapEvent) -> str:
         f"map{name} of {head.width:,} × {head.height:,} cells of {head.resolution:g} m from "
         f"({x:g}, {y:g}){turned}{floor}, from {head.source}"
     )
+
+
+def finding_text(finding: Finding) -> str:
+    """A finding in one line."""
+    where = [finding.segment] if finding.segment else []
+    if finding.first_offset is not None:
+        first, last = finding.first_offset, finding.last_offset
+        where.append(f"offset {first}" if first == last else f"offsets {first} to {last}")
+    return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")

@@ -200,7 +200,8 @@ def verify(
     """Read every byte of all logs, as `log verify` does of one; exit 3 if anything is wrong."""
     from projections.adapters.fleet.site_tasks import SiteVerification, verify_site
 
-    from .log import finding_text, verification_document
+    from .event_text import finding_text
+    from .log import verification_document
 
     sites = fleet_options.sites_of(place)
     found = [SiteVerification()] * len(sites)

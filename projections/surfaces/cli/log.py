@@ -14,7 +14,6 @@ from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import (
     Event,
-    Finding,
     LogReader,
     SegmentRecovery,
     Unreadable,
@@ -28,7 +27,8 @@ from eventsrc.log.recover import DEFAULT_MAX_LOSSES
 from eventsrc.log.seek import resolve, resolve_start, time_of
 from eventsrc.record.log_info import LogInfo, SegmentInfo, log_info
 
-from .event_text import event_document, event_line, iso_time
+from . import archive_command
+from .event_text import event_document, event_line, finding_text, iso_time
 from .folded_log import LogArgument
 from .new_log import say_camera
 from .options import JsonOption, option
@@ -91,9 +91,7 @@ class RangeNotes:
                     yield f"{log}: no event has the key {key!r}; there are {names}"
 
 
-log_commands = typer.Typer(
-    help="Inspect and repair a log: info, cat, verify, recover, spaces.", no_args_is_help=True
-)
+log_commands = typer.Typer(help="Inspect, repair and archive a log.", no_args_is_help=True)
 
 
 @log_commands.command()
@@ -248,15 +246,6 @@ def verification_document(result: Verification) -> dict[str, Any]:
     return {**asdict(result), "path": str(result.path)}
 
 
-def finding_text(finding: Finding) -> str:
-    """A finding in one line."""
-    where = [finding.segment] if finding.segment else []
-    if finding.first_offset is not None:
-        first, last = finding.first_offset, finding.last_offset
-        where.append(f"offset {first}" if first == last else f"offsets {first} to {last}")
-    return visible(f"{finding.kind:<9} {': '.join([*where, finding.message])}")
-
-
 @log_commands.command()
 def recover(
     log: LogArgument,
@@ -322,3 +311,7 @@ def spaces(log: LogArgument, json_: JsonOption = False) -> None:
         parts = [f"{each.recorded:,} recorded"] if each.recorded else []
         parts += [f"{each.reembedded:,} re-embedded"] if each.reembedded else []
         display(f"  {name}, dimension {each.dim:,}: {', '.join(parts) or 'none'}")
+
+
+for _command in (archive_command.archive, archive_command.restore):
+    log_commands.command()(_command)

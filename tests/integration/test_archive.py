@@ -1,0 +1,312 @@
+"""`mapfold log archive` and `log restore`: the same bytes back, from a folder and from a server of
+S3, also where the store answers wrongly: then nothing is taken for archived."""
+
+import hashlib
+import os
+import runpy
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+from eventsrc.base.errors import (
+    ArchiveError,
+    LogError,
+    MapfoldError,
+    MisuseError,
+    NotALog,
+    ObjectMissing,
+)
+from eventsrc.base.object_store import ObjectStore
+from eventsrc.log import LogWriter, verify_log
+from eventsrc.log.archive import Archive, Archived, archive_log
+from eventsrc.log.away import restore_log
+from eventsrc.log.verify import verify_archive
+from projections.fold.semantic_map import SemanticMap
+from tests.integration.test_kept_maps import nothing_is_folded
+from tests.integration.test_progress import reports_of
+from tests.property.test_timeline_cache import kept_early
+from tests.support.buckets import BUCKET, Answer, Fault, Proxy, proxy_of, s3_environment, s3_server
+from tests.support.commands import Commands
+from tests.support.envelopes import envelope, payload
+from tests.support.fixtures_log import KEY, flip
+from tests.support.shared_data import ROOT
+
+RECORDED = 60
+SEGMENTS = 4
+
+
+def recorded(log: Path, first: int = 0, count: int = RECORDED) -> Path:
+    """A log of `SEGMENTS` segments, or more of the same log."""
+    with LogWriter(log, rotate_events=RECORDED // SEGMENTS) as writer:
+        for number in range(first, first + count):
+            writer.append(KEY, payload(envelope(number)))
+            writer.sync()
+    return log
+
+
+def bytes_of(log: Path) -> dict[str, str]:
+    """Name and hash of each segment."""
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(log.iterdir())
+        if ".mcap" in path.name
+    }
+
+
+def folder_url(path: Path) -> str:
+    """The URL of an archive in a folder."""
+    return f"file://{path.as_posix()}"
+
+
+def archived(log: Path, url: str) -> Archived:
+    """Archive a log, in which nothing is to be said."""
+    return archive_log(log, ObjectStore(url, make=True), note=pytest.fail)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A closed log."""
+    return recorded(tmp_path / "log")
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    """Where it is archived."""
+    return folder_url(tmp_path / "an archive")
+
+
+def test_the_same_bytes_come_back(log: Path, url: str, tmp_path: Path) -> None:
+    stages = {each[0] for each in reports_of(lambda: archived(log, url))}
+    assert stages == {"archiving"}
+    made = archived(log, folder_url(tmp_path / "another"))
+    assert (made.added_segments, made.events, made.not_sealed) == (SEGMENTS, RECORDED, False)
+    again = archived(log, url)
+    assert (again.added_segments, again.added_bytes, again.segments) == (0, 0, SEGMENTS)
+    back = tmp_path / "back"
+    restored = restore_log(Archive(ObjectStore(url)), back)
+    assert (restored.fetched_segments, restored.events) == (SEGMENTS, RECORDED)
+    assert bytes_of(back) == bytes_of(log)
+    assert verify_log(back).findings == ()
+    recorded(back, RECORDED, 15)  # it is a log like any other
+    recorded(log, RECORDED, 15)
+    assert archived(log, url).added_segments == 1
+    assert verify_archive(ObjectStore(url)).events == RECORDED + 15
+
+
+def test_commands_archive_verify_and_restore(log: Path, url: str, tmp_path: Path) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    said = mapfold("log", "archive", "log", url, "--json").json
+    assert (said["events"], said["added_segments"]) == (RECORDED, SEGMENTS)
+    assert "all good" in mapfold("log", "archive", "nowhere", url, "--verify").err
+    assert mapfold("log", "archive", "log", url, "--verify", "--json").json["findings"] == []
+    mapfold("log", "restore", url, "back")
+    assert bytes_of(tmp_path / "back") == bytes_of(log)
+    assert "fetched 0 segments" in mapfold("log", "restore", url, "back").err
+    assert "no archive" in mapfold("log", "restore", folder_url(tmp_path), "x", code=1).err
+    assert "no such folder" in mapfold("log", "restore", url + "x", "x", code=1).err
+    assert not (tmp_path / "x").exists()
+    secret = mapfold("log", "archive", "log", "s3://me:hunter2@bucket/x", code=2).err
+    assert "hunter2" not in secret
+    assert "credentials" in secret
+
+
+def test_a_restored_log_has_its_fold(log: Path, url: str, tmp_path: Path) -> None:
+    from projections.surfaces.cli.archive_command import archive, restore
+    from projections.surfaces.cli.folded_log import CachedLog
+    from projections.surfaces.cli.maps import state
+
+    with kept_early():
+        archive(log, url)
+        restore(url, tmp_path / "back")
+        with patch.object(SemanticMap, "fold", nothing_is_folded):
+            state(source=CachedLog(log=tmp_path / "back"))
+        recorded(log, RECORDED, 15)
+        archive(log, url)
+        kept = Archive(ObjectStore(url)).kept_files()
+    assert kept
+    assert all(str(RECORDED + 15) in name for name in kept if name.endswith(".fold"))
+
+
+def test_another_log_is_never_written_over(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    archive = Archive(ObjectStore(url))
+    other = recorded(tmp_path / "other")
+    longer = tmp_path / "longer"
+    restore_log(archive, longer)
+    recorded(longer, RECORDED, 3)
+    document = tmp_path / "letters"
+    document.mkdir()
+    (document / "letter").write_text("dear")
+    for target in (other, longer, document):
+        before = sorted(path.name for path in target.iterdir())
+        with pytest.raises((LogError, NotALog)):
+            restore_log(archive, target)
+        assert sorted(path.name for path in target.iterdir()) == before
+    with pytest.raises(ArchiveError, match="choose another URL"):
+        archived(other, url)
+    with LogWriter(log), pytest.raises(LogError, match="not in the archive"):
+        restore_log(archive, log)
+
+
+def test_damage_is_not_archived(log: Path, url: str) -> None:
+    path = sorted(log.glob("*.mcap"))[2]
+    flip(path, 900)
+    with pytest.raises(LogError, match="log recover"):
+        archived(log, url)
+    assert len(Archive(ObjectStore(url)).entries()) == 2
+
+
+def test_a_damaged_archive_is_reported(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    store = ObjectStore(url)
+    one, other = sorted((tmp_path / "an archive" / "segments").iterdir())[1:3]
+    flip(one, 800)
+    found = verify_archive(store).findings
+    assert [each.kind for each in found] == ["crc"]
+    with pytest.raises(ArchiveError, match="the store gives"):
+        restore_log(Archive(store), tmp_path / "back")
+    with pytest.raises(LogError, match="were sealed and are not there"):
+        verify_or_write(tmp_path / "back")
+    flip(one, 800)
+    other.unlink()
+    assert [each.kind for each in verify_archive(store).findings] == ["gap"]
+    entry = sorted((tmp_path / "an archive" / "manifest").iterdir())[1]
+    entry.unlink()
+    assert [each.kind for each in verify_archive(store).findings] == ["gap", "gap"]
+    assert one.name in verify_archive(store).unnamed[0]
+    with pytest.raises(ArchiveError, match="not archived"):
+        Archive(store).entries()
+
+
+def verify_or_write(log: Path) -> None:
+    """Open a log for writing."""
+    LogWriter(log).close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """A server of S3."""
+    with s3_server() as address:
+        yield address
+
+
+@pytest.fixture
+def proxy(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """A proxy before it, which this process uses; what fails is tried once more."""
+    with proxy_of(server) as made:
+        for name, value in s3_environment(made.address).items():
+            monkeypatch.setenv(name, value)
+        quick = {"max_retries": 1}
+        with patch("eventsrc.base.object_store._RETRIES", quick):
+            yield made
+
+
+@pytest.mark.seconds
+def test_a_bucket_keeps_a_log(log: Path, proxy: Proxy, tmp_path: Path) -> None:
+    url = f"s3://{BUCKET}/{tmp_path.name}/robot-7"
+    mapfold = Commands.in_folder(tmp_path, **s3_environment(proxy.address))
+    mapfold("log", "archive", "log", url)
+    assert mapfold("log", "archive", "log", url, "--verify", "--json").json["findings"] == []
+    mapfold("log", "restore", url, "back")
+    assert bytes_of(tmp_path / "back") == bytes_of(log)
+    puts = [path for method, path in proxy.requests if method == "PUT"]
+    assert len(puts) == len(set(puts))  # each object once
+    gone = mapfold("log", "restore", "s3://no-such-bucket/x", "x", code=1).err
+    assert "no archive of a log" in gone
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("place", ["folder", "bucket"])
+def test_nothing_is_put_over_an_object(place: str, url: str, proxy: Proxy, tmp_path: Path) -> None:
+    store = ObjectStore(url if place == "folder" else f"s3://{BUCKET}/{tmp_path.name}", make=True)
+    assert store.put_new("a/b", b"first")
+    assert not store.put_new("a/b", b"second")
+    assert store.read("a/b") == b"first"
+    assert store.sizes("a/") == {"a/b": 5}
+    store.delete("a/b")
+    store.delete("a/b")
+    with pytest.raises(ObjectMissing, match="no such object"):
+        store.read("a/b")
+
+
+def says_500(_method: str, _path: str, answer: Answer) -> Answer:
+    return replace(answer, status=500, body=b"busy", length=4)
+
+
+def refuses(_method: str, _path: str, answer: Answer) -> Answer:
+    body = b"<Error><Code>ExpiredToken</Code><Message>has expired</Message></Error>"
+    return replace(answer, status=403, body=body, length=len(body))
+
+
+def on_segments(fault: Callable[[bytes], bytes], *, shorten: bool = False) -> Fault:
+    """A fault of the bodies of segments that are read."""
+
+    def changed(method: str, path: str, answer: Answer) -> Answer:
+        if method != "GET" or "/segments/" not in path:
+            return answer
+        body = fault(answer.body)
+        return replace(answer, body=body, length=answer.length if shorten else len(body))
+
+    return changed
+
+
+FAULTS: dict[str, tuple[Fault, str]] = {
+    "500s": (says_500, "500"),
+    "credentials": (refuses, "refuses access"),
+    "wrong bytes": (on_segments(lambda body: body[:-9] + b"!" + body[-8:]), "the store gives"),
+    "another object": (on_segments(lambda body: b"hello"), "the store gives"),
+    "cut": (on_segments(lambda body: body[:-100], shorten=True), "nothing is lost here"),
+}
+
+
+@pytest.mark.seconds
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_store_that_answers_wrongly(
+    name: str, log: Path, proxy: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fault, told = FAULTS[name]
+    url = f"s3://{BUCKET}/{tmp_path.name}"
+    before = bytes_of(log)
+    proxy.fault = fault
+    with pytest.raises(ArchiveError, match=told) as raised:
+        archived(log, url)
+    assert "\n" not in str(raised.value)
+    assert os.environ["AWS_SECRET_ACCESS_KEY"] not in str(raised.value)
+    assert bytes_of(log) == before
+    proxy.fault = Proxy().fault
+    assert archived(log, url).events == RECORDED  # it goes on
+    proxy.fault = fault
+    with pytest.raises(ArchiveError, match=told):
+        restore_log(Archive(ObjectStore(url)), tmp_path / "back")
+    proxy.fault = Proxy().fault
+    restore_log(Archive(ObjectStore(url)), tmp_path / "back")
+    assert bytes_of(tmp_path / "back") == before
+
+
+def test_forty_lines_verify_an_archive(log: Path, url: str, tmp_path: Path) -> None:
+    script = ROOT / "docs" / "verify_archive.py"
+    assert len(script.read_text().splitlines()) <= 45
+    verify = runpy.run_path(str(script))["verify"]
+    archived(log, url)
+    folder = tmp_path / "an archive"
+    assert verify(folder) == RECORDED
+    entry = sorted((folder / "manifest").iterdir())[2]
+    for old, new, told in (
+        ('"following": 48', '"following": 47', "number of events"),
+        ('"sha256": "', '"sha256": "0', "SHA-256"),
+    ):
+        right = entry.read_text()
+        entry.write_text(right.replace(old, new, 1))
+        with pytest.raises(SystemExit, match=told):
+            verify(folder)
+        entry.write_text(right)
+
+
+def test_what_is_no_url_of_an_archive() -> None:
+    for text in ("/a/path", "ftp://x/y", "file://x/y", "s3://b/x?token=abc"):
+        with pytest.raises((MisuseError, MapfoldError)) as raised:
+            ObjectStore(text)
+        assert "abc" not in str(raised.value)
