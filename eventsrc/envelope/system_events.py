@@ -8,6 +8,7 @@
                       (`eventsrc.ros.derivation`)
 ``mapfold/map``       an occupancy grid: where walls are (`.occupancy_map`)
 ``mapfold/embeddings``  vectors of another space for older detections (`NewVectors`)
+``mapfold/drop``      classes whose detections are never stored (`.dropped_classes`)
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """
@@ -31,6 +32,7 @@ COMMAND_KEY = "mapfold/command"
 MAP_KEY = "mapfold/map"
 ROS_KEY = "mapfold/ros"
 EMBEDDINGS_KEY = "mapfold/embeddings"
+DROP_KEY = "mapfold/drop"
 
 
 def is_system_key(key: str) -> bool:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import COMMAND
+from eventsrc.envelope.dropped_classes import DropClasses
 from eventsrc.envelope.model import ENVELOPE_VERSION
 from eventsrc.envelope.occupancy_map import OccupancyMapEvent
 from eventsrc.envelope.readers import EnvelopeModel
@@ -34,6 +35,7 @@ _SYSTEM_MODELS: dict[str, type[BaseModel]] = {
     system_events.LOSS_KEY: system_events.Loss,
     system_events.MAP_KEY: OccupancyMapEvent,
     system_events.EMBEDDINGS_KEY: system_events.Embeddings,
+    system_events.DROP_KEY: DropClasses,
 }
 
 

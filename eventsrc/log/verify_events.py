@@ -30,6 +30,7 @@ from pydantic import ValidationError
 from eventsrc.base.text import visible
 from eventsrc.envelope import system_events
 from eventsrc.envelope.commands import InvalidCommand, encode_command, parse_command
+from eventsrc.envelope.dropped_classes import DropClasses
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.gaps import Gap, GapLedger, gap_of
 from eventsrc.envelope.ingest import Accepted
@@ -179,6 +180,7 @@ _READERS: Final[dict[str, Callable[[bytes], object]]] = {
     system_events.MAP_KEY: decode_map,
     system_events.ROS_KEY: _read_recording,
     system_events.EMBEDDINGS_KEY: decode_embeddings,
+    system_events.DROP_KEY: DropClasses.model_validate_json,
 }
 """By key, what reads events that need no further check."""
 

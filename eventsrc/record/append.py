@@ -10,17 +10,24 @@ which has the same cells in a hundredth of the bytes.
 """
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from eventsrc.envelope import crops, grid_messages, ingest
 from eventsrc.envelope.cdr import is_cdr
+from eventsrc.envelope.dropped_classes import ClassDropper, DropClasses, Stripped
 from eventsrc.envelope.forms import PendingEvent, check_envelopes, detect_version
 from eventsrc.envelope.model import Offset, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap
-from eventsrc.envelope.system_events import MAP_KEY, REJECTED_KEY, Excerpt, RejectedPayload
-from eventsrc.log import LogWriter, MessageFormat, NewEvent
+from eventsrc.envelope.system_events import (
+    DROP_KEY,
+    MAP_KEY,
+    REJECTED_KEY,
+    Excerpt,
+    RejectedPayload,
+)
+from eventsrc.log import LogReader, LogWriter, MessageFormat, NewEvent
 
 from .transport.config import key_fault
 
@@ -37,6 +44,7 @@ class NewMap(NamedTuple):
 
 
 Result = ingest.CheckedEnvelope | NewMap | ingest.Rejected
+NOTHING_DROPPED: Final = ClassDropper[Any]()
 
 
 class Checked(msgspec.Struct, frozen=True, gc=False):
@@ -60,8 +68,10 @@ def append_payload(
     *,
     logged_ns: int | None = None,
     max_bytes: int = ingest.DEFAULT_MAX_PAYLOAD_BYTES,
+    dropper: ClassDropper[Any] = NOTHING_DROPPED,
 ) -> Result:
-    """Append ``payload``, received under ``key``, and return the result of its validation.
+    """Append ``payload``, received under ``key``, without what ``dropper`` leaves out, and return
+    the result of its validation.
 
     ``logged_ns`` is the time of receipt, by default the current time.
     """
@@ -72,15 +82,43 @@ def append_payload(
         logged_ns=logged,
         max_bytes=max_bytes,
     )
-    writer.append_all([checked_event(key, payload, checked, logged)])
+    checked, stripped = without_dropped(payload, checked, dropper)
+    writer.append_all([checked_event(key, stripped.payload, checked, logged, dropper)])
     return checked.result
 
 
-def checked_event(key: str, payload: bytes, checked: Checked, logged_ns: int) -> NewEvent:
+def dropped_classes(reader: LogReader) -> frozenset[str]:
+    """The classes that a log stores no detections of; what damage hides of them is passed over."""
+    events = reader.read(keys={DROP_KEY}, on_gap=lambda _: None)
+    found = (DropClasses.model_validate_json(event.payload).classes for event in events)
+    return frozenset(name for classes in found for name in classes)
+
+
+def without_dropped(
+    payload: bytes, checked: Checked, dropper: ClassDropper[Any]
+) -> tuple[Checked, Stripped]:
+    """A checked payload without what ``dropper`` leaves out; a rejection if it is an envelope that
+    cannot be read a second time."""
+    if not (dropper and isinstance(checked.result, ingest.CheckedEnvelope)):
+        return checked, Stripped(payload)
+    try:
+        return checked, dropper.strip(payload, checked.version)
+    except ValueError as error:
+        return Checked(checked.version, ingest.Rejected(str(error))), Stripped(payload)
+
+
+def checked_event(
+    key: str,
+    payload: bytes,
+    checked: Checked,
+    logged_ns: int,
+    dropper: ClassDropper[Any] = NOTHING_DROPPED,
+) -> NewEvent:
     """The event to append for a payload received under ``key``, by the result of its check."""
     version, result = checked.version, checked.result
     if isinstance(result, ingest.Rejected):
-        return rejected_event(key, payload, result.reason, logged_ns)
+        kept, reason = dropper.kept_of(payload), dropper.reason(result.reason)
+        return rejected_event(key, kept, reason, logged_ns)
     if isinstance(result, NewMap):
         return map_event(result.event, logged_ns)
     stamp = checked.stamp_ns

@@ -97,6 +97,30 @@ def test_envelopes_are_valid_and_say_what_was_seen(stage: Stage, made: Any) -> N
     assert len(set(instances)) > 5
 
 
+def test_a_class_is_dropped_before_its_crops_are_encoded(
+    stage: Stage, made: Any, tmp_path: Path
+) -> None:
+    """The log that the file is imported into drops it from other input, too."""
+    numbers, whole = made
+    classes = [each["class"] for one in whole for each in one["detections"]]
+    common = max(sorted({*classes}), key=classes.count)
+    out = tmp_path / "dropped.jsonl"
+    words = ("--threads", "1", "--run-id", "other", "--json", "--out", out, "--drop-class", common)
+    told = stage.run("detect", *stage.posed, *stage.models, *words)
+    assert told.json["dropped_detections"] == classes.count(common)
+    assert told.json["detections"] == numbers["detections"] - classes.count(common)
+    assert f"{classes.count(common)} detections dropped by class" in told.err
+    assert "dropped by class" not in stage.run("import", tmp_path / "log", out).err
+    said = stage.run("import", tmp_path / "log", stage.folder / "run.jsonl")
+    assert f"detections of {common} are not stored" in said.err
+    assert f"{classes.count(common)} detections dropped by class" in said.err
+    with LogReader(tmp_path / "log") as reader:
+        stored = [json.loads(event.payload) for event in reader.read() if event.is_envelope]
+    assert common not in [each["class"] for one in stored for each in one["detections"]]
+    counts = [one.get("dropped_detections", 0) for one in stored]
+    assert sum(counts) == 2 * classes.count(common)
+
+
 def _digest(log: Path) -> str:
     with LogReader(log) as reader:
         return map_digest(fold_log(reader, Settings())[1])

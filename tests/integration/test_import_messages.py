@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from eventsrc.record.importers.run import ImportInterrupted, ImportReport, import_files
+from eventsrc.record.importers.known_log import ImportReport
+from eventsrc.record.importers.run import ImportInterrupted, import_files
 from projections.surfaces.cli.signals import ctrl_c_between_steps
 from tests.support.commands import PROGRAM, TIMEOUT_S, Commands
 from tests.support.envelopes import envelope, payload

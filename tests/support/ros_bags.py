@@ -14,7 +14,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from eventsrc.log import LogWriter
 from eventsrc.record.importers.bag_streams import BagOptions
-from eventsrc.record.importers.run import ImportReport, import_files
+from eventsrc.record.importers.known_log import ImportReport
+from eventsrc.record.importers.run import import_files
 from eventsrc.ros.transforms import Transform
 from tests.support import ros_messages as ros
 from tests.support.fixtures_log import read_log

@@ -7,13 +7,14 @@ without a pose has only the time. The first picture is one, and so is the first 
 
 import base64
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eventsrc.envelope.dropped_classes import DROPPED_FIELD
 from eventsrc.envelope.model import MAX_TIMESTAMP_S, DetId, KeyframeId, RunId, default_det_id
 from eventsrc.ros.messages import BadMessage
 from eventsrc.ros.pictures import Boxes
@@ -96,6 +97,8 @@ class PictureCounts:
     """Boxes left out because they are less than a pixel wide or high in the picture."""
     cut: int = 0
     """Boxes beyond the most that a picture may have."""
+    dropped_detections: int = 0
+    """Detections left out by their class."""
 
     @property
     def lost(self) -> int:
@@ -130,8 +133,10 @@ class Keyframes:
         *,
         hfov_deg: float | None = None,
         keep_crops: bool = False,
+        drop_classes: Collection[str] = (),
         note: Callable[[str], None],
     ) -> None:
+        self._drop_classes = frozenset(drop_classes)
         self._finder, self._encoder, self._gate, self._poses = finder, encoder, gate, poses
         self._run_id, self._hfov_deg, self._keep_crops = run_id, hfov_deg, keep_crops
         self._note = note
@@ -155,11 +160,17 @@ class Keyframes:
             self._skip(picture, str(error))
             return None
         self._gate.set_last(picture.stamp_s, pose)
-        found = self._finder.find(pixels)
+        whole = self._finder.find(pixels)
+        found = whole.without(self._drop_classes)
         self._count(picture, found)
+        dropped = len(whole.labels) - len(found.labels)
+        counts.dropped_detections += dropped
         counts.keyframes += 1
         counts.without_pose += pose is None
-        return self._keyframe(picture, pixels, pose, found)
+        keyframe = self._keyframe(picture, pixels, pose, found)
+        if dropped:
+            keyframe.envelope[DROPPED_FIELD] = dropped
+        return keyframe
 
     def _skip(self, picture: Picture, reason: str) -> None:
         self.counts.unreadable += 1

@@ -15,6 +15,7 @@ from eventsrc.base.errors import MapfoldError, MisuseError, SpoolFull, Transport
 from eventsrc.base.text import counted
 from eventsrc.base.user_files import written_whole
 from eventsrc.envelope.commands import UseSettings
+from eventsrc.envelope.dropped_classes import DropClasses
 from eventsrc.envelope.model import stamp_ns
 from eventsrc.record.importers.json_lines import command_record
 from eventsrc.record.robot.publisher import EnvelopePublisher
@@ -45,12 +46,14 @@ class Delivered:
 class FileOutput:
     """Envelopes as JSON lines in a new file, which gets its name when it is closed, or when a write
     fails: then it has the whole lines before. A log that it is imported into begins with
-    ``settings``. Raises MisuseError if the file exists already or cannot be made, MapfoldError
-    where writing fails."""
+    ``settings``, and drops what ``drops`` says. Raises MisuseError if the file exists already or
+    cannot be made, MapfoldError where writing fails."""
 
-    def __init__(self, path: Path, settings: UseSettings | None = None) -> None:
+    def __init__(
+        self, path: Path, settings: UseSettings | None = None, drops: DropClasses | None = None
+    ) -> None:
         self.delivered = Delivered()
-        self._settings = settings
+        self._begins: list[UseSettings | DropClasses] = [b for b in (settings, drops) if b]
         if path.is_file():
             raise MisuseError(f"--out {path}: there is such a file; remove it, or choose another")
         self._path, self._stack = path, ExitStack()
@@ -60,10 +63,10 @@ class FileOutput:
         """Write its envelope."""
         whole = self._file.tell() if self._file.seekable() else None
         try:
-            if self._settings is not None:
-                first = command_record(self._settings, stamp_ns(keyframe.envelope["timestamp"]))
+            for said in self._begins:
+                first = command_record(said, stamp_ns(keyframe.envelope["timestamp"]))
                 self._file.write(_encode(first) + b"\n")
-                self._settings = None
+            self._begins = []
             self._file.write(_encode(keyframe.envelope) + b"\n")
         except MapfoldError as error:
             if whole is not None:  # keyframes of a camera cannot be had a second time

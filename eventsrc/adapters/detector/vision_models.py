@@ -9,7 +9,7 @@ it; docs/detector.md has it for common models:
 """
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
@@ -73,6 +73,14 @@ class Found(NamedTuple):
     not_finite: int
     too_small: int
     cut: int
+
+    def without(self, classes: Collection[str]) -> "Found":
+        """Without the detections of these classes."""
+        left = [i for i, label in enumerate(self.labels) if label not in classes]
+        if len(left) == len(self.labels):
+            return self
+        scores, labels = [self.scores[i] for i in left], [self.labels[i] for i in left]
+        return self._replace(boxes=self.boxes[left], scores=scores, labels=labels)
 
 
 class Finder:

@@ -27,8 +27,9 @@ from typing import Any, BinaryIO, TypeGuard
 
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.envelope.commands import Command
+from eventsrc.envelope.dropped_classes import DropClasses
 from eventsrc.envelope.ingest import check_cost
-from eventsrc.envelope.system_events import COMMAND_KEY, MAX_KEPT_BYTES, Excerpt
+from eventsrc.envelope.system_events import COMMAND_KEY, DROP_KEY, MAX_KEPT_BYTES, Excerpt
 
 from .sources import ImportedMessage, Source
 
@@ -39,12 +40,13 @@ _SHOWN_FIELDS = frozenset({"offset", "logged_ns", "stamp_ns", "key", "payload"})
 _MAX_NS = 2**63
 
 
-def command_record(command: Command, stamp_ns: int) -> dict[str, Any]:
-    """A command as a line of ``mapfold log cat --json`` has it: the first line of a file that says
-    the settings of the log that it is imported into."""
-    payload = command.model_dump(mode="json", exclude_none=True)
+def command_record(said: Command | DropClasses, stamp_ns: int) -> dict[str, Any]:
+    """A command, or that classes are dropped, as a line of ``mapfold log cat --json`` has it: one
+    of the first of a file that says this of the log that it is imported into."""
+    payload = said.model_dump(mode="json", exclude_none=True)
     times = {"logged_ns": stamp_ns, "stamp_ns": stamp_ns}
-    return {"offset": 0, **times, "key": COMMAND_KEY, "payload": payload}
+    key = DROP_KEY if isinstance(said, DropClasses) else COMMAND_KEY
+    return {"offset": 0, **times, "key": key, "payload": payload}
 
 
 def read_line(line: bytes) -> ImportedMessage:

@@ -1,5 +1,6 @@
-"""What a log has before an import: what of a source is in it already, and which of the source's
-commands it takes over.
+"""What a log has before an import, and what an import has added.
+
+What of a source is in the log already, and which of the source's commands it takes over:
 
 An envelope is in it already if it has the same bytes and its keyframe is recorded; another event of
 mapfold's own, or a verbatim message, if it has the same bytes, key and log time. Rejections are
@@ -12,7 +13,7 @@ undos.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -20,10 +21,14 @@ from typing import Final, NamedTuple
 from eventsrc.base.errors import LogDamaged, MapfoldError
 from eventsrc.base.text import command_line
 from eventsrc.envelope import commands
+from eventsrc.envelope.dropped_classes import NO_DROPPED, DropClasses, Dropped
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import CheckedEnvelope
 from eventsrc.envelope.model import FIRST_OFFSET, Offset, RunId
 from eventsrc.log import LogReader
+
+from .ros_bags import BagReport
+from .sources import PassedOver
 
 IS_KNOWN: Final = "in the log already"
 SETTINGS_CHOSEN: Final = "other settings than were chosen for the new log"
@@ -38,7 +43,8 @@ class LogCommands(NamedTuple):
     says nothing yet; ``settings`` the document in force, None without any; ``labels`` names of
     classes in force by label; ``all`` all commands. ``differs`` tells, of the settings in force and
     those of a source, why they are not the same; empty if they are. It raises MapfoldError for
-    settings that no fold can use."""
+    settings that no fold can use. ``drops`` is the event that more classes are dropped, None for
+    none; ``dropped`` are all classes that are, these among them."""
 
     begins: commands.UseSettings | None = None
     settings: Mapping[str, object] | None = None
@@ -47,6 +53,8 @@ class LogCommands(NamedTuple):
     differs: Callable[[Mapping[str, object] | None, Mapping[str, object]], str] = (
         lambda here, there: "" if here == there else "the settings are others"
     )
+    drops: DropClasses | None = None
+    dropped: Collection[str] = ()
 
 
 class SourceCommands:
@@ -109,6 +117,50 @@ class SourceCommands:
                     f"it calls label {label!r} {name!r}, which is {here!r} in this log; "
                     f"`{edit}` changes that"
                 )
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """Counts of an import, which appended the events ``first_offset`` to ``next_offset`` - 1."""
+
+    accepted: int
+    rejected: int
+    system: int
+    """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
+    skipped: int
+    """Number of messages that were passed over."""
+    first_offset: Offset
+    next_offset: Offset
+    maps: int = 0
+    """Occupancy maps, given or among the messages."""
+    verbatim: int = 0
+    """Verbatim messages of another mapfold log, copied unchanged."""
+    passed_over: tuple[PassedOver, ...] = ()
+    """Messages that were passed over, by topic and what they are, in the order of the first."""
+
+    @property
+    def known(self) -> int:
+        """How many messages were passed over because the log has them already."""
+        return sum(each.count for each in self.passed_over if each.what == IS_KNOWN)
+
+    @property
+    def imported_nothing(self) -> bool:
+        """Whether there were messages, all of them rejected or passed over, and none of them in the
+        log already."""
+        imported = self.accepted + self.system + self.maps + self.verbatim + self.known
+        return not imported and bool(self.rejected or self.skipped)
+
+    bags: tuple[BagReport, ...] = ()
+    """The reports of the ROS 2 bags."""
+    repeated: int | None = None
+    """How many accepted envelopes are of keyframes that the log had already, with other bytes, and
+    the fold ignores; None if no ledger was given."""
+    began_as_source: bool = False
+    """Whether a new log began with the settings that its first source begins with."""
+    numbered_classes: bool = False
+    """Whether all classes of accepted envelopes are numbers, and no command names any."""
+    dropped: Dropped = NO_DROPPED
+    """What was left out since the log never stores its class."""
 
 
 @dataclass(slots=True)

@@ -7,10 +7,13 @@ that was interrupted can be run again.
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+from pydantic import ValidationError
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.commands import encode_command
+from eventsrc.envelope.dropped_classes import ClassDropper, DropClasses
 from eventsrc.envelope.forms import BARE_LIST_VERSION
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, CheckedEnvelope, Rejected
@@ -18,6 +21,7 @@ from eventsrc.envelope.model import Offset, RunId, has_keyframe_id
 from eventsrc.envelope.occupancy_map import InvalidMap, OccupancyMap, decode_map
 from eventsrc.envelope.system_events import (
     COMMAND_KEY,
+    DROP_KEY,
     EMBEDDINGS_KEY,
     LOSS_KEY,
     MAP_KEY,
@@ -25,10 +29,24 @@ from eventsrc.envelope.system_events import (
     ROS_KEY,
 )
 from eventsrc.log import FsyncPolicy, LogWriter, MessageFormat
-from eventsrc.record.append import Checked, NewMap, check_payloads, checked_event, rejected_event
+from eventsrc.record.append import (
+    Checked,
+    NewMap,
+    check_payloads,
+    checked_event,
+    rejected_event,
+    without_dropped,
+)
 
 from .bag_streams import BagOptions
-from .known_log import IS_KNOWN, KnownEvents, LogCommands, NotTakenOver, SourceCommands
+from .known_log import (
+    IS_KNOWN,
+    ImportReport,
+    KnownEvents,
+    LogCommands,
+    NotTakenOver,
+    SourceCommands,
+)
 from .opening import open_source
 from .ros_bags import BagReport, RosBag
 from .sources import (
@@ -40,6 +58,7 @@ from .sources import (
     Source,
     TopicChoice,
     looks_like_envelope,
+    not_dropped,
 )
 
 DEFAULT_KEY = "tb/detections"
@@ -49,55 +68,11 @@ IMPORT_FSYNC = FsyncPolicy(interval_ns=500_000_000, max_events=4096)
 ALL_TOPICS = TopicChoice()
 _PROGRESS_EVERY = 64
 _DEFAULT_BAGS = BagOptions()
+_NO_COMMANDS = LogCommands()
 
 Progress = Callable[[Source], None]
 OnReject = Callable[[str, str], None]
 """Called with the place of a message (``run.jsonl: line 17``) and the reason of its rejection."""
-
-
-_NO_COMMANDS = LogCommands()
-
-
-@dataclass(frozen=True, slots=True)
-class ImportReport:
-    """Counts of an import, which appended the events ``first_offset`` to ``next_offset`` - 1."""
-
-    accepted: int
-    rejected: int
-    system: int
-    """Rejected payloads, losses and maps of another mapfold log, copied unchanged."""
-    skipped: int
-    """Number of messages that were passed over."""
-    first_offset: Offset
-    next_offset: Offset
-    maps: int = 0
-    """Occupancy maps, given or among the messages."""
-    verbatim: int = 0
-    """Verbatim messages of another mapfold log, copied unchanged."""
-    passed_over: tuple[PassedOver, ...] = ()
-    """Messages that were passed over, by topic and what they are, in the order of the first."""
-
-    @property
-    def known(self) -> int:
-        """How many messages were passed over because the log has them already."""
-        return sum(each.count for each in self.passed_over if each.what == IS_KNOWN)
-
-    @property
-    def imported_nothing(self) -> bool:
-        """Whether there were messages, all of them rejected or passed over, and none of them in the
-        log already."""
-        imported = self.accepted + self.system + self.maps + self.verbatim + self.known
-        return not imported and bool(self.rejected or self.skipped)
-
-    bags: tuple[BagReport, ...] = ()
-    """The reports of the ROS 2 bags."""
-    repeated: int | None = None
-    """How many accepted envelopes are of keyframes that the log had already, with other bytes, and
-    the fold ignores; None if no ledger was given."""
-    began_as_source: bool = False
-    """Whether a new log began with the settings that its first source begins with."""
-    numbered_classes: bool = False
-    """Whether all classes of accepted envelopes are numbers, and no command names any."""
 
 
 class ImportInterrupted(KeyboardInterrupt):
@@ -141,10 +116,12 @@ def import_files(
     """
     refused = on_reject or (lambda _place, _reason: None)
     given = [] if commands.begins is None else [(COMMAND_KEY, encode_command(commands.begins))]
+    given += [(DROP_KEY, commands.drops.encode())] if commands.drops else []
     given += [] if given_map is None else [(MAP_KEY, given_map.encode())]
+    dropper = ClassDropper[ImportedMessage](commands.dropped, commands.labels)
     known = KnownEvents(writer.path, writer.next_offset, ledger)
     of_source = SourceCommands(writer.path, commands)
-    run = _Import(writer, key, refused, topics, ledger, known, of_source, given)
+    run = _Import(writer, key, refused, topics, ledger, known, of_source, given, dropper)
     try:
         with ExitStack() as files:
             for name in names:
@@ -182,6 +159,7 @@ class _Import:
     commands: SourceCommands
     given: list[tuple[str, bytes]]
     """Keys and payloads that are appended before the first message."""
+    dropper: ClassDropper[ImportedMessage]
     begins: bool = False
     """Whether no message of the source had a time yet. If log times go back there, a new segment
     is begun."""
@@ -207,7 +185,11 @@ class _Import:
 
     def append(self, source: Source, message: ImportedMessage) -> None:
         """Append one message: a system event or a verbatim message unchanged, anything else after
-        validation."""
+        validation; all without what the log drops."""
+        for each in not_dropped(message, self.dropper) if self.dropper else (message,):
+            self._append(source, each)
+
+    def _append(self, source: Source, message: ImportedMessage) -> None:
         topic = message.key or self.key
         self.begins |= message.begins
         if not self.topics.takes(topic):
@@ -226,6 +208,8 @@ class _Import:
             self._append_map_event(source, message)
         elif message.key == COMMAND_KEY:
             self._append_command(source, message)
+        elif message.key == DROP_KEY:
+            self._append_drop(source, message)
         else:
             self._append_envelope(source, message)
         self.last = source, source.at
@@ -289,6 +273,18 @@ class _Import:
         else:
             self._append_system_event(COMMAND_KEY, message)
 
+    def _append_drop(self, source: Source, message: ImportedMessage) -> None:
+        """Append that another log drops classes, which this one then does, too."""
+        try:
+            is_new = self.dropper.add(DropClasses.model_validate_json(message.payload).classes)
+        except ValidationError as error:
+            self._reject(source, message, error.errors()[0]["msg"])
+            return
+        if is_new:
+            self._append_system_event(DROP_KEY, message)
+        else:
+            self.passed_over[DROP_KEY, IS_KNOWN] += 1
+
     def _append_refused(self, source: Source, message: ImportedMessage, reason: str) -> None:
         if self._is_for_others(message):
             self.passed_over[message.key or self.key, NO_ENVELOPES] += 1
@@ -298,7 +294,8 @@ class _Import:
     def _reject(self, source: Source, message: ImportedMessage, reason: str) -> None:
         payload = message.payload if message.excerpt is None else message.excerpt
         key, logged_ns = message.key or self.key, self._time_of(message)
-        self.writer.append_all([rejected_event(key, payload, reason, logged_ns)])
+        kept, why = self.dropper.kept_of(payload), self.dropper.reason(reason)
+        self.writer.append_all([rejected_event(key, kept, why, logged_ns)])
         self._count_rejected(source, reason)
 
     def _count_rejected(self, source: Source, reason: str) -> None:
@@ -322,7 +319,7 @@ class _Import:
 
     def _append_envelope(self, source: Source, message: ImportedMessage) -> None:
         key = message.key or self.key
-        (checked,) = check_payloads(
+        (whole,) = check_payloads(
             [(key, message.payload)],
             first=self.writer.next_offset,
             logged_ns=self.writer.now_ns() if message.logged_ns is None else message.logged_ns,
@@ -330,7 +327,13 @@ class _Import:
             version=BARE_LIST_VERSION if message.version == BARE_LIST_VERSION else None,
             are_grids=message.is_grid,
         )
-        result, stamp_ns = checked.result, checked.stamp_ns
+        checked, stripped = without_dropped(message.payload, whole, self.dropper)
+        self._append_checked(source, replace(message, payload=stripped.payload), checked)
+        for crop in self.dropper.release(stripped):
+            self._append(source, replace(crop, logged_ns=message.logged_ns))
+
+    def _append_checked(self, source: Source, message: ImportedMessage, checked: Checked) -> None:
+        key, result, stamp_ns = message.key or self.key, checked.result, checked.stamp_ns
         if isinstance(result, Rejected) and self._is_for_others(message):
             self.passed_over[key, NO_ENVELOPES] += 1
             return
@@ -341,7 +344,8 @@ class _Import:
         if isinstance(result, CheckedEnvelope) and stamp_ns is not None:
             keyframe = result.run_id, stamp_ns
         logged_ns = self._time_of(message, keyframe)
-        self.writer.append_all([checked_event(key, message.payload, checked, logged_ns)])
+        of_message = key, message.payload, checked, logged_ns, self.dropper
+        self.writer.append_all([checked_event(*of_message)])
         if isinstance(result, Rejected):
             self._count_rejected(source, result.reason)
         elif isinstance(result, NewMap):
@@ -391,4 +395,5 @@ class _Import:
             None if self.ledger is None else self.ledger.duplicates - self.repeated_before,
             self.commands.began,
             self.classes == {True} and not self.commands.names_labels,
+            self.dropper.counts,
         )

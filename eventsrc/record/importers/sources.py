@@ -1,22 +1,35 @@
-"""Messages to import and what gives them: their topics and log times, MCAP files, other logs."""
+"""Messages to import and what gives them: their topics and log times, MCAP files, other logs; and
+which of them a log takes that drops classes."""
 
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import BinaryIO, Final
 
+import numpy as np
+from pydantic import ValidationError
 from pydantic_core import from_json
 
 from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.envelope.crops import CROP_SCHEMA, InvalidCrop, decode_crop
+from eventsrc.envelope.dropped_classes import ClassDropper
 from eventsrc.envelope.grid_messages import GRID_SCHEMA
 from eventsrc.envelope.model import RunId
-from eventsrc.envelope.system_events import Excerpt
+from eventsrc.envelope.system_events import (
+    EMBEDDINGS_KEY,
+    REJECTED_KEY,
+    Excerpt,
+    InvalidEmbeddings,
+    decode_embeddings,
+)
 from eventsrc.log import LogReader, MessageFormat, VerbatimEvent
 from eventsrc.log.foreign_mcap import ForeignDamage, ForeignMessage, foreign_messages
 from eventsrc.log.format import IMPORTED
+from eventsrc.ros import measured
+from eventsrc.ros import messages as ros
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +139,52 @@ def looks_like_envelope(payload: bytes) -> bool:
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
         return False
     return all(any(name in each for name in _CLASS_FIELDS) for each in value)
+
+
+_MAY_SHOW: Final = "may show what the log drops"
+_SHOW_NOTHING: Final = (
+    *(ros.TF, ros.ODOMETRY, ros.POSE, ros.CAMERA_INFO, ros.GRID),
+    *(ros.LABELS, ros.VISION_INFO, ros.PARAMETERS, measured.LASER_SCAN),
+)
+"""Types of messages of ROS that show no detection."""
+
+
+def not_dropped(
+    message: ImportedMessage, dropper: ClassDropper[ImportedMessage]
+) -> list[ImportedMessage]:
+    """What a log that drops classes takes of a message that is no envelope: nothing of a crop while
+    its envelope has not come, other messages without what they show."""
+    form = message.form
+    if form is not None and form.schema == CROP_SCHEMA:
+        try:
+            det_id = decode_crop(message.payload).det_id
+        except InvalidCrop:  # another picture
+            return [replace(message, form=None, unread=f"{form.schema}, {_MAY_SHOW}")]
+        return dropper.crop(det_id, message, len(message.payload))
+    if form is not None and form.schema not in _SHOW_NOTHING:
+        what = f"{form.encoding} {form.schema}".strip()
+        return [replace(message, form=None, unread=f"{what}, {_MAY_SHOW}")]
+    try:
+        if message.key == REJECTED_KEY:
+            return [replace(message, payload=dropper.refused_again(message.payload))]
+        if message.key == EMBEDDINGS_KEY:
+            return _embeddings(message, dropper)
+    except (InvalidEmbeddings, ValidationError):
+        return [replace(message, unread=f"an event that cannot be read, {_MAY_SHOW}")]
+    return [message]
+
+
+def _embeddings(
+    message: ImportedMessage, dropper: ClassDropper[ImportedMessage]
+) -> list[ImportedMessage]:
+    made = decode_embeddings(message.payload)
+    left = [i for i, det_id in enumerate(made.det_ids) if not dropper.knows_dropped(det_id)]
+    if len(left) == len(made.det_ids):
+        return [message]
+    kept = made._replace(
+        det_ids=tuple(made.det_ids[i] for i in left), vectors=made.vectors[np.array(left, int)]
+    )
+    return [replace(message, payload=kept.encode())] if left else []
 
 
 TOGETHER_NS: Final = 10 * 1_000_000_000

@@ -14,23 +14,27 @@ that waited for a pose were not made into an envelope at all. Both follow from t
 log (`eventsrc.ros.derivation`), so the next recorder appends them before it records
 (`append_missing`). It must read the last recording's messages once; after a regular end there is
 nothing to do. A recording that has lost events to damage is left as it is.
+
+In a log that drops classes (`eventsrc.envelope.dropped_classes`) messages of detections, embeddings
+and pictures are read and not kept, so that after a kill nothing can be made of them.
 """
 
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged
 from eventsrc.envelope.crops import CROPS_TOPIC, encode_crop
+from eventsrc.envelope.dropped_classes import ClassDropper
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, MAP_KEY, ROS_KEY
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, VerbatimEvent
-from eventsrc.record.append import CROP_FORMAT, append_payload, map_event
+from eventsrc.record.append import CROP_FORMAT, NOTHING_DROPPED, append_payload, map_event
 from eventsrc.record.gap_history import keyframe_of, loss_of
 from eventsrc.record.transport.session import Received, SequenceNumber
 from eventsrc.ros.derivation import CDR, ROS2MSG, Derivation, Derived, RosRecording, read_recording
@@ -75,11 +79,15 @@ class Bridge:
         types: MessageTypes,
         wire: Wire | None = None,
         cut: CutCrops | None = None,
+        dropper: ClassDropper[CheckedMessage] | None = None,
     ) -> None:
+        self._dropper = ClassDropper[CheckedMessage]() if dropper is None else dropper
         self.recording = recording
         self.wire: Wire = wire or BridgeWire()
         self.derivation = Derivation(recording, types, cut)
-        self._kept = frozenset(topics)
+        streams = recording.streams if dropper else ()
+        showing = {t for s in streams for t in (s.detections, s.embeddings, s.images)}
+        self._kept = frozenset(topics) - showing
         self.topics = tuple(dict.fromkeys([*topics, *sorted(self.derivation.pictures)]))
         self.keys = tuple(map(self.wire.key, self.topics))
         self._topics: dict[str, str] = {}
@@ -169,7 +177,7 @@ class Bridge:
                 continue
             if self._topics[key] in self.derivation.pictures:
                 for derived in self.derivation.add_picture(self._topics[key], logged_ns, payload):
-                    taken += _checked(derived, check)
+                    taken += self._checked(derived, check)
                 if self._topics[key] not in self._kept:
                     continue
             if key in self._formats and key not in waiting:
@@ -187,7 +195,7 @@ class Bridge:
         while self._held:
             taken += self._give_up(self._next_held(), logged_ns, check)
         for derived in self.derivation.finish():
-            taken += _checked(derived, check)
+            taken += self._checked(derived, check)
         return taken
 
     def _know(self, key: str) -> bool:
@@ -263,7 +271,8 @@ class Bridge:
         self, key: str, payload: bytes, logged_ns: int, check: CheckEnvelope
     ) -> Iterator[CheckedMessage]:
         topic, form = self._topics[key], self._formats.get(key, _UNKNOWN)
-        yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
+        if topic in self._kept:
+            yield CheckedMessage(topic, payload, ENVELOPE_VERSION, None, form=form)
         if topic in self.derivation.pictures:
             return
         if key in self._undefined:
@@ -273,23 +282,28 @@ class Bridge:
             definition = form.schema_text.decode()
             made = self.derivation.add(topic, form.schema, definition, logged_ns, payload)
             for derived in made:
-                yield from _checked(derived, check)
+                yield from self._checked(derived, check)
 
-
-def _checked(derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]:
-    """The messages of an event: an envelope and its crops, or a map."""
-    if derived.key == MAP_KEY:
-        yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
-    else:
+    def _checked(self, derived: Derived, check: CheckEnvelope) -> Iterator[CheckedMessage]:
+        """The messages of an event: an envelope and its crops, or a map."""
+        if derived.key == MAP_KEY:
+            yield CheckedMessage(MAP_KEY, derived.payload, ENVELOPE_VERSION, None)
+            return
         for message in check([Received(derived.key, derived.payload)]):
             # no robot sent it, so none is answered
             yield msgspec.structs.replace(message, sha256="")
         for crop in derived.crops:
             kept = encode_crop(crop, derived.stamp_ns or 0)
-            yield CheckedMessage(CROPS_TOPIC, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
+            made = CheckedMessage(CROPS_TOPIC, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
+            yield from self._dropper.crop(crop.det_id, made, len(kept))
 
 
-def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) -> int:
+def append_missing(
+    reader: LogReader,
+    writer: LogWriter,
+    types: MessageTypes,
+    dropper: ClassDropper[Any] = NOTHING_DROPPED,
+) -> int:
     """Append the events that follow from the messages of the log's last recording of ROS and are
     not in it, and end that recording; returns how many. Raises LogDamaged."""
     last = None
@@ -305,7 +319,7 @@ def append_missing(reader: LogReader, writer: LogWriter, types: MessageTypes) ->
         if derived.key == MAP_KEY:
             writer.append_all([map_event(derived.payload, writer.now_ns())])
         else:
-            append_payload(writer, derived.key, derived.payload)
+            append_payload(writer, derived.key, derived.payload, dropper=dropper)
     writer.append(ROS_KEY, RosRecording(key=recording.key).encode())
     writer.sync()
     return len(missing)

@@ -12,11 +12,19 @@ from typing import Final
 import msgspec
 
 from eventsrc.envelope.crops import InvalidCrop, encode_crop, received_crop
+from eventsrc.envelope.dropped_classes import ClassDropper
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES, Rejected
 from eventsrc.envelope.model import ENVELOPE_VERSION, KeyframeId, RunId, has_keyframe_id
 from eventsrc.envelope.system_events import MAP_KEY, Excerpt
 from eventsrc.log import LogWriter, MessageFormat, NewEvent
-from eventsrc.record.append import CROP_FORMAT, NewMap, check_payloads, map_event, rejected_event
+from eventsrc.record.append import (
+    CROP_FORMAT,
+    NewMap,
+    check_payloads,
+    map_event,
+    rejected_event,
+    without_dropped,
+)
 from eventsrc.record.robot.acks import SENT_SUFFIX, Refusal, payload_sha256
 from eventsrc.record.transport.session import Received
 
@@ -101,8 +109,10 @@ class Checker:
         *,
         max_payload_bytes: int,
         max_messages: int | None,
+        dropper: ClassDropper[CheckedMessage] | None = None,
     ) -> None:
         self._queue = queue
+        self.dropper = ClassDropper[CheckedMessage]() if dropper is None else dropper
         self._writer = writer
         self._max_payload_bytes = max_payload_bytes
         self._max_kept_bytes = _MAX_KEPT * max(max_payload_bytes, DEFAULT_MAX_PAYLOAD_BYTES)
@@ -146,7 +156,7 @@ class Checker:
                 batch.bridged.append(message)
                 batch.size += len(message.payload)
             elif isinstance(message, CropMessage):
-                batch.messages.append(_checked_crop(message, self._writer.now_ns()))
+                batch.messages += self._crop(message)
                 batch.size += len(message.payload)
             elif message.key.endswith(SENT_SUFFIX):
                 batch.announcements.append(message)
@@ -163,43 +173,57 @@ class Checker:
         """The rejection of a message of which only an excerpt is kept."""
         excerpt = Excerpt.of((message.payload,))
         reason = excerpt.reason(self._max_kept_bytes)
+        if self.dropper:
+            return self._refused(message, reason)
         refusal = Refusal(sha256=excerpt.sha256, size=excerpt.size, reason=reason)
         return CheckedMessage(message.key, b"", ENVELOPE_VERSION, refusal, excerpt=excerpt)
 
+    def _refused(
+        self, message: Received, reason: str, version: int = ENVELOPE_VERSION
+    ) -> CheckedMessage:
+        refusal = Refusal.of(message.payload, self.dropper.reason(reason))
+        kept = self.dropper.kept_of(message.payload)
+        if isinstance(kept, Excerpt):
+            return CheckedMessage(message.key, b"", version, refusal, excerpt=kept)
+        return CheckedMessage(message.key, kept, version, refusal)
+
+    def _crop(self, message: CropMessage) -> list[CheckedMessage]:
+        """The crop to append, or its rejection; none while its detection may be dropped."""
+        try:
+            topic, crop = received_crop(message.key, message.payload)
+        except InvalidCrop as error:
+            return [self._refused(message, str(error))]
+        kept = encode_crop(crop, self._writer.now_ns())
+        checked = CheckedMessage(topic, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
+        return self.dropper.crop(crop.det_id, checked, len(kept))
+
     def check(self, messages: Sequence[Received]) -> Iterator[CheckedMessage]:
-        """Validate messages together; the result of each, in order."""
+        """Validate messages together; the result of each, in order, behind an envelope the crops
+        that waited for it."""
         checked = check_payloads(
             [(message.key, message.payload) for message in messages],
             first=self._writer.next_offset,
             logged_ns=self._writer.now_ns(),
             max_bytes=self._max_payload_bytes,
         )
-        for message, known in zip(messages, checked, strict=True):
-            key, payload = message.key, message.payload
+        for message, whole in zip(messages, checked, strict=True):
+            known, stripped = without_dropped(message.payload, whole, self.dropper)
+            key, payload = message.key, stripped.payload
             version, result = known.version, known.result
             if isinstance(result, Rejected):
-                refusal = Refusal.of(payload, result.reason)
-                yield CheckedMessage(key, payload, version, refusal)
+                yield self._refused(message, result.reason, version)
             elif isinstance(result, NewMap):
                 yield CheckedMessage(MAP_KEY, result.event, version, None)
             elif not has_keyframe_id(version):
                 yield CheckedMessage(key, payload, version, None)
             else:
                 run_id, keyframe_id = result.run_id, result.keyframe_id
-                sha256, stamp = payload_sha256(payload), result.stamp_ns
+                # of what the robot sent, which it waits for
+                sha256, stamp = payload_sha256(message.payload), result.stamp_ns
                 yield CheckedMessage(
                     key, payload, version, None, run_id, keyframe_id, stamp, sha256
                 )
-
-
-def _checked_crop(message: CropMessage, now_ns: int) -> CheckedMessage:
-    key, payload = message.key, message.payload
-    try:
-        topic, crop = received_crop(key, payload)
-    except InvalidCrop as error:
-        return CheckedMessage(key, payload, ENVELOPE_VERSION, Refusal.of(payload, str(error)))
-    kept = encode_crop(crop, now_ns)
-    return CheckedMessage(topic, kept, ENVELOPE_VERSION, None, form=CROP_FORMAT)
+            yield from self.dropper.release(stripped)
 
 
 def _split(messages: Sequence[Received]) -> Iterator[list[Received]]:

@@ -8,6 +8,7 @@ from typing import Final
 
 from eventsrc.base.errors import TransportError
 from eventsrc.envelope.crops import CROPS_TOPIC
+from eventsrc.envelope.dropped_classes import ClassDropper
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.ingest import DEFAULT_MAX_PAYLOAD_BYTES
 from eventsrc.envelope.model import RunId
@@ -16,6 +17,7 @@ from eventsrc.record.robot.acks import ACK_PREFIX, MAX_SENT_BYTES, sent_key
 from eventsrc.record.transport.session import Query, Received, Session, SizeLimit, check_keys
 
 from .bridged import Bridge
+from .checking import CheckedMessage
 from .edits import EditRequest, Edits, edit_key
 from .listener import fetch_kept, subscribe_to
 from .queue import DEFAULT_QUEUE_SIZE, BridgedMessage, CropMessage, MessageQueue
@@ -34,6 +36,7 @@ class Recorder:
     that do not count their keyframes by one. With ``edits`` it records commands too (`edits`), with
     ``bridge`` the messages of a bridge from ROS (`bridged`). Under ``crops``, each ``PREFIX/*``, it
     records the JPEGs of detections (`eventsrc.envelope.crops`), and ignores them under ``keys``.
+    What ``dropper`` leaves out is not stored.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class Recorder:
         edits: Edits | None = None,
         bridge: Bridge | None = None,
         crops: Sequence[str] = (),
+        dropper: ClassDropper[CheckedMessage] | None = None,
     ) -> None:
         bridged = () if bridge is None else bridge.keys
         check_keys((*keys, *bridged))
@@ -68,6 +72,7 @@ class Recorder:
             max_payload_bytes=max_payload_bytes,
             edits=edits,
             bridge=bridge,
+            dropper=dropper,
         )
         # A larger announcement is ignored, as is one that cannot be read: it is no event.
         sent_limit = SizeLimit(MAX_SENT_BYTES, lambda: None)

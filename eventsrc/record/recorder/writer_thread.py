@@ -30,6 +30,7 @@ from typing import Final, Literal, NamedTuple, cast
 from pydantic import ValidationError
 
 from eventsrc.base.errors import LogError
+from eventsrc.envelope.dropped_classes import NO_DROPPED, ClassDropper, Dropped
 from eventsrc.envelope.gaps import Gap, GapLedger, Source
 from eventsrc.envelope.model import Offset, RunId
 from eventsrc.envelope.system_events import LOSS_KEY, ROS_KEY, Loss
@@ -87,7 +88,8 @@ class RecorderReport:
     more; the next start may find some of them on the disk. ``unsealed`` segments are finished and
     not sealed, with ``sealing_error`` if sealing fails: they take more disk, nothing is lost.
     ``faults`` describe segment files that were deleted, cut short or written to by others, and
-    ``lost_from_log`` counts the recorded events in them. ``commands`` of `mapfold edit` are synced.
+    ``lost_from_log`` counts the recorded events in them. ``commands`` of `mapfold edit`, and
+    ``crops``, are synced; ``dropped`` was left out since the log never stores its class.
     """
 
     recorded: int
@@ -106,7 +108,6 @@ class RecorderReport:
     faults: tuple[str, ...] = ()
     commands: int = 0
     crops: int = 0
-    """JPEGs of detections that are synced."""
     messages: int = 0
     """Messages of a bridge that are kept verbatim and synced."""
     held: int = 0
@@ -119,6 +120,7 @@ class RecorderReport:
     """Messages of a bridge left out, since their keys belong to no recorded topic."""
     streams: tuple[tuple[str, Counts], ...] = ()
     """Counts of the envelopes made, by topic of detections of a bridge."""
+    dropped: Dropped = NO_DROPPED
 
     @property
     def lost(self) -> int:
@@ -169,6 +171,7 @@ class WriterThread:
         max_payload_bytes: int,
         edits: Edits | None = None,
         bridge: Bridge | None = None,
+        dropper: ClassDropper[CheckedMessage] | None = None,
     ) -> None:
         self._queue = queue
         self._bridge = bridge
@@ -182,7 +185,11 @@ class WriterThread:
         self._save_after_ns = _FIRST_SAVE_NS
         self._save_due_ns = time.monotonic_ns() + self._save_after_ns
         self._checker = Checker(
-            queue, writer, max_payload_bytes=max_payload_bytes, max_messages=max_events
+            queue,
+            writer,
+            max_payload_bytes=max_payload_bytes,
+            max_messages=max_events,
+            dropper=dropper,
         )
         self._unsynced: deque[tuple[Offset, CheckedMessage]] = deque()
         self._announcements: deque[_Announcement] = deque()
@@ -244,6 +251,7 @@ class WriterThread:
             unread=() if self._bridge is None else self._bridge.unread,
             unknown_keys=0 if self._bridge is None else self._bridge.unknown_keys,
             streams=() if self._bridge is None else self._bridge.streams,
+            dropped=self._checker.dropper.counts,
         )
 
     def _unwritten(self) -> int:

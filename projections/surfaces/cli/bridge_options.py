@@ -14,12 +14,14 @@ import typer
 
 from eventsrc.base.errors import LogDamaged, MisuseError
 from eventsrc.base.text import counted, visible
+from eventsrc.envelope.dropped_classes import ClassDropper
 from eventsrc.envelope.gaps import GapLedger
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.importers.bag_streams import BagOptions, Choice
 from eventsrc.record.importers.map_yaml import read_labels
 from eventsrc.record.recorder.bridged import Bridge, append_missing
+from eventsrc.record.recorder.checking import CheckedMessage
 from eventsrc.record.recorder.recorder import DEFAULT_KEYS
 from eventsrc.record.recorder.writer_thread import RecorderReport
 from eventsrc.record.ros_node import MAP_FRAME, find_topics
@@ -272,11 +274,13 @@ def as_of_a_bag(choice: BridgeChoice) -> BagOptions:
     )
 
 
-def finish_last_recording(writer: LogWriter, types: MessageTypes) -> None:
+def finish_last_recording(
+    writer: LogWriter, types: MessageTypes, dropper: ClassDropper[CheckedMessage]
+) -> None:
     """Make the envelopes that a killed recorder left out, before those of this one are numbered."""
     try:
         with LogReader(writer.path) as reader:
-            made = append_missing(reader, writer, types)
+            made = append_missing(reader, writer, types, dropper)
     except LogDamaged as error:
         say(f"not checked which envelopes the last recording of ROS lacks: {error}")
     else:

@@ -32,7 +32,7 @@ from eventsrc.record.transport.session import Session, ZenohOptions, open_sessio
 
 from . import detect_text
 from .detect_text import WITHOUT_MODELS, advice, as_document, metrics_of, show_status, summary
-from .new_log import NewLogOptions
+from .new_log import DropClassOption, NewLogOptions, drop_event
 from .options import JsonOption, PublishKeyOption, ZenohPeer, option
 from .signals import stop_on_signals
 from .terminal import emit, finish, say
@@ -177,6 +177,7 @@ def detect(
         option("FILE", "Write JSON lines for `import` into a new file; publish nothing."),
     ] = None,
     new_log: NewLogOptions,
+    drop_class: DropClassOption = None,
     keep_crops: Annotated[
         bool,
         typer.Option(
@@ -220,6 +221,7 @@ def detect(
         raise MisuseError("--keep-crops publishes crops, but --out nothing; give one of them")
     check_key(key, "--key")
     settings = new_log.for_file(out)
+    drops = drop_event(drop_class)
     address = None if metrics is None else parse_address(metrics, "--metrics")
     name = detect_text.run_id_of(run_id)
     check_installed()
@@ -255,11 +257,12 @@ def detect(
             name,
             hfov_deg=hfov,
             keep_crops=keep_crops,
+            drop_classes=drop_class or (),
             note=_note,
         )
         output = _output(
             stack,
-            None if out is None else service.FileOutput(out, settings),
+            None if out is None else service.FileOutput(out, settings, drops),
             zenoh,
             spool or detect_text.spool_path(),
             key,

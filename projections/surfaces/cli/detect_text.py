@@ -189,6 +189,9 @@ def summary(run_id: str, report: Report, where: str) -> str:
         f"{counts.not_finite:,} boxes of NaN" if counts.not_finite else "",
         f"{counts.too_small:,} boxes of no size" if counts.too_small else "",
         f"{counts.cut:,} boxes too many" if counts.cut else "",
+        f"{counted(counts.dropped_detections, 'detection')} dropped by class"
+        if counts.dropped_detections
+        else "",
         f"{counts.not_encoded:,} without an embedding" if counts.not_encoded else "",
         f"{counted(sent.crops, 'crop')} sent" if sent.crops else "",
         f"{counted(sent.crops_lost, 'crop')} lost" if sent.crops_lost else "",

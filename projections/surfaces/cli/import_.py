@@ -15,6 +15,7 @@ from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.gap_history import fold_and_save_ledger
 from eventsrc.record.importers import run
 from eventsrc.record.importers.bag_streams import BagOptions
+from eventsrc.record.importers.known_log import ImportReport
 from eventsrc.record.importers.map_yaml import read_map_yaml
 from eventsrc.record.importers.opening import check_sources, is_ros
 from eventsrc.record.importers.sources import NOT_CHOSEN, Source, TopicChoice
@@ -22,7 +23,7 @@ from eventsrc.record.transport.config import check_key
 
 from .bag_text import BagChoice, bag_lines
 from .folded_log import classes_advice
-from .new_log import LogStart, NewLogOptions, say_camera
+from .new_log import DropClassOption, LogStart, NewLogOptions, drop_event, say_camera
 from .options import JsonOption, option
 from .recorder_text import restart_as_json, say_restart
 from .signals import ctrl_c_between_steps
@@ -63,6 +64,7 @@ def import_(
         option("GLOB", "Only topics (keys) that match this, such as 'tb/*'; may be repeated."),
     ] = None,
     new_log: NewLogOptions,
+    drop_class: DropClassOption = None,
     choice: BagChoice,
     json_: JsonOption = False,
 ) -> None:
@@ -91,12 +93,13 @@ def import_(
     given_map = None if map_ is None else read_map_yaml(map_, floor)
     bags = choice.options()
     new_log.check()
+    drops = drop_event(drop_class)
     has_ros = any(map(is_ros, names))
     rejects = _RejectPrinter()
     try:
         with LogWriter(log, fsync=run.IMPORT_FSYNC, imported=True) as writer:
             say_restart(log, writer)
-            start = LogStart.of(log, writer, new_log, is_ros=has_ros)
+            start = LogStart.of(log, writer, new_log, is_ros=has_ros, drops=drops)
             ledger = _known_keyframes(log)
             with FileBars() as bars, ctrl_c_between_steps() as step, start.said_on_error(writer):
                 report = run.import_files(
@@ -148,10 +151,11 @@ def _known_keyframes(log: Path) -> GapLedger[RunId] | None:
         return None
 
 
-def _as_json(report: run.ImportReport) -> dict[str, Any]:
+def _as_json(report: ImportReport) -> dict[str, Any]:
     """The report as JSON; ``bags`` and such only where there is something to say."""
     document = asdict(report)
-    for name in ("bags", "began_as_source", "numbered_classes"):
+    document["dropped"] = report.dropped._asdict() if any(report.dropped) else None
+    for name in ("bags", "began_as_source", "numbered_classes", "dropped"):
         if not document[name]:
             del document[name]
     return document
@@ -184,7 +188,7 @@ def _kept(log: Path, interrupted: run.ImportInterrupted) -> str:
     )
 
 
-def _summary(log: Path, report: run.ImportReport) -> str:
+def _summary(log: Path, report: ImportReport) -> str:
     parts = [f"imported {counted(report.accepted, 'envelope')} into {log}"]
     if report.repeated:
         new = report.accepted - report.repeated
@@ -197,6 +201,10 @@ def _summary(log: Path, report: run.ImportReport) -> str:
         parts.append(f"{counted(report.verbatim, 'verbatim message')} taken over")
     if report.system:
         parts.append(f"{counted(report.system, 'event')} of mapfold's own taken over")
+    if report.dropped.detections:
+        parts.append(f"{counted(report.dropped.detections, 'detection')} dropped by class")
+    if report.dropped.crops:
+        parts.append(f"{counted(report.dropped.crops, 'crop')} dropped")
     if report.skipped:
         parts.append(f"{counted(report.skipped, 'message')} passed over")
     parts.append(f"{report.rejected} rejected")
@@ -208,7 +216,7 @@ def _summary(log: Path, report: run.ImportReport) -> str:
     return ", ".join(parts) + hint
 
 
-def _passed_over(log: Path, report: run.ImportReport) -> Iterator[str]:
+def _passed_over(log: Path, report: ImportReport) -> Iterator[str]:
     for each in report.passed_over[:_MOST_TOPICS]:
         yield visible(f"passed over: {each.topic}: {counted(each.count, 'message')}, {each.what}")
     if len(report.passed_over) > _MOST_TOPICS:

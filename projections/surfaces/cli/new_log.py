@@ -1,4 +1,5 @@
-"""The settings of a log, said once: when it is made they become its first event.
+"""What is said once of a log: its settings, which become its first event, and the classes that it
+drops (`eventsrc.envelope.dropped_classes`), which any later recording may add to.
 
 A log is new as long as it has no events. A command with other settings than a log has is refused;
 the error names the `edit` that changes them.
@@ -10,15 +11,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
+
+from pydantic import ValidationError
 
 from eventsrc.base.errors import LogDamaged, MapfoldError, MisuseError
 from eventsrc.base.text import command_line, visible
 from eventsrc.envelope.commands import UseSettings, encode_command
+from eventsrc.envelope.dropped_classes import MAX_CLASSES, ClassDropper, DropClasses
 from eventsrc.envelope.ingest import Accepted, ingest
-from eventsrc.envelope.model import FIRST_OFFSET, Offset
-from eventsrc.envelope.system_events import COMMAND_KEY
+from eventsrc.envelope.model import FIRST_OFFSET, MAX_ID_LENGTH, Offset
+from eventsrc.envelope.system_events import COMMAND_KEY, DROP_KEY
 from eventsrc.log import LogReader, LogWriter
+from eventsrc.record.append import dropped_classes
 from eventsrc.record.importers.known_log import LogCommands
 from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.map_errors import FoldError
@@ -35,6 +40,31 @@ ROS_PRESET: Final = "full"
 _ROS_REASON: Final = "the preset of ROS input"
 _TOLD_REASON: Final = "said when the log was made"
 _PANEL: Final = "Settings of a new log"
+
+
+DropClassOption = Annotated[
+    list[str] | None,
+    option(
+        "CLASS",
+        "Never store detections of this class, nor their vectors and crops; may be repeated. Said"
+        " once: all later recordings of the log obey, and nothing takes it back.",
+        "--drop-class",
+    ),
+]
+
+
+def drop_event(classes: Sequence[str] | None) -> DropClasses | None:
+    """The event that says ``--drop-class``; None without it. Raises MisuseError."""
+    named = tuple(dict.fromkeys(classes or ()))
+    if not named:
+        return None
+    try:
+        return DropClasses(classes=named, issued_by=user_at_host())
+    except ValidationError:
+        raise MisuseError(
+            f"--drop-class {visible(', '.join(named)[:80])}: name at most {MAX_CLASSES:,} classes,"
+            f" each of 1 to {MAX_ID_LENGTH} characters, none of them a control character"
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,24 +158,55 @@ class LogStart:
     known: Settings | None = None
     command: UseSettings | None = None
     commands: tuple[RecordedCommand, ...] = ()
+    drops: DropClasses | None = None
+    dropped: frozenset[str] = frozenset()
 
     @classmethod
     def of(
-        cls, log: Path, writer: LogWriter, options: NewLogOptions, *, is_ros: bool
+        cls,
+        log: Path,
+        writer: LogWriter,
+        options: NewLogOptions,
+        *,
+        is_ros: bool,
+        drops: DropClasses | None = None,
     ) -> "LogStart":
-        """The start of the log that ``writer`` has opened; ``is_ros`` if it gets input of ROS.
-        Raises MisuseError if settings are chosen and the log has others."""
+        """The start of the log that ``writer`` has opened; ``is_ros`` if it gets input of ROS, and
+        ``drops`` are classes that it is to drop. Raises MisuseError if settings are chosen and the
+        log has others."""
+        asked = frozenset(() if drops is None else drops.classes)
         if writer.next_offset > 0:
+            with LogReader(log) as reader:
+                dropped = dropped_classes(reader)
             commands = _known_commands(log, is_needed=bool(options.assignments))
             known = compile_corrections(commands).settings
             _check_same(log, known or Settings(), options)
             return cls(
-                log, options, is_new=False, is_ros=is_ros, known=known, commands=tuple(commands)
+                log,
+                options,
+                is_new=False,
+                is_ros=is_ros,
+                known=known,
+                commands=tuple(commands),
+                drops=None if asked <= dropped else drops,
+                dropped=dropped | asked,
             )
         command = options.command()
         if command is None and is_ros:
             command = _command([f"preset={ROS_PRESET}"], _ROS_REASON)
-        return cls(log, options, is_new=True, is_ros=is_ros, command=command)
+        return cls(
+            log,
+            options,
+            is_new=True,
+            is_ros=is_ros,
+            command=command,
+            drops=drops,
+            dropped=asked,
+        )
+
+    def dropper(self) -> ClassDropper[Any]:
+        """What leaves out the classes that the log drops."""
+        return ClassDropper(self.dropped, compile_corrections(self.commands).labels)
 
     def for_import(self) -> LogCommands:
         """The same for an importer."""
@@ -154,7 +215,8 @@ class LogStart:
             document = self.command.settings
         labels = compile_corrections(self.commands).labels
         given = [recorded.command for recorded in self.commands]
-        return LogCommands(self.command, document, labels, given, self._differs)
+        dropped = self.drops, self.dropped
+        return LogCommands(self.command, document, labels, given, self._differs, *dropped)
 
     def _differs(self, here: Mapping[str, object] | None, there: Mapping[str, object]) -> str:
         """Why the settings of a source are not those of the log; empty if they are the same."""
@@ -175,7 +237,9 @@ class LogStart:
         """Append the command; it is durable when this returns."""
         if self.command is not None:
             writer.append(COMMAND_KEY, encode_command(self.command))
-            writer.sync()
+        if self.drops is not None:
+            writer.append(DROP_KEY, self.drops.encode())
+        writer.sync()
         self.say()
 
     @contextmanager
@@ -194,7 +258,10 @@ class LogStart:
 
     def say(self, *, as_source: bool = False) -> None:
         """Print one line on the settings of a new log, ``as_source`` if it took those of a source.
-        Also where ROS goes into a log that says nothing."""
+        Also where ROS goes into a log that says nothing. And one on the classes that it drops."""
+        if self.dropped:
+            named = ", ".join(sorted(self.dropped))
+            say(visible(f"{self.log}: detections of {named} are not stored, as this log says"))
         if self.command is not None:
             named = " ".join(self.options.words()) or f"--preset {ROS_PRESET}, for input of ROS"
             say(visible(f"{self.log}: a new log with {named}, said at offset 0"))

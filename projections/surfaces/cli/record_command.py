@@ -27,7 +27,7 @@ from projections.fold.corrections import check_settings
 from . import bridge_options
 from .bag_text import crop_cutter, stream_lines
 from .folded_log import classes_advice
-from .new_log import LogStart, NewLogOptions, say_camera
+from .new_log import DropClassOption, LogStart, NewLogOptions, drop_event, say_camera
 from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer, option
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
@@ -92,6 +92,7 @@ def record(
         ),
     ] = False,
     new_log: NewLogOptions,
+    drop_class: DropClassOption = None,
     ros2: bridge_options.Ros2Option = False,
     domain: bridge_options.RecordedDomainOption = None,
     ros2dds: bridge_options.Ros2ddsOption = False,
@@ -108,6 +109,7 @@ def record(
     bridge_options.check_unused(choice, domain, ros2=ros2, ros2dds=ros2dds)
     is_ros = ros2 or ros2dds
     new_log.check()
+    drops = drop_event(drop_class)
     policy = parse_fsync(fsync)
     options = dataclasses.replace(
         peer.zenoh, max_message_bytes=max(_LARGEST_BYTES, 4 * max_payload)
@@ -136,9 +138,16 @@ def record(
         writer = opened.enter_context(LogWriter(log, fsync=policy, sealing_process=True))
         say_restart(log, writer)
         start = writer.next_offset
-        LogStart.of(log, writer, new_log, is_ros=is_ros).record(writer)
+        said = LogStart.of(log, writer, new_log, is_ros=is_ros, drops=drops)
+        dropper = said.dropper()
+        if dropper and choice.topic:
+            raise MisuseError(
+                f"--topic {visible(choice.topic[0])} keeps messages as they are, with whatever they"
+                f" show, but the log drops {visible(', '.join(sorted(dropper.classes)))}"
+            )
+        said.record(writer)
         if types is not None:
-            bridge_options.finish_last_recording(writer, types)
+            bridge_options.finish_last_recording(writer, types, dropper)
         ledger = _gap_history(log)
         bridge = None
         if types is not None:
@@ -148,7 +157,7 @@ def record(
                 else bridge_options.topics_of_nodes(choice, made, number, ledger)
             )
             cut = crop_cutter(choice.keep_crops, choice.images)
-            bridge = Bridge(found.recording, found.topics, types, found.wire, cut)
+            bridge = Bridge(found.recording, found.topics, types, found.wire, cut, dropper)
         recorder = Recorder(
             session,
             writer,
@@ -161,6 +170,7 @@ def record(
             edits=_edits(log, writer) if accept_edits else None,
             bridge=bridge,
             crops=crop_keys,
+            dropper=dropper,
         )
         summary.watch(writer, recorder)
         with _metrics(address, recorder, log), show_status(log) as watch:

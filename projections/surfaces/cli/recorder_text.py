@@ -215,10 +215,16 @@ def summary(log: Path, report: RecorderReport) -> str:
     """The last line of a recording."""
     commands = f"{counted(report.commands, 'command')} of mapfold edit, " if report.commands else ""
     messages = f"{counted(report.messages, 'message')} of ROS, " if report.messages else ""
+    left_out = (
+        f"{counted(report.dropped.detections, 'detection')} and "
+        f"{counted(report.dropped.crops, 'crop')} dropped by class, "
+        if any(report.dropped)
+        else ""
+    )
     crops = f"{counted(report.crops, 'crop')}, " if report.crops else ""
     return (
         f"{log}: {report.recorded:,} recorded, {report.rejected:,} rejected, {report.lost:,} lost, "
-        f"{counted(report.missing, 'keyframe')} missing; {crops}{messages}{commands}"
+        f"{counted(report.missing, 'keyframe')} missing; {left_out}{crops}{messages}{commands}"
         f"{counted(report.next_offset, 'event')} in the log"
     )
 
@@ -245,5 +251,6 @@ def as_json(report: RecorderReport) -> dict[str, Any]:
         "next_offset": report.next_offset,
         "unsealed": report.unsealed,
         "sealing_error": report.sealing_error,
+        **({"dropped": report.dropped._asdict()} if any(report.dropped) else {}),
         **(of_ros if report.streams else {}),
     }
