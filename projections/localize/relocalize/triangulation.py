@@ -283,9 +283,15 @@ def cluster_points(points: Points, weight: Floats, most: int) -> list[Indices]:
     free = np.ones(len(weight), dtype=bool)
     left = weight.copy()
     support = (near * left).sum(1)
+    # what clusters take lowers the support of others, which is summed again only where it counts
+    is_new = free.copy()
     found: list[Indices] = []
     while True:
-        centre = int(np.argmax(support))
+        centre = int(support.argmax())
+        while not is_new[centre]:
+            support[centre] = (near[centre] * left).sum()
+            is_new[centre] = True
+            centre = int(support.argmax())
         mean = _weighted_mean(points, near[centre] * free)
         members = free & (_chi_squared(points, mean) < _GATE)
         members[centre] = True
@@ -295,9 +301,8 @@ def cluster_points(points: Points, weight: Floats, most: int) -> list[Indices]:
         if len(found) == most or not free.any():
             return found
         left[cluster] = 0.0
-        # the support of points that are not near one of these is what it was
-        lost = np.flatnonzero(near.take(cluster, axis=1).any(1))
-        support[lost] = np.where(free[lost], (near.take(lost, axis=0) * left).sum(1), -1.0)
+        support[cluster] = -1.0
+        is_new[:] = False
 
 
 @dataclass(frozen=True, slots=True)
