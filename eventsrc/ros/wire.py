@@ -53,7 +53,6 @@ _OWN_ENCLAVE: Final = "%mapfold"
 _LABELLED: Final = b"\x0fsequence_number"
 """The start of attachments that name their fields, which older versions of rmw_zenoh send."""
 _FIELDS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
-MAX_DOMAIN: Final = 232
 
 
 class KeyParts(NamedTuple):

@@ -23,6 +23,7 @@ NETWORK = ("zenoh", "fastapi", "starlette", "uvicorn")
 DATABASES = ("psycopg", "pgserver", "projections.postgres")
 WRITERS = ("eventsrc.log.writer", "eventsrc.log.recover", "eventsrc.log.verify")
 HELPERS = ("projections.localize", "projections.edit", "projections.surfaces.serve")
+IMPORTERS = ("eventsrc.record.importers", "eventsrc.record.recorder")
 
 
 ALWAYS = (*ROS, *ADAPTERS, *NETWORK, *DATABASES, *HELPERS)
@@ -42,6 +43,7 @@ def loaded(folder: Path, *words: str) -> list[str]:
             ("merges sample", (*ALWAYS, *WRITERS), 152),
             ("state sample", (*ALWAYS, *WRITERS), 140),
             ("log info sample", ALWAYS, 130),
+            ("path sample 0,0 1,0", (*ROS, *IMPORTERS, *ADAPTERS, *NETWORK, *WRITERS), 122),
         ]
     ),
 )

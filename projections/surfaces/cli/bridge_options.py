@@ -2,13 +2,12 @@
 
 import dataclasses
 import functools
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import typer
 
@@ -29,17 +28,16 @@ from eventsrc.record.transport.session import Session
 from eventsrc.ros.derivation import RosRecording
 from eventsrc.ros.library import MessageTypes
 from eventsrc.ros.stream import DEFAULT_MAX_GAP_NS, Stream
-from eventsrc.ros.wire import MAX_DOMAIN, BridgeWire, RmwWire, Wire, topic_of
+from eventsrc.ros.wire import BridgeWire, RmwWire, Wire, topic_of
 
 from . import bag_text
-from .options import option
+from .options import domain_option
 from .terminal import say
 
 TF_POSE: Final = "tf"
 NONE: Final = "none"
 _DETECTIONS: Final = "/detections"
 _GRID: Final = "/map"
-_DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
 _BASE_FRAME: Final = "base_link"
 _QUIET_S: Final = 5.0
 _PANEL: Final = "Messages of ROS 2, with --ros2 or --ros2dds"
@@ -58,14 +56,8 @@ Ros2Option = Annotated[
 ]
 
 
-def _domain_option(text: str, **more: Any) -> Any:
-    default = " [default: ROS_DOMAIN_ID, else 0]"
-    return option("N", text + default, "--domain", min=0, max=MAX_DOMAIN, **more)
-
-
-DomainOption = Annotated[int | None, _domain_option("The ROS domain of the node.")]
 RecordedDomainOption = Annotated[
-    int | None, _domain_option("The domain of the nodes, with --ros2.", rich_help_panel=_PANEL)
+    int | None, domain_option("The domain of the nodes, with --ros2.", rich_help_panel=_PANEL)
 ]
 Ros2ddsOption = Annotated[
     bool,
@@ -183,18 +175,6 @@ def check_unused(choice: BridgeChoice, domain: int | None, *, ros2: bool, ros2dd
             "--namespace, --detections, --pose and the other options for messages of ROS go with "
             "--ros2 or --ros2dds"
         )
-
-
-def domain_of(domain: int | None) -> int:
-    """``--domain``, or that of ROS's environment. Raises MisuseError."""
-    if domain is not None:
-        return domain
-    said = os.environ.get(_DOMAIN_VARIABLE) or "0"
-    if not (said.isascii() and said.isdecimal() and len(said) < 9 and int(said) <= MAX_DOMAIN):
-        raise MisuseError(
-            f"{_DOMAIN_VARIABLE} is {visible(said)[:80]}, not 0 to {MAX_DOMAIN}; give --domain N"
-        )
-    return int(said)
 
 
 class RecordedRos(NamedTuple):

@@ -10,8 +10,7 @@ import typer
 from eventsrc.base.errors import MapfoldError, MisuseError
 from projections.ask.goal_pose import GoalPose
 
-from .bridge_options import DomainOption, domain_of
-from .options import ZenohClient, option
+from .options import DomainOption, ZenohClient, domain_of, option
 from .terminal import display, emit, say
 
 

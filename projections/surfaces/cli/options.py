@@ -12,11 +12,12 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast, get_args
 
 import typer
 
 from eventsrc.base.errors import MisuseError
+from eventsrc.base.text import visible
 from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.record.transport.config import DEFAULT_ENDPOINT, ZenohOptions
 from projections.fold.map_errors import QuestionError
@@ -289,3 +290,30 @@ def method_from(text: str) -> "Method":
     if text in get_args(Method):
         return cast("Method", text)
     raise MisuseError(f"--method {text}: choose joint or plain")
+
+
+# Robots with ROS 2
+
+_DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
+_MAX_DOMAIN: Final = 232
+
+
+def domain_option(text: str, **more: Any) -> Any:
+    """The option ``--domain``."""
+    default = f" [default: {_DOMAIN_VARIABLE}, else 0]"
+    return option("N", text + default, "--domain", min=0, max=_MAX_DOMAIN, **more)
+
+
+DomainOption = Annotated[int | None, domain_option("The ROS domain of the node.")]
+
+
+def domain_of(domain: int | None) -> int:
+    """``--domain``, or that of ROS's environment. Raises MisuseError."""
+    if domain is not None:
+        return domain
+    said = os.environ.get(_DOMAIN_VARIABLE) or "0"
+    if not (said.isascii() and said.isdecimal() and len(said) < 9 and int(said) <= _MAX_DOMAIN):
+        raise MisuseError(
+            f"{_DOMAIN_VARIABLE} is {visible(said)[:80]}, not 0 to {_MAX_DOMAIN}; give --domain N"
+        )
+    return int(said)

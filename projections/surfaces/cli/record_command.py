@@ -28,7 +28,7 @@ from . import bridge_options
 from .bag_text import crop_cutter, stream_lines
 from .folded_log import classes_advice
 from .new_log import DropClassOption, LogStart, NewLogOptions, drop_event, say_camera
-from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer, option
+from .options import ConfigOption, JsonOption, ListenOption, ZenohPeer, domain_of, option
 from .recorder_text import EVERY_S, RecorderSummary, say_restart, show_status
 from .signals import stop_on_signals
 from .terminal import say, say_metrics
@@ -118,7 +118,7 @@ def record(
     check_keys(keys)
     crop_keys = _crop_keys(crops)
     types = MessageTypes() if is_ros else None
-    number = bridge_options.domain_of(domain) if ros2 else 0
+    number = domain_of(domain) if ros2 else 0
     if ros2dds:
         bridge_options.recording_of(choice, 0, None)
     if is_ros:

@@ -21,9 +21,17 @@ from eventsrc.ros.wire import RmwWire, topic_of
 from projections.fold.map_errors import DatabaseUnavailable, ProjectionMissing
 from projections.localize.relocalize import Answer, Question, rank
 
-from .bridge_options import DomainOption, domain_of, used_topics
+from .bridge_options import used_topics
 from .folded_log import FoldSettings, NoCacheOption
-from .options import LiveDbOption, LogOrDbArgument, VectorsOption, ZenohClient, option
+from .options import (
+    DomainOption,
+    LiveDbOption,
+    LogOrDbArgument,
+    VectorsOption,
+    ZenohClient,
+    domain_of,
+    option,
+)
 from .signals import stop_on_signals
 from .terminal import say
 
