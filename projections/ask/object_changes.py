@@ -22,12 +22,15 @@ A change is *sure* when
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from projections.fold.exact import UM_PER_M
-from projections.fold.presence import would_see
+from projections.fold.presence import similar_sights, would_see
 from projections.fold.sights import camera_of
 from projections.map.phrases import seen_times
 from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord, Relocation
@@ -185,8 +188,8 @@ def _looked_again(earlier: MapView, later: MapView, record: ObjectRecord) -> boo
     where it stood."""
     seen = list(earlier.sightings(record))
     until, runs = max(k.offset for k in seen), {k.run for k in seen}
-    since = (k for k in later.keyframes if k.offset > until and k.run not in runs)
-    return bool(keyframes_looking(earlier, record, since))
+    looking = keyframes_looking(earlier, record, later)
+    return any(k.offset > until and k.run not in runs for k in looking)
 
 
 def _checked(later: MapView, record: ObjectRecord, absence: ObjectAbsence) -> ObjectAbsence:
@@ -195,7 +198,7 @@ def _checked(later: MapView, record: ObjectRecord, absence: ObjectAbsence) -> Ob
     if any(keyframe.run == record.missing_in for keyframe in seen.values()):
         return replace(absence, sure=False)
     until = max(seen)
-    looks = keyframes_looking(later, record, later.keyframes)
+    looks = list(keyframes_looking(later, record, later))
     before = [keyframe for keyframe in looks if keyframe.offset <= until]
     hits = sum(keyframe.offset in seen for keyframe in before)
     is_usual = hits + 1 >= _SHARE * (len(before) + 2)
@@ -218,22 +221,37 @@ def _turn(looks: Iterable[KeyframeRecord], spot: Point) -> float:
 
 
 def keyframes_looking(
-    view: MapView, record: ObjectRecord, among: Iterable[KeyframeRecord]
-) -> list[KeyframeRecord]:
-    """Those of some keyframes that should see an Object where it stands
-    (`fold.presence.would_see`)."""
+    view: MapView, record: ObjectRecord, among: MapView
+) -> Iterator[KeyframeRecord]:
+    """The keyframes of ``among`` that should see an Object of ``view`` where it stands
+    (`fold.presence`), in their order."""
     seen = [k for k in view.sightings(record) if k.pose is not None]
     floors = {k.floor for k in seen}
     vantages = {(k.pose.x_um / UM_PER_M, k.pose.y_um / UM_PER_M) for k in seen if k.pose}
-    found = list[KeyframeRecord]()
-    for keyframe in among:
-        pose = keyframe.pose
-        if pose is None or keyframe.floor not in floors:
-            continue
-        camera = camera_of(keyframe.camera, view.settings.camera)
-        if any(would_see(pose, camera, record.spot, vantage) for vantage in vantages):
-            found.append(keyframe)
-    return found
+    keyframes, (ordinals, spots) = among.once(keyframes_of), among.once(_by_position)
+    similar = [similar_sights(spots, record.spot, vantage) for vantage in vantages]
+    for number in np.unique(ordinals[np.concatenate([*similar, _NONE])]).tolist():
+        keyframe = keyframes[number]
+        if keyframe.pose is not None and keyframe.floor in floors:
+            camera = camera_of(keyframe.camera, view.settings.camera)
+            if would_see(keyframe.pose, camera, record.spot):
+                yield keyframe
+
+
+def keyframes_of(view: MapView) -> list[KeyframeRecord]:
+    """All keyframes; a past map makes each one anew."""
+    return list(view.keyframes)
+
+
+def _by_position(view: MapView) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The ordinals of the keyframes that have a pose, ascending by x, and their positions in
+    metres, shape (n, 2)."""
+    poses = view.poses()
+    order = np.argsort(poses.positions_um[:, 0], kind="stable")
+    return poses.keyframes[order], poses.positions_um[order] / UM_PER_M
+
+
+_NONE: Final = np.zeros(0, np.intp)
 
 
 def object_changes(

@@ -23,7 +23,15 @@ from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 from .find import SeenAt, seen_at
-from .object_changes import KNOWN_M, Point, became, is_within, keyframes_looking, object_rows
+from .object_changes import (
+    KNOWN_M,
+    Point,
+    became,
+    is_within,
+    keyframes_looking,
+    keyframes_of,
+    object_rows,
+)
 
 ChangeKind = Literal["moved", "missing", "new", "back"]
 KINDS: Final[tuple[ChangeKind, ...]] = ("moved", "missing", "new", "back")
@@ -125,14 +133,14 @@ def run_span(view: MapView, run_id: str) -> tuple[Offset, Offset] | None:
     run = next((run for run in view.runs if run.run_id == run_id), None)
     if run is None:
         return None
-    offsets = [k.offset for k in view.keyframes if k.run == run.ordinal]
+    offsets = [k.offset for k in view.once(keyframes_of) if k.run == run.ordinal]
     return Offset(min(offsets)), Offset(max(offsets) + 1)
 
 
 def last_run_start(view: MapView) -> Offset:
     """The offset at which the run began that began last; 0 where it is the only one."""
     starts = dict[int, Offset]()
-    for keyframe in view.keyframes:
+    for keyframe in view.once(keyframes_of):
         starts.setdefault(keyframe.run, keyframe.offset)
     return max(starts.values()) if len(starts) > 1 else Offset(0)
 
@@ -154,21 +162,22 @@ def _new(first: MapView, second: MapView) -> tuple[list[ObjectRecord], int]:
     there = dict[str, list[ObjectRecord]]()
     for each in first.objects.values():
         there.setdefault(each.class_name, []).append(each)
+    keyframes = second.once(keyframes_of)
     sure, doubtful = list[ObjectRecord](), 0
     for record in second.objects.values():
         at = record.estimate
         if record.object_id in known or not record.confirmed or at is None or record.missing_in:
             continue
-        seen = {k.offset for k in second.sightings(record)}
-        if min(seen) < first.next_offset:
+        seen = set(second.seen_by(record))
+        if keyframes[min(seen)].offset < first.next_offset:
             continue
         alike = any(is_within(e.estimate, at) for e in there.get(record.class_name, ()))
         if at.est_sigma_m > KNOWN_M or alike:
             doubtful += 1
         else:
-            looks = [k.offset for k in keyframes_looking(second, record, second.keyframes)]
-            before = sum(offset < first.next_offset for offset in looks)
-            hits = sum(offset in seen for offset in looks)
+            looks = list(keyframes_looking(second, record, second))
+            before = sum(keyframe.offset < first.next_offset for keyframe in looks)
+            hits = sum(keyframe.ordinal in seen for keyframe in looks)
             if before * (hits + 1) >= _EXPECTED * (len(looks) - before + 2):
                 sure.append(record)
     return sure, doubtful
@@ -180,7 +189,7 @@ class _Writer:
     def __init__(self, view: MapView) -> None:
         self._view = view
         self._short = ShortIds.of(things_of(view))
-        self._at: Mapping[int, KeyframeRecord] = {k.offset: k for k in view.keyframes}
+        self._at: Mapping[int, KeyframeRecord] = {k.offset: k for k in view.once(keyframes_of)}
         self.objects = {each.object_id: each for each in view.objects.values()}
 
     def change(

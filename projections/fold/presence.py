@@ -25,6 +25,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eventsrc.envelope.model import Offset
 
@@ -36,6 +37,7 @@ from .sights import half_field
 
 _CELL_UM = 750_000
 _NEAR_M2 = 1.1 * 1.1
+_ROUNDING_M = 1e-3
 _LEAST_AHEAD_M = 0.3
 _INNER = 0.84
 """The inner share of half the picture's width within which an Object should be seen."""
@@ -300,13 +302,28 @@ class Presence:
         known.cells = set()
 
 
-def would_see(pose: d.Pose, camera: CameraConstants, at: Metres, vantage: Metres) -> bool:
-    """Whether a keyframe looks for a thing that was seen from another one, a vantage."""
+def would_see(pose: d.Pose, camera: CameraConstants, at: Metres) -> bool:
+    """Whether a keyframe would look for a thing, if a sight from its pose is `similar_sights`."""
     cos, sin = cos_sin(pose.yaw_rad + camera.yaw_rad)
     half_cos, half_sin = half_field(camera.hfov_deg)
     dx, dy = at[0] - pose.x_um / 1e6, at[1] - pose.y_um / 1e6
-    is_inside = _is_inside(dx * cos + dy * sin, dy * cos - dx * sin, half_sin / half_cos * _INNER)
-    return is_inside and _is_similar(dx, dy, at[0] - vantage[0], at[1] - vantage[1])
+    return _is_inside(dx * cos + dy * sin, dy * cos - dx * sin, half_sin / half_cos * _INNER)
+
+
+def similar_sights(spots: NDArray[np.float64], at: Metres, vantage: Metres) -> NDArray[np.intp]:
+    """The indices of the positions, in metres, shape (n, 2) and ascending by x, from which a
+    keyframe looks for a thing that was seen from ``vantage``, where it faces the thing."""
+    reach = math.sqrt(_NEAR_M2) + _ROUNDING_M
+    first, last = np.searchsorted(spots[:, 0], (vantage[0] - reach, vantage[0] + reach))
+    dx, dy = at[0] - spots[first:last, 0], at[1] - spots[first:last, 1]
+    vx, vy = at[0] - vantage[0], at[1] - vantage[1]
+    apart_x, apart_y = dx - vx, dy - vy
+    far2, usual2, dot = dx * dx + dy * dy, vx * vx + vy * vy, dx * vx + dy * vy
+    similar = apart_x * apart_x + apart_y * apart_y <= _NEAR_M2
+    similar &= (far2 <= usual2 * _DISTANCES2) & (usual2 <= far2 * _DISTANCES2)
+    similar &= (dot > 0.0) & (dot * dot >= _TURN2 * far2 * usual2)
+    found: NDArray[np.intp] = np.flatnonzero(similar) + first
+    return found
 
 
 def _is_inside(ahead: float, aside: float, inner: float) -> bool:

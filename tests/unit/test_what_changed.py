@@ -9,9 +9,12 @@ import pytest
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.commands import UseSettings
+from projections.ask.object_changes import Point, keyframes_looking
 from projections.ask.what_changed import MapChanges, changes_text, map_changes
+from projections.fold.presence import would_see
 from projections.fold.settings import Settings
 from projections.history import LogTimeline
+from projections.map.records import KeyframeRecord
 from projections.surfaces.python import Timeline, fold
 from tests.support.commands import Commands
 from tests.support.folds import Folded
@@ -120,6 +123,36 @@ def test_where_nothing_stands_elsewhere_nothing_changed() -> None:
     found = changed(run("a", ROOM), run("b", ROOM))
     assert found.changes == ()
     assert changes_text(found) == "nothing changed for sure\n"
+
+
+def test_the_keyframes_that_look_are_found_among_those_near_by() -> None:
+    """The same as by the rule of `projections.fold.presence`, one keyframe after the other."""
+    view = Folded.start(SETTINGS).extend(run("a", ROOM) + run("b", LATER)).view
+    counts = []
+    for record in view.objects.values():
+        vantages = {_at(k) for k in view.sightings(record)}
+        looking = [
+            keyframe.ordinal
+            for keyframe in view.keyframes
+            if keyframe.pose is not None
+            and would_see(keyframe.pose, SETTINGS.camera.constants, record.spot)
+            and any(_is_similar(_at(keyframe), record.spot, each) for each in vantages)
+        ]
+        assert [k.ordinal for k in keyframes_looking(view, record, view)] == looking
+        counts.append(len(looking))
+    assert 0 < min(counts) < max(counts) < len(view.keyframes)
+
+
+def _at(keyframe: KeyframeRecord) -> Point:
+    assert keyframe.pose is not None
+    return keyframe.pose.x_m, keyframe.pose.y_m
+
+
+def _is_similar(here: Point, thing: Point, there: Point) -> bool:
+    far, usual = math.dist(here, thing), math.dist(there, thing)
+    dot = sum((t - a) * (t - b) for t, a, b in zip(thing, here, there, strict=True))
+    near = math.dist(here, there) <= 1.1 and max(far, usual) <= 1.6 * min(far, usual)
+    return near and dot >= 0.87 * far * usual
 
 
 def test_what_was_never_looked_at_is_not_new() -> None:
