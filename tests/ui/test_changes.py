@@ -1,6 +1,7 @@
 """Points 7 to 9: corrections, a log that grows, and what can be taken away."""
 
 import json
+import re
 import shlex
 import shutil
 import xml.etree.ElementTree as ET
@@ -14,7 +15,7 @@ from eventsrc.log import LogReader
 from tests.support.commands import Commands
 from tests.support.logs import append_raw
 from tests.support.ui_page import UiServer, showing
-from tests.ui.browser import point_over, whole
+from tests.ui.browser import other_pixels, pixels, point_over, whole
 from tests.ui.conftest import SAMPLE, WIDE, Visit
 from tests.ui.test_moments import moment
 
@@ -77,6 +78,66 @@ def test_what_was_recorded_is_undone_beside_it(
     page.get_by_role("button", name="Undo it").click()
     expect(page.locator(".corrections > li")).to_have_count(2)
     expect(page.locator(".corrections > li").first).to_contain_text("undone by")
+
+
+def drag(page: Page, start: tuple[float, float], end: tuple[float, float]) -> None:
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=5)
+
+
+def test_places_are_joined_and_cut_by_dragging_with_preview_and_undo(
+    edited: tuple[Path, UiServer], visit: Visit, pictures: Path
+) -> None:
+    page = visit(edited[1], "#panel=correct")
+    one, other = point_over(page, "sim-7-a_p5"), point_over(page, "sim-7-a_p6")
+    plain = pixels(page)
+    drag(page, other, one)
+    page.mouse.up()
+    other_pixels(page, plain)  # the view moved
+    page.get_by_role("button", name="Show the whole map").click()
+    page.get_by_label("by dragging on the map").check()
+    one, other = point_over(page, "sim-7-a_p5"), point_over(page, "sim-7-a_p6")
+    drag(page, one, other)
+    expect(page.locator(".tip")).to_have_text("Join \u2068p5\u2069 with \u2068p6\u2069")
+    page.screenshot(path=pictures / "drag.png")
+    page.mouse.up()
+    expect(page.locator(".preview b")).to_contain_text("Would change")
+    expect(page.locator("#correction-kind")).to_have_value("join")
+    page.get_by_label("Reason").fill("one room")
+    page.get_by_role("button", name="Record it").click()
+    corrections = page.locator(".corrections > li")
+    expect(corrections).to_have_count(1)
+    expect(page.locator(".facts")).to_contain_text("5 places")
+    page.get_by_role("button", name="Undo it").click()
+    expect(corrections.first).to_contain_text("undone by")
+    expect(page.locator(".facts")).to_contain_text("6 places")
+
+    start = point_over(page, "sim-7-a_p0")
+    page.mouse.move(*start)
+    drag(page, start, (start[0] + 60, start[1]))
+    expect(page.locator(".tip")).to_contain_text("Cut")
+    page.mouse.up()
+    expect(page.locator("#correction-kind")).to_have_value("keep-apart")
+    expect(page.locator(".preview b").or_(page.locator(".correction .error"))).to_be_visible()
+    expect(page.get_by_label("Place", exact=True)).to_have_value(re.compile(r"sim-7-a:\d+"))
+    page.mouse.click(*start)
+    expect(page.get_by_role("tab", name="Why")).to_have_attribute("aria-selected", "true")
+
+
+def test_an_object_is_dragged_onto_another_whose_class_its_own_becomes(
+    edited: tuple[Path, UiServer], visit: Visit
+) -> None:
+    page = visit(edited[1], "#panel=correct")
+    page.get_by_label("by dragging on the map").check()
+    start, end = point_over(page, "sink"), point_over(page, "oven")
+    drag(page, start, end)
+    expect(page.locator(".tip")).to_contain_text("oven")
+    page.mouse.up()
+    expect(page.get_by_label("Class=new name")).to_have_value("sink=oven")
+    expect(page.locator(".preview b")).to_contain_text("Would change")
+    page.get_by_role("button", name="Record it").click()
+    expect(page.locator(".corrections > li")).to_have_count(1)
 
 
 def test_a_merge_is_undone_with_a_preview_of_what_changes(

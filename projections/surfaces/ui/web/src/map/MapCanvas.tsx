@@ -7,7 +7,9 @@ import { useEffect, useRef } from "preact/hooks";
 import { select } from "../state/actions";
 import { lostPoint, shownBridge, shownLost } from "../state/overlays";
 import { walls } from "../state/walls";
-import { menu, tip } from "../state/pointer";
+import { markTip, menu, tip } from "../state/pointer";
+import { type Grip, byDragging, dragged, dropped } from "../panels/drag_edits";
+import { propose } from "../panels/proposals";
 import { shownObjects } from "../model/map_at";
 import * as store from "../state/store";
 import { summary } from "../ui/summary";
@@ -30,6 +32,9 @@ let moved = false;
 const FACTS_WIDE_PX = 212;
 const FACTS_HIGH_PX = 44;
 const NARROW_PX = 520;
+
+/** How far a pointer moves until it drags. */
+const DRAG_PIXELS = 4;
 
 /** The view that shows the whole map. */
 export function fitView() {
@@ -153,7 +158,7 @@ function inputs(side: Side) {
   return [
     store.at, store.view, store.layers, store.selection, store.hovered, store.found, store.dark, store.log,
     side === "main" ? store.history : store.otherHistory,
-    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.mapFacts, walls,
+    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.mapFacts, walls, dragged,
   ];
 }
 
@@ -162,7 +167,7 @@ function keepZoomed(canvas: HTMLCanvasElement): () => void {
     .scaleExtent([0.02, 4000])
     .clickDistance(4)
     .duration(0)
-    .filter((event: MouseEvent) => event.button === 0 && !(event.ctrlKey && event.type !== "wheel"))
+    .filter((event: MouseEvent) => !event.button && !(event.ctrlKey && event.type !== "wheel") && dragged.value === null)
     .on("zoom", ({ transform, sourceEvent }: D3ZoomEvent<HTMLCanvasElement, unknown>) => {
       if (sourceEvent === null) return;
       moved = true;
@@ -201,8 +206,44 @@ function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
     store.hovered.value = null;
     tip.value = null;
   };
+  let from: Grip | null = null;
+  let wasDrag = false;
+  const grip = (event: MouseEvent): Grip | null => {
+    const [picked, view, box] = [at(event), store.view.value, canvas.getBoundingClientRect()];
+    return picked === null || view === null ? null : { picked, x: mapX(view, event.clientX - box.left), y: mapY(view, event.clientY - box.top) };
+  };
+  const down = (event: PointerEvent) => {
+    wasDrag = false;
+    if (event.button !== 0 || side !== "main" || !byDragging.value || store.panel.value !== "correct") return;
+    from = grip(event);
+    if (from === null) return;
+    dragged.value = { x0: from.x, y0: from.y, x1: from.x, y1: from.y };
+    canvas.setPointerCapture(event.pointerId);
+  };
+  const proposed = (event: MouseEvent) => {
+    const [history, map] = [store.history.value, store.map.value];
+    return from === null || history === null || map === null || !wasDrag ? null : dropped(history, map, from, grip(event));
+  };
+  const drag = (event: PointerEvent) => {
+    const [line, view, box] = [dragged.value, store.view.value, canvas.getBoundingClientRect()];
+    if (line === null || view === null) return;
+    const [x1, y1] = [mapX(view, event.clientX - box.left), mapY(view, event.clientY - box.top)];
+    wasDrag ||= Math.hypot(x1 - line.x0, y1 - line.y0) * view.k > DRAG_PIXELS;
+    dragged.value = { ...line, x1, y1 };
+    tip.value = null;
+    store.hovered.value = at(event)?.thing ?? null;
+    const says = proposed(event)?.says;
+    markTip.value = says === undefined ? null : { x: event.clientX, y: event.clientY, lines: [says] };
+  };
+  const up = (event: PointerEvent) => {
+    const found = event.type === "pointerup" ? proposed(event) : null;
+    if (dragged.value !== null) dragged.value = markTip.value = null;
+    from = null;
+    if (found !== null) propose(found.proposal(), true);
+  };
   const click = (event: MouseEvent) => {
     menu.value = null;
+    if (wasDrag) return;
     if (store.panel.value === "lost" && store.view.value !== null) {
       const box = canvas.getBoundingClientRect();
       lostPoint.value = { x: mapX(store.view.value, event.clientX - box.left), y: mapY(store.view.value, event.clientY - box.top) };
@@ -215,11 +256,19 @@ function followPointer(canvas: HTMLCanvasElement, side: Side): () => void {
     if (found !== null) select(found.thing);
     menu.value = { x: event.clientX, y: event.clientY, thing: found?.thing ?? null };
   };
+  canvas.addEventListener("pointerdown", down);
+  canvas.addEventListener("pointermove", drag);
+  canvas.addEventListener("pointerup", up);
+  canvas.addEventListener("pointercancel", up);
   canvas.addEventListener("pointermove", move);
   canvas.addEventListener("pointerleave", leave);
   canvas.addEventListener("click", click);
   canvas.addEventListener("contextmenu", context);
   return () => {
+    canvas.removeEventListener("pointerdown", down);
+    canvas.removeEventListener("pointermove", drag);
+    canvas.removeEventListener("pointerup", up);
+    canvas.removeEventListener("pointercancel", up);
     canvas.removeEventListener("pointermove", move);
     canvas.removeEventListener("pointerleave", leave);
     canvas.removeEventListener("click", click);

@@ -2,6 +2,7 @@
 
 import { difference, shownBridge, shownLost } from "../state/overlays";
 import { differenceOn } from "../model/floors";
+import { dragged } from "../panels/drag_edits";
 import { walls } from "../state/walls";
 import * as store from "../state/store";
 import { litObject } from "./lit";
@@ -34,6 +35,7 @@ export function currentScene(side: Side, width: number, height: number): Scene |
     difference: compared === null ? null : { ...compared, difference: differenceOn(history, compared.difference, floor) },
     bridge: main ? shownBridge.value : null,
     lost: main ? shownLost.value : null,
+    drag: main ? dragged.value : null,
     controls: [],
     dots: null,
   };

@@ -66,7 +66,7 @@ function badge(on: Surface, x: number, y: number, colour: string, change: string
   on.stroke();
 }
 
-function arrow(on: Surface, scene: Scene, x0: number, y0: number, x1: number, y1: number) {
+export function arrow(on: Surface, scene: Scene, x0: number, y0: number, x1: number, y1: number) {
   const { view, palette } = scene;
   const [ax, ay, bx, by] = [screenX(view, x0), screenY(view, y0), screenX(view, x1), screenY(view, y1)];
   if (Math.hypot(bx - ax, by - ay) < 6) return;

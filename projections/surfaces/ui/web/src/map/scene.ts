@@ -49,6 +49,8 @@ export interface Scene {
   difference: { before: MapState; difference: MapDifference } | null;
   bridge: Bridge | null;
   lost: LostOverlay | null;
+  /** A correction that is being dragged, metres. */
+  drag: { x0: number; y0: number; x1: number; y1: number } | null;
   /** What lies over the map on the screen, where no label may be. */
   controls: readonly Box[];
   /** Draws many keyframes at once, on a canvas only. */

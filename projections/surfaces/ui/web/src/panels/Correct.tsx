@@ -8,7 +8,8 @@ import { useAnswer } from "../state/answers";
 import { grow, sentence } from "../state/loading";
 import { showNotice } from "../state/pointer";
 import * as store from "../state/store";
-import { type Parameter, KINDS, proposal, propose, proposed } from "./proposals";
+import { byDragging } from "./drag_edits";
+import { type Parameter, KINDS, previewed, proposal, propose, proposed } from "./proposals";
 import { Answer, CommandLine, Moment } from "./AnswerParts";
 
 interface Correction {
@@ -103,7 +104,9 @@ function Form() {
     if (asked === focused) return;
     focused = asked;
     const fields = [...(form.current?.querySelectorAll<HTMLInputElement>("input[type=text]") ?? [])];
-    (fields.find((each) => each.value === "") ?? fields[0])?.focus();
+    if (previewed.value) void send(true);
+    else (fields.find((each) => each.value === "") ?? fields[0])?.focus();
+    previewed.value = false;
   }, [asked]);
   const needsReason = !["name-place", "relabel"].includes(wanted.kind);
   const whole = given.every((each) => each.trim() !== "");
@@ -161,6 +164,10 @@ function Form() {
         void send(preview === null && needsReason);
       }}
     >
+      <label class="check" title="Anywhere else a drag moves the view">
+        <input type="checkbox" checked={byDragging.value} onChange={() => (byDragging.value = !byDragging.value)} />
+        <span>Correct by dragging on the map: a place onto another joins them, within one cuts it; an object onto another makes them one, or gives its class the other’s name</span>
+      </label>
       <label for="correction-kind">
         Correction
         <select id="correction-kind" value={wanted.kind} onChange={(event) => (proposal.value = { kind: event.currentTarget.value, arguments: sameKind(wanted, event.currentTarget.value) })}>

@@ -23,6 +23,7 @@ export const KINDS: Record<string, { says: string; parameters: Parameter[] }> = 
   "same-object": { says: "Two objects are one", parameters: [{ name: "Object", takes: "object" }, { name: "Other object", takes: "object" }] },
   "different-objects": { says: "Two objects are not one", parameters: [{ name: "Object or det_id", takes: "object" }, { name: "Other object or det_id", takes: "object" }] },
   "drop-object": { says: "Leave an object out", parameters: [{ name: "Object", takes: "object" }] },
+  relabel: { says: "Rename a class", parameters: [{ name: "Class=new name", takes: "text" }] },
   "forget-run": { says: "Forget a run", parameters: [{ name: "Run", takes: "run" }] },
   undo: { says: "Undo a correction", parameters: [{ name: "Command id", takes: "command" }] },
 };
@@ -32,9 +33,13 @@ export const proposal = signal<Proposal | null>(null);
 /** How often a correction was proposed: each time its form takes the focus. */
 export const proposed = signal(0);
 
-export function propose(wanted: Proposal) {
+/** Whether the form shows at once what the proposal would change. */
+export const previewed = signal(false);
+
+export function propose(wanted: Proposal, preview = false) {
   batch(() => {
     proposal.value = wanted;
+    previewed.value = preview;
     proposed.value++;
     openPanel("correct");
   });
