@@ -116,9 +116,9 @@ def test_no_damage_gives_a_wrong_vector(log: Path) -> None:
     content = path.read_bytes()
     spoiled = [
         content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
-        for at in places(content, rounds(150, 20))
+        for at in places(content, rounds(150, 8))
     ]
-    cut = [content[:end] for end in places(content, rounds(40, 4))]
+    cut = [content[:end] for end in places(content, rounds(40, 3))]
     for number, damaged in enumerate([*spoiled, *cut]):
         path.write_bytes(damaged)
         notes: list[str] = []

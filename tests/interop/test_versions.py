@@ -69,6 +69,24 @@ def check(programs: Path, folder: Path) -> None:
     assert mapfold("completion", "bash")
 
 
+def test_a_release_is_the_same_bytes_whoever_builds_it(folder: Path) -> None:
+    """From two folders, at two times."""
+    found = []
+    for name in ("one", "other"):
+        tree = folder / name / "mapfold"
+        done = subprocess.run(["git", "clone", "--quiet", ROOT, tree], check=False)
+        assert done.returncode == 0
+        out = folder / name / "dist"
+        built = subprocess.run(
+            [UV, "build", "--quiet", "--out-dir", out], capture_output=True, text=True, check=False,
+            cwd=tree, env={**os.environ, "SOURCE_DATE_EPOCH": "1774310400"},
+        )  # fmt: skip
+        assert built.returncode == 0, built.stderr
+        found.append({each.name: each.read_bytes() for each in out.glob("mapfold-*")})
+    assert len(found[0]) == 2
+    assert found[0] == found[1]
+
+
 HELP_OF_ALL = """
 from typer.testing import CliRunner
 from projections.surfaces.cli import COMMANDS, command_line

@@ -10,11 +10,13 @@ from projections.map.view import MapView
 from projections.store.history_recorder import map_after
 from scripts.programs.differ.__main__ import main
 from scripts.programs.differ.growing_log import GrowingLog
+from tests.support.thorough import rounds
 
 
 @pytest.mark.seconds
 def test_all_ways_agree_on_a_log(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--seed", "1", "--log", "1", "--events", "20", "--without", "databases"]) == 0
+    events = str(rounds(20, 6))
+    assert main(["--seed", "1", "--log", "1", "--events", events, "--without", "databases"]) == 0
     assert "1 logs" in capsys.readouterr().out
 
 

@@ -235,6 +235,7 @@ def test_a_robot_that_was_parked_before_and_after_has_one_large_step() -> None:
     assert [each.step_m for each in steps(parked)] == [6.0]
 
 
+@pytest.mark.slow
 def test_a_stretch_too_short_to_be_compared_is_not_left_out() -> None:
     documents = jumped("a", 200, 205)
     found = steps(documents)
@@ -258,6 +259,7 @@ def test_the_tail_behind_a_jump_is_brought_back(back: int | None) -> None:
     assert not any(each.is_jump for each in others)  # the run is back in its frame
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_did_not_jump() -> None:
     """Its frame is right before and after; only the way between is missing."""
     documents = [*simulated().envelopes[:150], *simulated().envelopes[250:]]

@@ -2,10 +2,11 @@
 
 import math
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projections.adapters.drawing.sheet import Extent, LabelRequest, place_labels
+from tests.support.thorough import examples
 
 BOUNDS = (0.0, 0.0, 10.0, 8.0)
 RINGS = (0.1, 0.4, 1.2)
@@ -64,6 +65,7 @@ def test_a_lone_label_with_space_around_it_lies_on_the_first_ring(label: LabelRe
 
 
 @given(wanted)
+@settings(max_examples=examples(100))
 def test_a_label_is_left_out_only_when_everything_is_taken(label: LabelRequest) -> None:
     assert place_labels([label], [Extent(5, 5, 50, 50)], BOUNDS, RINGS) == [None]
     assert place_labels([label], [], (4.0, 4.0, 4.05, 4.05), RINGS) == [None]
