@@ -21,6 +21,7 @@ from .terminal import say
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from projections.history.timeline import SettingsChoice
     from projections.surfaces.ui.editor import Editor
     from projections.surfaces.ui.question_threads import UiService
 
@@ -62,6 +63,14 @@ def ui(
             "--allow-host",
         ),
     ] = None,
+    export_html: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "Instead of serving write one page of the map at all moments, which needs no server.",
+            "--export-html",
+        ),
+    ] = None,
     db: Annotated[str | None, option("URL", "Show how far behind this database is.")] = None,
     vector_db: VectorsOption = None,
     client: ZenohClient,
@@ -86,6 +95,11 @@ def ui(
         raise MisuseError(
             f"mapfold ui needs {error.name}, which is not installed; pip install 'mapfold[ui]'"
         ) from None
+    if export_html is not None:
+        if open_ or allow_edits or truth or allow_host or db is not None:
+            raise MisuseError("--export-html serves nothing; give it with --at, --select or --set")
+        _export(source, settings, export_html, shown_first)
+        return
     from projections.localize.evaluate.truth import read_truth
     from projections.surfaces.ui.live_watch import LiveWatch
     from projections.surfaces.ui.log_map import Opened
@@ -133,6 +147,27 @@ def ui(
             webbrowser.open(url)
         stop.wait()
     say("page closed")
+
+
+def _export(source: CachedLog, settings: "SettingsChoice", file: Path, shown_first: str) -> None:
+    """Write the page, and say where it is."""
+    from projections.surfaces.ui.log_map import LogMap, Opened
+    from projections.surfaces.ui.saved_page import write_page
+
+    opened = Opened(
+        source.log,
+        settings,
+        sets=tuple(source.assignments),
+        settings_file=source.settings_file,
+        cache=not source.no_cache,
+    )
+    with LogMap(opened) as shown:
+        shown.refresh()
+        size = write_page(shown, file)
+        for problem in shown.problems:
+            say(f"warning: {problem}")
+    address = file.resolve().as_uri()
+    say(f"wrote {address}{shown_first}, {size / 1e6:.1f} MB: open it in a browser or send it")
 
 
 def _moment(at: Offset | None, select: str | None) -> str:

@@ -2,6 +2,7 @@ import "./styles/base.css";
 import "./styles/layout.css";
 import "./styles/panels.css";
 import { render } from "preact";
+import { isSaved } from "./api/saved";
 import { keepBench } from "./bench";
 import { keepLive } from "./panels/Live";
 import { keepWalls } from "./state/walls";
@@ -24,5 +25,5 @@ void load().then(() => {
   keepAddress();
   keepKnown();
   keepWalls();
-  keepLive();
+  if (!isSaved) keepLive();
 });

@@ -20,13 +20,16 @@ import { dotRadius } from "./keyframes";
 import { paint } from "./paint";
 import { DARK, LIGHT } from "./palette";
 import { type Picked, pick } from "./pick";
-import { fitted, mapX, mapY } from "./view";
+import type { Bounds } from "../model/regions";
+import { type View, filled, fitted, mapX, mapY } from "./view";
 
 type Zoomed = ZoomBehavior<HTMLCanvasElement, unknown>;
 
 /** Called after a frame of the main map is drawn. */
 export const painted = new Set<() => void>();
 let moved = false;
+/** The part of the map that a link asked for, as long as nobody moves it. */
+let wanted: Bounds | null = null;
 
 /** What the counts at the top left cover: a column, on a phone a row. */
 const FACTS_WIDE_PX = 212;
@@ -42,8 +45,37 @@ export function fitView() {
   const bounds = store.drawnBounds.value;
   if (canvas === null || bounds === null || canvas.clientWidth === 0) return;
   moved = false;
+  wanted = null;
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
   store.view.value = width <= NARROW_PX ? fitted(bounds, width, height, 0, FACTS_HIGH_PX) : fitted(bounds, width, height, FACTS_WIDE_PX);
+}
+
+/** What the canvas shows of the map, metres; null for the whole map. */
+export function viewBox(): Bounds | null {
+  const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
+  const view = store.view.value;
+  if (canvas === null || view === null || !moved) return null;
+  if (wanted !== null) return wanted;
+  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+  return { x0: mapX(view, 0), y0: mapY(view, h), x1: mapX(view, w), y1: mapY(view, 0) };
+}
+
+/** Shows a part of the map; null for all of it. */
+export function showBox(box: Bounds | null) {
+  const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
+  if (box === null) fitView();
+  else if (canvas !== null) {
+    moved = true;
+    wanted = box;
+    store.view.value = filled(box, canvas.clientWidth, canvas.clientHeight);
+  }
+}
+
+/** A person moves the view. */
+function move(view: View) {
+  moved = true;
+  wanted = null;
+  store.view.value = view;
 }
 
 /** Zooms about the middle, or moves by pixels. */
@@ -51,13 +83,12 @@ export function changeView(factor: number, dx = 0, dy = 0) {
   const canvas = document.querySelector<HTMLCanvasElement>("canvas.map");
   const view = store.view.value;
   if (canvas === null || view === null) return;
-  moved = true;
   const [cx, cy] = [canvas.clientWidth / 2, canvas.clientHeight / 2];
-  store.view.value = {
+  move({
     k: view.k * factor,
     x: cx + (view.x - cx) * factor + dx,
     y: cy + (view.y - cy) * factor + dy,
-  };
+  });
 }
 
 /** Moves the view so that a point of the map is in the middle, unless it is well inside already. */
@@ -68,8 +99,7 @@ export function bringIntoView(x: number, y: number) {
   const [sx, sy] = [x * view.k + view.x, view.y - y * view.k];
   const [w, h] = [canvas.clientWidth, canvas.clientHeight];
   if (sx > 60 && sy > 60 && sx < w - 60 && sy < h - 60) return;
-  moved = true;
-  store.view.value = { k: view.k, x: view.x + w / 2 - sx, y: view.y + h / 2 - sy };
+  move({ k: view.k, x: view.x + w / 2 - sx, y: view.y + h / 2 - sy });
 }
 
 export function MapCanvas({ side }: { side: Side }) {
@@ -123,6 +153,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
     const view = store.view.value;
     if (side === "main" && now > 0) {
       if (view === null || !moved) fitView();
+      else if (wanted !== null) showBox(wanted);
       else if (width > 0) store.view.value = { ...view, x: view.x + (now - width) / 2 };
     }
     width = now;
@@ -130,7 +161,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
   });
   observer.observe(canvas);
   const stopFitting = effect(() => {
-    if (side === "main" && store.drawnBounds.value !== null && !moved) queueMicrotask(fitView);
+    if (side === "main" && store.drawnBounds.value !== null && !moved) queueMicrotask(() => moved || fitView());
   });
   const stop = effect(() => {
     for (const each of inputs(side)) void each.value;
@@ -170,8 +201,7 @@ function keepZoomed(canvas: HTMLCanvasElement): () => void {
     .filter((event: MouseEvent) => !event.button && !(event.ctrlKey && event.type !== "wheel") && dragged.value === null)
     .on("zoom", ({ transform, sourceEvent }: D3ZoomEvent<HTMLCanvasElement, unknown>) => {
       if (sourceEvent === null) return;
-      moved = true;
-      store.view.value = { k: transform.k, x: transform.x, y: transform.y };
+      move({ k: transform.k, x: transform.x, y: transform.y });
     });
   const selected = d3select(canvas).call(behaviour).on("dblclick.zoom", null); // it would animate
   const stop = effect(() => {

@@ -32,6 +32,12 @@ export function fitted(bounds: Bounds, width: number, height: number, left = 0, 
   };
 }
 
+/** The view of a part of the map as large as it fits, in the middle. */
+export function filled({ x0, y0, x1, y1 }: Bounds, width: number, height: number): View {
+  const k = Math.min(width / (x1 - x0), height / (y1 - y0));
+  return { k, x: (width - k * (x0 + x1)) / 2, y: (height + k * (y0 + y1)) / 2 };
+}
+
 /** A round length in metres whose bar is about as wide as asked. */
 export function scaleBar(view: View, about: number): { metres: number; width: number } {
   const wanted = about / view.k;

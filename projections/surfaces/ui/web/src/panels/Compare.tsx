@@ -1,5 +1,6 @@
 /** Compares two moments, or two settings. */
 
+import { isSaved } from "../api/saved";
 import type { CompareMode } from "../state/store";
 import * as store from "../state/store";
 import { CompareMoments } from "./CompareMoments";
@@ -14,7 +15,7 @@ export function Compare() {
   const mode = store.compareMode.value;
   return (
     <section class="story">
-      <fieldset class="segments wide">
+      {!isSaved && <fieldset class="segments wide">
         <legend class="hidden">What to compare</legend>
         {MODES.map(([each, says]) => (
           <label key={each} class={mode === each ? "on" : ""}>
@@ -22,8 +23,8 @@ export function Compare() {
             {says}
           </label>
         ))}
-      </fieldset>
-      {mode === "moments" ? <CompareMoments /> : <CompareSettings />}
+      </fieldset>}
+      {mode === "moments" || isSaved ? <CompareMoments /> : <CompareSettings />}
     </section>
   );
 }

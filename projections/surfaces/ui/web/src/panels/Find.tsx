@@ -28,7 +28,7 @@ interface Search {
   command: string;
 }
 
-const text = signal("");
+const text = store.condition;
 const answer = signal<Search | null>(null);
 const problem = signal<{ message: string; column: number | null } | null>(null);
 const every = signal(false);
@@ -50,6 +50,9 @@ export function Find() {
       store.foundAt.value = [];
     };
   }, [answer.value]);
+  useEffect(() => {
+    if (text.value !== "" && answer.value === null) void ask(); // of a link
+  }, []);
   const ask = async () => {
     const history = store.history.value;
     if (history === null) return;

@@ -1,8 +1,8 @@
 /** The map at a glance: what changed, what is odd, rooms and objects. All of it is what `mapfold` answers. */
 
-import { signal } from "@preact/signals";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { address } from "../api/client";
+import { isSaved } from "../api/saved";
 import type { Crop, FoundObject, FoundObjects, MapChanges, MapFacts, Room } from "../api/types";
 import type { History } from "../history/types";
 import { counted, findPlace, isolated, keyframeId, label, shortPlace } from "../model/names";
@@ -25,6 +25,7 @@ export function Overview({ history }: { history: History }) {
   if (facts === null || at > history.through) return <p class="dim" role="status">Loading rooms and objects …</p>;
   return (
     <section class={store.mapFactsNow.value === null ? "story stale" : "story"}>
+      {isSaved && facts.at !== store.at.value && <p class="dim">The tables are as of event {facts.at.toLocaleString("en")}: this page was saved with some moments of them.</p>}
       <Changed history={history} at={facts.at} />
       <Odd odd={facts.odd} />
       <Rooms history={history} rooms={facts.rooms} />
@@ -38,8 +39,10 @@ export function Overview({ history }: { history: History }) {
 function Changed({ history, at }: { history: History; at: number }) {
   const runs = store.log.value?.runs.filter(({ first_offset }) => first_offset < at) ?? [];
   const known = store.log.value?.fusion === "evidence" && runs.length > 1;
-  const asked = useAnswer<MapChanges>(known ? address("/api/changes", { until: at, known_at: store.knownAt(at) }) : null, history.state);
+  const since = isSaved ? runs[runs.length - 1]?.first_offset : null; // an answer that has this name
+  const asked = useAnswer<MapChanges>(known ? address("/api/changes", { since, until: at, known_at: store.knownAt(at) }) : null, history.state);
   const found = asked.value;
+  if (isSaved && asked.error !== null) return null; // saved for the ends of runs
   if (asked.error !== null) return <Answer asked={asked}>{() => null}</Answer>;
   if (found === null || found.since === 0) return null;
   const { offset, run } = history.keyframes;
@@ -141,12 +144,9 @@ function Rooms({ history, rooms }: { history: History; rooms: Room[] }) {
   );
 }
 
-type Column = "class" | "room" | "seen" | "last seen";
-const asked = signal({ what: "", room: "", every: false });
-const sorted = signal<{ by: Column; down: boolean }>({ by: "seen", down: true });
-
+const { asked, sorted } = store;
 const roomOf = (each: FoundObject) => each.place_name ?? each.place_type ?? each.place_id ?? "";
-const ORDER: Record<Column, (a: FoundObject, b: FoundObject) => number> = {
+const ORDER: Record<store.Column, (a: FoundObject, b: FoundObject) => number> = {
   class: (a, b) => a.class_name.localeCompare(b.class_name),
   room: (a, b) => roomOf(a).localeCompare(roomOf(b)),
   seen: (a, b) => a.obs_count - b.obs_count,
@@ -159,8 +159,10 @@ function Objects({ history, facts: { at, rooms, crops } }: { history: History; f
   const timer = useRef(0);
   useEffect(() => () => clearTimeout(timer.current), []);
   const listed = rooms.some(({ place_id }) => place_id === room) ? room : "";
-  const question = { what: what.trim(), in: listed, all: every ? 1 : null, top: MOST_OBJECTS, at, known_at: store.knownAt(at) };
-  const found = useAnswer<FoundObjects>(address("/api/find", question), history.state);
+  const moment = { all: every ? 1 : null, at, known_at: store.knownAt(at) };
+  const question = isSaved ? moment : { what: what.trim(), in: listed, top: MOST_OBJECTS, ...moment };
+  const answered = useAnswer<FoundObjects>(address("/api/find", question), history.state);
+  const found = isSaved ? { ...answered, value: answered.value === null ? null : namedAlike(answered.value, what, listed) } : answered;
   const ask = (changed: Partial<typeof asked.value>) => (asked.value = { ...asked.value, ...changed });
   const type = (value: string) => {
     clearTimeout(timer.current);
@@ -195,10 +197,18 @@ function Objects({ history, facts: { at, rooms, crops } }: { history: History; f
   );
 }
 
+/** Of all objects those in a room whose class has a text: a saved page cannot ask what a word means. */
+function namedAlike(all: FoundObjects, what: string, room: string): FoundObjects {
+  const wanted = what.trim().toLowerCase();
+  if (wanted === "" && room === "") return all;
+  const answers = all.answers.filter((each) => each.class_name.toLowerCase().includes(wanted) && (room === "" || each.place_id === room));
+  return { ...all, answers, count: answers.length, unconfirmed: 0 };
+}
+
 function ObjectTable({ answers, history, crops, most }: { answers: FoundObject[]; history: History; crops: boolean; most: number }) {
   const { by, down } = sorted.value;
   const rows = [...answers].sort((a, b) => (down ? -1 : 1) * ORDER[by](a, b)).slice(0, most);
-  const head = (name: Column) => (
+  const head = (name: store.Column) => (
     <th scope="col" aria-sort={by !== name ? "none" : down ? "descending" : "ascending"}>
       <button type="button" onClick={() => (sorted.value = { by: name, down: by === name ? !down : name === "seen" || name === "last seen" })}>
         {name}{by === name && <span aria-hidden="true">{down ? " ↓" : " ↑"}</span>}

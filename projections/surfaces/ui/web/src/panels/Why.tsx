@@ -2,6 +2,7 @@
 
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
+import { isSaved } from "../api/saved";
 import type { Room, Step } from "../api/types";
 import type { History } from "../history/types";
 import type { MapState } from "../model/map_at";
@@ -189,6 +190,6 @@ function keyframeFacts(thing: store.Thing, history: History, map: MapState): Fac
     ["pose", pose],
     ["in", placeLink(history, map, map.placeOf[keyframe])],
     ...floorFact(history, history.keyframes.floor[keyframe]),
-    ["ask", <button type="button" class="link" onClick={() => openPanel("lost")}>Where would a robot be that sees this?</button>],
+    ...(isSaved ? [] : [["ask", <button type="button" class="link" onClick={() => openPanel("lost")}>Where would a robot be that sees this?</button>] satisfies Fact]),
   ];
 }

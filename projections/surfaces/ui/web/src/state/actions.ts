@@ -46,7 +46,7 @@ export function select(thing: store.Thing | null, open = false) {
 }
 
 export function openPanel(name: store.PanelName | null) {
-  store.panel.value = name;
+  if (name === null || store.PANELS.includes(name)) store.panel.value = name;
 }
 
 export function togglePlay() {

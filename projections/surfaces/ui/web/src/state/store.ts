@@ -1,6 +1,7 @@
 /** What the page shows, as signals. Panels and the canvas read them; actions.ts changes them. */
 
 import { computed, signal } from "@preact/signals";
+import { isSaved, savedMoment } from "../api/saved";
 import type { LogInfo, MapFacts, Room } from "../api/types";
 import type { History } from "../history/types";
 import { type Shown, firstFloor, floorsOf, onFloor } from "../model/floors";
@@ -19,7 +20,8 @@ export interface Thing {
 }
 
 export type PanelName = "why" | "compare" | "find" | "lost" | "correct";
-export const PANELS: readonly PanelName[] = ["why", "compare", "find", "lost", "correct"];
+/** A saved page has those that need no server. */
+export const PANELS: readonly PanelName[] = isSaved ? ["why", "compare"] : ["why", "compare", "find", "lost", "correct"];
 
 export type CompareMode = "moments" | "settings";
 export type Theme = "auto" | "light" | "dark";
@@ -42,7 +44,7 @@ export const shownKnownAt = signal<number | null>(null);
 export const wantedKnownAt = computed<number | null>(() => {
   const commands = (history.value?.system ?? []).filter(({ kind }) => kind === "correction");
   const before = commands.filter(({ offset }) => offset < at.value);
-  if (known.value === "now" || before.length === commands.length) return null;
+  if (isSaved || known.value === "now" || before.length === commands.length) return null;
   return (before[before.length - 1]?.offset ?? -1) + 1;
 });
 /** The `known_at` of a question about the map at some W. */
@@ -55,6 +57,7 @@ export const mapFacts = signal<MapFacts | null>(null);
 /** The same if they belong to the map that is shown, otherwise null. */
 export const mapFactsNow = computed(() => {
   const now = known.value === "then" ? at.value : history.value?.knownAt;
+  if (isSaved) return mapFacts.value?.at === savedMoment(at.value) ? mapFacts.value : null;
   const fits = mapFacts.value?.at === at.value && mapFacts.value.known_at === now && wantedKnownAt.value === shownKnownAt.value;
   return fits ? mapFacts.value : null;
 });
@@ -83,13 +86,21 @@ export const otherMinSamples = signal<number | null>(null);
 export const otherHistory = signal<History | null>(null);
 export const foundAt = signal<{ offset: number; becomes: boolean }[]>([]);
 
+/** Which objects the table lists, and in which order. */
+export const asked = signal({ what: "", room: "", every: false });
+export type Column = "class" | "room" | "seen" | "last seen";
+export const COLUMNS: readonly Column[] = ["class", "room", "seen", "last seen"];
+export const sorted = signal<{ by: Column; down: boolean }>({ by: "seen", down: true });
+/** The condition of Find. */
+export const condition = signal("");
+
 export const theme = signal<Theme>("auto");
 export const systemDark = signal(false);
 export const dark = computed(() => (theme.value === "auto" ? systemDark.value : theme.value === "dark"));
 
 export const view = signal<View | null>(null);
 
-export const layers = signal({
+export const LAYERS = {
   regions: true,
   path: true,
   keyframes: true,
@@ -99,8 +110,9 @@ export const layers = signal({
   edges: true,
   walls: true,
   labels: true,
-});
-export type LayerName = keyof (typeof layers)["value"];
+};
+export const layers = signal(LAYERS);
+export type LayerName = keyof typeof LAYERS;
 
 export const map = computed<MapState | null>(() =>
   history.value === null ? null : mapAt(history.value, at.value),

@@ -1,6 +1,8 @@
-/** The address bar holds the moment, the selection, the settings and the panel, behind the `#`. */
+/** The address bar holds all that the page shows, behind the `#`: a link is a moment. */
 
 import { batch, effect } from "@preact/signals";
+import { showBox, viewBox } from "../map/MapCanvas";
+import type { Bounds } from "../model/regions";
 import * as store from "./store";
 
 const WRITE_AFTER_MS = 250;
@@ -20,12 +22,42 @@ export function readAddress(hash: string) {
     selection: KINDS.includes(kind) && id.length > 0 ? ({ kind, id: id.join(":") } as store.Thing) : null,
     panel: panel === "none" ? null : store.PANELS.find((each) => each === panel),
     compareWith: number("with"),
+    settings: found.get("compare") === "settings",
+    asked: { what: found.get("what") ?? "", room: found.get("in") ?? "", every: found.has("once") },
+    sorted: sortedBy(found.get("sort")),
+    condition: found.get("if") ?? "",
+    layers: layersOf(found.get("layers")),
+    box: boxOf(found.get("box")),
     eps: number("eps_m"),
     minSamples: number("min_samples"),
     byTime: found.get("clock") === "time",
     known: found.get("known") === "then" ? ("then" as const) : ("now" as const),
     floor: found.get("floor"),
   };
+}
+
+/** `-seen` is by that column downwards, as at first. */
+function sortedBy(text: string | null) {
+  const by = store.COLUMNS.find((each) => text?.replace("-", "") === each) ?? "seen";
+  return { by, down: text === null || text.startsWith("-") };
+}
+
+/** The names of all layers shown. */
+function layersOf(text: string | null) {
+  if (text === null) return store.LAYERS;
+  const shown = text.split(",");
+  return Object.fromEntries(Object.keys(store.LAYERS).map((name) => [name, shown.includes(name)])) as typeof store.LAYERS;
+}
+
+/** Two corners in metres of the map frame. */
+function boxOf(text: string | null): Bounds | null {
+  const [x0, y0, x1, y1] = text?.split(",").map(Number) ?? [];
+  return [x0, y0, x1, y1].every(Number.isFinite) && x0 < x1 && y0 < y1 ? { x0, y0, x1, y1 } : null;
+}
+
+function shifted({ x0, y0, x1, y1 }: Bounds, sign: 1 | -1): Bounds {
+  const [x, y] = (store.history.value?.origin ?? [0, 0]).map((each) => sign * each);
+  return { x0: x0 + x, y0: y0 + y, x1: x1 + x, y1: y1 + y };
 }
 
 export function applyAddress(hash: string) {
@@ -36,7 +68,12 @@ export function applyAddress(hash: string) {
     store.compareWith.value = found.compareWith;
     store.otherEps.value = found.eps;
     store.otherMinSamples.value = found.minSamples;
-    if (found.eps !== null || found.minSamples !== null) store.compareMode.value = "settings";
+    store.compareMode.value = found.settings || found.eps !== null || found.minSamples !== null ? "settings" : "moments";
+    store.asked.value = found.asked;
+    store.sorted.value = found.sorted;
+    store.condition.value = found.condition;
+    store.layers.value = found.layers;
+    showBox(found.box === null ? null : shifted(found.box, -1));
     store.byTime.value = found.byTime;
     store.known.value = found.known;
     const floors = store.history.value?.floors ?? [];
@@ -59,10 +96,23 @@ export function writtenAddress(still = false): string {
     if (store.compareMode.value === "moments") {
       if (store.compareWith.value !== null) found.set("with", String(store.compareWith.value));
     } else {
+      found.set("compare", "settings");
       if (store.otherEps.value !== null) found.set("eps_m", String(store.otherEps.value));
       if (store.otherMinSamples.value !== null) found.set("min_samples", String(store.otherMinSamples.value));
     }
   }
+  const { what, room, every } = store.asked.value;
+  if (what !== "") found.set("what", what);
+  if (room !== "") found.set("in", room);
+  if (every) found.set("once", "1");
+  const { by, down } = store.sorted.value;
+  if (by !== "seen" || !down) found.set("sort", (down ? "-" : "") + by);
+  if (store.panel.value === "find" && store.condition.value !== "") found.set("if", store.condition.value);
+  const shown = Object.entries(store.layers.value).filter(([, on]) => on).map(([name]) => name);
+  if (shown.join() !== Object.entries(store.LAYERS).filter(([, on]) => on).map(([name]) => name).join()) found.set("layers", shown.join());
+  void store.view.value;
+  const box = viewBox();
+  if (box !== null) found.set("box", Object.values(shifted(box, 1)).map((each) => String(Number(each.toFixed(3)))).join());
   if (store.byTime.value) found.set("clock", "time");
   if (store.known.value === "then") found.set("known", "then");
   if (store.floor.value !== null) found.set("floor", store.history.value?.floors[store.floor.value] ?? "-");

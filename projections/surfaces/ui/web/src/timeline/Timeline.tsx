@@ -3,7 +3,8 @@
 import { effect, untracked } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { DARK, LIGHT } from "../map/palette";
-import { goTo, select, showEvent, stepBy, togglePlay } from "../state/actions";
+import { isSaved } from "../api/saved";
+import { goTo, openPanel, select, showEvent, stepBy, togglePlay } from "../state/actions";
 import { markTip, pointedAt } from "../state/pointer";
 import * as store from "../state/store";
 import { Icon, type IconName } from "../ui/icons";
@@ -27,7 +28,7 @@ function Transport() {
   const history = store.history.value;
   const at = store.at.value;
   const stamps = store.stamps.value;
-  const corrected = history?.system.some(({ kind }) => kind === "correction");
+  const corrected = !isSaved && history?.system.some(({ kind }) => kind === "correction");
   const jump = (kind: "event" | "change" | "merge", direction: 1 | -1, icon: IconName, says: string, key: string) => (
     <button class="icon" type="button" title={`${says} (${key})`} aria-label={says} onClick={() => stepBy(kind, direction)}>
       <Icon name={icon} />
@@ -182,7 +183,7 @@ function followPointer(host: HTMLElement, track: Track): () => void {
       if (mark.kind === "place_merged") select({ kind: "merge", id: String(mark.offset) }, true);
       if (mark.kind === "place_founded") select({ kind: "place", id: history.placeIds[mark.ref] }, true);
       if (mark.kind === "object_missing" || mark.kind === "object_moved") select({ kind: "object", id: history.objectIds[mark.ref] }, true);
-      if (mark.kind === "correction") store.panel.value = "correct";
+      if (mark.kind === "correction") openPanel("correct");
       return;
     }
     dragging = true;

@@ -1,6 +1,7 @@
 /** What can be done with the thing under the pointer. */
 
 import { useEffect, useRef } from "preact/hooks";
+import { isSaved } from "../api/saved";
 import { correctionsFor, propose } from "../panels/proposals";
 import { copy } from "../panels/AnswerParts";
 import { openPanel, select } from "../state/actions";
@@ -26,12 +27,12 @@ export function ContextMenu() {
   if (thing !== null) {
     items.push(["Why is it so?", () => select(thing, true)]);
     items.push([`Copy the id of this ${thing.kind}`, () => void copy(thing.id, "the id")]);
-    if (thing.kind === "keyframe") {
+    if (thing.kind === "keyframe" && !isSaved) {
       items.push(["Where would a robot be that sees this?", () => { select(thing); openPanel("lost"); }]);
     }
   }
   items.push(["Compare from this moment", () => { store.compareWith.value = store.at.value; store.compareMode.value = "moments"; openPanel("compare"); }]);
-  const corrections = thing === null ? [] : correctionsFor(thing);
+  const corrections = thing === null || isSaved ? [] : correctionsFor(thing);
   const keys = (event: KeyboardEvent) => {
     if (event.key === "Escape" || event.key === "Tab") {
       menu.value = null;

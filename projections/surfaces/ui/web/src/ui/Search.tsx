@@ -4,6 +4,7 @@
 import { batch, effect, signal } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import { ApiError, address, getJson } from "../api/client";
+import { isSaved } from "../api/saved";
 import type { FoundObjects, NamedThing } from "../api/types";
 import { bringIntoView } from "../map/MapCanvas";
 import { label } from "../model/names";
@@ -148,6 +149,14 @@ async function askServer(value: string) {
   const { signal: left } = asking;
   const [history, map, at] = [store.history.value, store.map.value, store.at.value];
   if (history === null || map === null) return;
+  if (isSaved) {
+    const { answers } = await getJson<FoundObjects>(address("/api/find", { all: 1, at }));
+    const alike = answers.filter(({ class_name, object_id }) => `${class_name} ${object_id}`.toLowerCase().includes(value.trim().toLowerCase()));
+    hits.value = [...searchLocally(history, map, store.rooms.value, value), ...alike.slice(0, MOST_OBJECTS).map((each) => foundHit(history, each))];
+    remark.value = hits.value.length > 0 ? null : "No name in this saved page has that text";
+    if (chosenEarly) choose(hits.value[0]);
+    return;
+  }
   const moment = { at, known_at: store.knownAt(at) };
   const [objects, named] = await Promise.allSettled([
     getJson<FoundObjects>(address("/api/find", { what: value.trim(), top: MOST_OBJECTS, ...moment }), left),

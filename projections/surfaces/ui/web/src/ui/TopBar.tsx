@@ -1,5 +1,6 @@
 /** The line above the map: which log, search, live, what to take away, help. */
 
+import { isSaved } from "../api/saved";
 import { goLive } from "../state/actions";
 import { LiveState } from "../panels/Live";
 import { TakeAway } from "../panels/TakeAway";
@@ -25,7 +26,7 @@ export function TopBar() {
       <SettingsNote />
       <Search />
       <span class="space" />
-      <LiveState />
+      {isSaved ? <span class="dim saved" title="It has the map at all moments and asks no server">saved page</span> : <LiveState />}
       <TakeAway />
       <button class="icon" type="button" aria-label={dark ? "Light colours" : "Dark colours"} title={dark ? "Light colours (T)" : "Dark colours (T)"} onClick={toggleTheme}>
         <Icon name={dark ? "sun" : "moon"} />
