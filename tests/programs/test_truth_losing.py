@@ -25,6 +25,6 @@ def test_the_table_adds_up() -> None:
 def test_a_robot_of_the_trial_data_is_told_where_it_is(tmp_path: Path) -> None:
     generator = trial_generator()
     case = make_case(generator, "rover", "aws_house", limit=200, cache=tmp_path)
-    row = lost_row(generator, case, "aws_bookstore", 200, 3)
+    row = lost_row(generator, case, "aws_bookstore", 200, trials=3)
     assert (row.trials, row.strangers, row.strangers_told) == (3, 3, 0)
     assert row.right == row.told >= 1

@@ -11,7 +11,6 @@ import pytest
 from eventsrc.envelope.ingest import Accepted, ingest
 from projections.localize.relocalize import Answer, PoseHypothesis
 from projections.localize.relocalize.layout import Hypotheses
-from projections.localize.relocalize.question import MAX_VIEWS
 from projections.localize.relocalize.waking_robot import MOST_KEYFRAMES, SurePose, WakingRobot
 
 
@@ -35,22 +34,19 @@ def answer(x: float, yaw: float, spread_m: float = 0.05, **more: Any) -> Answer:
     return replace(sure, **more)
 
 
-def told(second: Answer) -> SurePose | None:
-    """A robot that drives 1 m ahead and turns by 0.5, facing the map's y axis."""
+def told(second: Answer, seen: int = 1) -> SurePose | None:
+    """A robot that drives 1 m ahead, turns by 0.5 and sees so many things in each keyframe."""
     robot = WakingRobot()
-    assert robot.see(keyframe(0, 0.0, 0.0)) is not None
-    assert robot.judge(answer(5.0, 0.0)) is None  # nothing agrees with it yet
-    assert robot.see(keyframe(1, 1.0, 0.5)) is not None
-    assert robot.judge(answer(5.0, 0.0)) is None  # it did not move on
-    assert robot.see(keyframe(2, 2.0, 0.5)) is not None
+    assert robot.see(keyframe(0, 0.0, 0.0, seen)) is not None
+    assert robot.judge(answer(5.0, 0.0)) is None  # one view
+    assert robot.see(keyframe(1, 1.0, 0.5, seen)) is not None
     return robot.judge(second)
 
 
-def test_two_answers_that_agree_are_told() -> None:
-    ahead = math.cos(0.5)  # of the turned robot, as odometry has it, in its own frame
-    found = told(answer(5.0 + ahead, 0.0, 0.05))
+def test_a_sure_answer_to_two_views_is_told() -> None:
+    found = told(answer(5.0, 0.3, 0.05))
     assert found is not None
-    assert (found.x, found.yaw) == (5.0 + ahead, 0.0)
+    assert (found.x, found.y, found.yaw) == (5.0, 2.0, 0.3)
     covariance = np.reshape(found.covariance, (3, 3))
     assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
     assert covariance[0, 0] == pytest.approx(0.05**2 + 0.1**2)
@@ -59,41 +55,47 @@ def test_two_answers_that_agree_are_told() -> None:
 @pytest.mark.parametrize(
     "less",
     [
-        {"confidence": 0.7},
-        {"known": 0.6},
+        {"confidence": 0.5},
+        {"known": 0.7},
         {"thin": "two spots"},
         {"pose": None},
         {"hypotheses": None},
-        {"pose": PoseHypothesis(5.9, 2.0, None, 0.1)},
+        {"pose": PoseHypothesis(5.9, 2.0, 0.0, 0.1)},
+        {"pose": PoseHypothesis(5.0, 2.0, None, 0.1)},
+        {"pose": PoseHypothesis(5.0, 2.0, 0.0, 0.1, "upstairs")},
     ],
 )
 def test_an_answer_that_is_not_sure_is_not_told(less: dict[str, Any]) -> None:
-    assert told(replace(answer(5.0 + math.cos(0.5), 0.0), **less)) is None
+    assert told(replace(answer(5.0, 0.0), **less)) is None
 
 
-def test_answers_that_disagree_or_are_wide_are_not_told() -> None:
-    at = 5.0 + math.cos(0.5)
-    for wrong in (answer(at + 1.0, 0.0), answer(at, 0.3), answer(at, 0.0, 0.6)):
-        assert told(wrong) is None
+@pytest.mark.parametrize(
+    "other", [(5.0, 3.1, 0.0), (5.0, 2.0, 0.4), (5.0, 2.0, math.pi)], ids=["away", "askew", "back"]
+)
+def test_weight_elsewhere_counts_the_more_the_more_crops_there_are(
+    other: tuple[float, float, float],
+) -> None:
+    poses = np.array([[5.0, 2.0, 0.0], other])
+    found = Hypotheses(poses, np.array([0.96, 0.04]), (None, None))
+    sure = answer(5.0, 0.0, hypotheses=found)
+    for seen, is_told in ((1, True), (2, True), (4, False), (9, False)):
+        assert (told(sure, seen) is not None) == is_told
 
 
-def test_an_answer_of_another_run_does_not_count() -> None:
+def test_a_keyframe_of_another_run_does_not_count() -> None:
     robot = WakingRobot()
-    for number in (0, 1):
-        assert robot.see(keyframe(number, 0.0, 0.0)) is not None
-    assert robot.judge(answer(5.0, 0.0)) is None
-    for number in (0, 1):
+    assert robot.see(keyframe(0, 0.0, 0.0)) is not None
+    for number, is_told in ((0, False), (1, True)):
         assert robot.see(keyframe(number, 0.0, 0.0, run_id="other")) is not None
-    assert robot.judge(answer(5.0, 0.0)) is None
-    assert robot.judge(answer(5.0, 0.0)) is not None
+        assert (robot.judge(answer(5.0, 0.0)) is not None) == is_told
 
 
-def test_questions_have_the_latest_keyframe_and_views_spread_over_the_others() -> None:
+def test_questions_have_all_keyframes_that_show_something_and_their_best_crops() -> None:
     robot, question = WakingRobot(), None
     for number in range(MOST_KEYFRAMES + 5):
         question = robot.see(keyframe(number, 0.1 * number, 0.0, seen=9))
     assert question is not None
-    assert len(question.views) == MAX_VIEWS
+    assert [len(view.crops) for view in question.views] == [1] * 8 + [2] * 12
     assert sum(view.dx for view in question.views) == pytest.approx(0.1 * (MOST_KEYFRAMES - 1))
     assert question.views[-1].crops[0].det_id == f"r_kf{MOST_KEYFRAMES + 4}_d8"
     assert len(question.crops) == 32

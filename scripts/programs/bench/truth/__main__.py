@@ -86,7 +86,13 @@ def main() -> None:
         cases = _cases(generator, chosen, options, limit)
         if options.lost:
             lost = [
-                lost_row(generator, case, stranger_of(generator, options.half, _world(case)), limit)
+                lost_row(
+                    generator,
+                    case,
+                    stranger_of(generator, options.half, _world(case)),
+                    limit,
+                    options.seed,
+                )
                 for case in cases
                 if _world(case) in world_names(generator)
             ]

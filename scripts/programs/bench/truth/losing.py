@@ -18,7 +18,7 @@ from projections.localize.relocalize import ExactIndex, rank
 from projections.localize.relocalize.waking_robot import MOST_KEYFRAMES, WakingRobot
 
 from .localising import first_run, make_map
-from .worlds import Case
+from .worlds import SEED, Case
 
 TRIALS = 12
 NEAR_DRIVE_M = 1.5
@@ -47,14 +47,20 @@ class LostRow:
 
 
 def lost_row(
-    generator: ModuleType, case: Case, stranger: str, limit: int, trials: int = TRIALS
+    generator: ModuleType,
+    case: Case,
+    stranger: str,
+    limit: int,
+    seed: int = SEED,
+    trials: int = TRIALS,
 ) -> LostRow:
-    """One robot of a case, whose name is ``PROFILE WORLD``; ``stranger`` is another world."""
+    """One robot of a case, whose name is ``PROFILE WORLD`` and whose runs were generated with
+    ``seed``; ``stranger`` is another world."""
     profile, _, world = case.name.partition(" ")
     index = ExactIndex(make_map(case, "evidence"))
     drive = [(each.envelope.map_x or 0.0, each.envelope.map_y or 0.0) for each in first_run(case)]
-    own = [*turns(generator, world, profile, limit, drive, trials)]
-    others = [*turns(generator, stranger, profile, limit, [], len(own))]
+    own = [*turns(generator, world, profile, limit, drive, trials, seed)]
+    others = [*turns(generator, stranger, profile, limit, [], len(own), seed)]
     told = [found for turn in own if (found := _told(turn, index, case)) is not None]
     return LostRow(
         case.name,
@@ -76,12 +82,13 @@ def turns(
     limit: int,
     drive: Sequence[tuple[float, float]],
     trials: int,
+    seed: int = SEED,
 ) -> Iterator[Turn]:
     """Turns at spots near ``drive``, anywhere if it is empty, by the generator's camera, detector
     and pose errors."""
     building, how = generator.World(world), generator.PROFILES[profile]
-    region = generator.region_of(building, how, generator.crc(profile, 0), limit)
-    chance = generator.np.random.default_rng(generator.crc(world, profile, "lost"))
+    region = generator.region_of(building, how, generator.crc(profile, seed), limit)
+    chance = generator.np.random.default_rng(generator.crc(world, profile, "lost", seed))
     stops = [cell for _, cell in generator.stops_of(building, 1.5, chance, region)]
     spots = [(float(building.cx[cell]), float(building.cy[cell])) for cell in stops]
     chance.shuffle(spots)
@@ -103,7 +110,7 @@ def turns(
         spinning = {**how, "tour": "spin"}
         count = MOST_KEYFRAMES * len(near)
         made = generator.simulate(
-            building, spinning, profile, "b", building.objects, 1, region, count
+            building, spinning, profile, "b", building.objects, seed + 1, region, count
         )
         rows = [*made]
     finally:
