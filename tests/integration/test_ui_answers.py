@@ -246,6 +246,19 @@ def test_find_is_that_of_the_command(server: UiServer, mapfold: Commands) -> Non
     assert server.ask("/api/find", what="chair", top=0).status == 400
 
 
+def test_the_way_and_the_goal_are_those_of_the_command(server: UiServer, mapfold: Commands) -> None:
+    thing = server.api("find", top=1)["answers"][0]["object_id"]
+    place = server.api("overview")["rooms"][-1]["place_id"]
+    found = server.api("path", **{"from": place, "to": thing})
+    line = shlex.split(found["command"])[1:]
+    assert found["path"] == mapfold(*line, "--json").json
+    assert found["yaml"] == mapfold(*line, "--goal", "yaml").out
+    alone = server.api("path", to=thing)
+    assert (alone["path"], alone["goal"], alone["yaml"]) == (None, found["goal"], found["yaml"])
+    assert alone["yaml"] == mapfold(*shlex.split(alone["command"])[1:]).out
+    assert server.api("path", **{"from": place, "to": place})["goal"] is None
+
+
 def test_the_overview_has_the_rooms_that_are_asked_for_one_by_one(
     server: UiServer, sample: Path
 ) -> None:

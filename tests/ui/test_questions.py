@@ -1,6 +1,7 @@
 """Points 3 to 6: why, compare, find, lost; the answers are those of the commands."""
 
 import json
+import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -253,3 +254,38 @@ def test_a_question_in_a_file_is_asked_and_one_that_is_none_refused(
     bad.write_text("{not json")
     page.set_input_files("input[type=file]", bad)
     expect(page.get_by_role("alert")).to_contain_text("bad.json is not JSON")
+
+
+def test_the_way_between_two_things_is_shown_and_its_goal_is_copied(
+    rooms: UiServer, visit: Visit, mapfold: Commands
+) -> None:
+    """What `mapfold path` answers: its length, its rooms and the pose at its end."""
+    thing = rooms.api("find", what="sink", top=1)["answers"][0]["object_id"]
+    begin, other = [each["place_id"] for each in rooms.api("overview")["rooms"][:2]]
+    page = visit(rooms, f"#select=object:{thing}&panel=why")
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    plain = pixels(page)
+    page.get_by_label("Way here from").select_option(begin)
+    way = page.locator("section.way")
+    expect(way.locator(".command code")).to_have_text(re.compile("mapfold path .*"))
+    line = shlex.split(way.locator(".command code").inner_text())
+    said = mapfold(*line[1:], "--json").json
+    expect(way).to_contain_text(f"{said['length_m']:.1f} m")
+    expect(way).to_contain_text(f"{said['goal']['distance_m']:.2f} m away")
+    other_pixels(page, plain)
+    way.get_by_role("button", name="Copy the goal as YAML").click()
+    expect(page.locator(".notice")).to_contain_text("Copied the goal as YAML")
+    copied = page.evaluate("() => navigator.clipboard.readText()")
+    assert copied == mapfold(*line[1:], "--goal", "yaml").out
+    expect(page).to_have_url(re.compile(f"from={begin}"))
+    page.get_by_label("Way here from").select_option("goal")
+    expect(way.locator(".command code")).to_have_text(re.compile("mapfold find .* --goal yaml"))
+    assert rooms.api("path", to=thing)["yaml"] == copied
+    there = visit(rooms, f"#select=place:{other}&panel=why&from={begin}")
+    way = there.locator("section.way")
+    expect(way.get_by_label("Way here from")).to_have_value(begin)
+    found = rooms.api("path", **{"from": begin, "to": other})
+    expect(way).to_contain_text(f"{found['path']['length_m']:.1f} m")
+    expect(way.get_by_role("button", name="Copy the goal")).to_have_count(0)
+    there.get_by_label("Way here from").select_option("robot")
+    expect(way.locator(".command code")).to_have_text(re.compile(r"mapfold path \S+ -?\d+\.\d+,"))

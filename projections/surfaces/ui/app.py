@@ -44,7 +44,7 @@ from .log_map import LogMap
 from .map_answers import digest_answer, history_answer, overview_answer, walls_answer
 from .question_threads import GoOn, UiService
 from .requests import assignments_of, encoded, refusal
-from .search import find_answer, keyframe_answer, search_answer
+from .search import find_answer, keyframe_answer, path_answer, search_answer
 from .stories import why_answer
 from .token_gate import EDIT_PATH
 
@@ -195,6 +195,9 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
     )
     find_parameters = ("what", "in", "near", "top", "all")
     answers("find", "Where things are", find_answer, *find_parameters, *_AT_W)
+    answers(
+        "path", "The way between two things, and the goal at one", path_answer, "from", "to", *_AT_W
+    )
     answers("search", "Things whose name matches a text", search_answer, "q", "kind", *_AT_W)
     answers(
         "keyframe", "A keyframe and its detections", keyframe_answer, "number", "keyframe", *_AT_W

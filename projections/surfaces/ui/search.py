@@ -9,6 +9,7 @@ from starlette.datastructures import QueryParams
 
 from eventsrc.envelope.model import Offset
 from projections.ask.find import Wanted, find
+from projections.ask.room_and_path import goal_of, path
 from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, ObservationOrdinal
 from projections.fold.map_errors import QuestionError
 from projections.history import NoSuchThing
@@ -146,6 +147,24 @@ def find_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
         **asked.document(),
         **find(view, wanted, words_of(view)).document(),
         "command": asked.command("find", *words),
+    }
+
+
+def path_answer(shown: LogMap, query: QueryParams) -> dict[str, Any]:
+    """The way ``from`` one thing ``to`` another, and where that is an Object its goal, also as YAML
+    for ROS 2; without ``from`` only the goal. What ``mapfold path A B`` answers."""
+    asked = AskedPoint.of(shown, query)
+    view = asked.known.at(asked.end)
+    start, end = query.get("from") or None, text_of(query, "to")
+    way = None if start is None else path(view, start, end)
+    goal = goal_of(view, end) if way is None else way.goal
+    words = ("find", end, "--goal", "yaml") if start is None else ("path", start, end)
+    return {
+        **asked.document(),
+        "path": None if way is None else way.document(),
+        "goal": None if goal is None else goal.document(),
+        "yaml": None if goal is None else goal.pose_stamped(),
+        "command": asked.command(*words),
     }
 
 

@@ -5,7 +5,7 @@ import { select as d3select } from "d3-selection";
 import { type D3ZoomEvent, type ZoomBehavior, zoom, zoomIdentity } from "d3-zoom";
 import { useEffect, useRef } from "preact/hooks";
 import { select } from "../state/actions";
-import { lostPoint, shownBridge, shownLost } from "../state/overlays";
+import { lostPoint, shownBridge, shownLost, shownWay } from "../state/overlays";
 import { walls } from "../state/walls";
 import { markTip, menu, tip } from "../state/pointer";
 import { type Grip, byDragging, dragged, dropped } from "../panels/drag_edits";
@@ -189,7 +189,7 @@ function inputs(side: Side) {
   return [
     store.at, store.view, store.layers, store.selection, store.hovered, store.found, store.dark, store.log,
     side === "main" ? store.history : store.otherHistory,
-    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, store.floor, store.mapFacts, walls, dragged,
+    store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, shownWay, store.floor, store.mapFacts, walls, dragged,
   ];
 }
 

@@ -1,6 +1,6 @@
 /** The scene of one of the two maps as things are now. */
 
-import { difference, shownBridge, shownLost } from "../state/overlays";
+import { difference, shownBridge, shownLost, shownWay } from "../state/overlays";
 import { differenceOn } from "../model/floors";
 import { dragged } from "../panels/drag_edits";
 import { walls } from "../state/walls";
@@ -34,6 +34,7 @@ export function currentScene(side: Side, width: number, height: number): Scene |
     found: new Set(store.found.value.map((thing) => litObject(shown, thing))),
     difference: compared === null ? null : { ...compared, difference: differenceOn(history, compared.difference, floor) },
     bridge: main ? shownBridge.value : null,
+    way: main ? shownWay.value : null,
     lost: main ? shownLost.value : null,
     drag: main ? dragged.value : null,
     controls: [],

@@ -151,6 +151,28 @@ export function drawLikely(on: Surface, scene: Scene) {
   }
 }
 
+export function drawWay(on: Surface, { way, view, palette }: Scene) {
+  if (way === null) return;
+  on.beginPath();
+  way.points.forEach(([x, y], index) => (index === 0 ? on.moveTo(screenX(view, x), screenY(view, y)) : on.lineTo(screenX(view, x), screenY(view, y))));
+  for (const [colour, width] of [[palette.ground, 7], [palette.accent, 3.5]] as const) {
+    on.strokeStyle = colour;
+    on.lineWidth = width;
+    on.stroke();
+  }
+  const spots = [...way.doors, ...way.points.slice(0, 1), ...(way.goal === null ? way.points.slice(-1) : [])];
+  for (const [x, y] of spots) {
+    on.beginPath();
+    on.arc(screenX(view, x), screenY(view, y), 5, 0, ROUND);
+    on.fillStyle = palette.ground;
+    on.fill();
+    on.strokeStyle = palette.accent;
+    on.lineWidth = 2.2;
+    on.stroke();
+  }
+  if (way.goal !== null) drawArrow(on, screenX(view, way.goal.x), screenY(view, way.goal.y), way.goal.yaw, 13, palette.accent, palette.ground);
+}
+
 export function drawLost(on: Surface, scene: Scene) {
   const { lost, view, palette } = scene;
   if (lost === null) return;

@@ -3,7 +3,7 @@
 import { drawGrid, drawRegions, drawWalls } from "./ground";
 import { drawKeyframes, drawRobot } from "./keyframes";
 import { drawLabels } from "./labels";
-import { arrow, drawBridge, drawDifference, drawGone, drawLikely, drawLost } from "./overlays";
+import { arrow, drawBridge, drawDifference, drawGone, drawLikely, drawLost, drawWay } from "./overlays";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { drawEdges, drawObjects } from "./things";
@@ -17,6 +17,7 @@ export function paint(on: Surface, scene: Scene) {
   if (scene.layers.path || scene.layers.keyframes) drawKeyframes(on, scene);
   if (scene.layers.objects) drawObjects(on, scene);
   drawDifference(on, scene);
+  drawWay(on, scene);
   drawRobot(on, scene);
   if (scene.layers.labels) drawLabels(on, scene);
   drawGone(on, scene);

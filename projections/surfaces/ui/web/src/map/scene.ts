@@ -30,6 +30,13 @@ export interface LostOverlay {
   places: Set<number>;
 }
 
+/** A way over ground that robots drove: its points and passages, and the pose at its end. */
+export interface WayOverlay {
+  points: [number, number][];
+  doors: [number, number][];
+  goal: { x: number; y: number; yaw: number } | null;
+}
+
 export interface Scene {
   history: History;
   map: MapState;
@@ -49,6 +56,7 @@ export interface Scene {
   difference: { before: MapState; difference: MapDifference } | null;
   bridge: Bridge | null;
   lost: LostOverlay | null;
+  way: WayOverlay | null;
   /** A correction that is being dragged, metres. */
   drag: { x0: number; y0: number; x1: number; y1: number } | null;
   /** What lies over the map on the screen, where no label may be. */

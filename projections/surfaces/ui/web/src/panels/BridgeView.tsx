@@ -129,6 +129,7 @@ function miniScene({ history, map }: Shown, merge: MergeStory, width: number, he
     difference: null,
     bridge,
     lost: null,
+    way: null,
     drag: null,
     controls: [],
     dots: null,

@@ -16,6 +16,7 @@ import * as store from "../state/store";
 import { Icon } from "../ui/icons";
 import { type MergeStory, BridgeView, bridgeOf } from "./BridgeView";
 import { Overview } from "./Overview";
+import { Way } from "./Way";
 import { Pictures } from "./Pictures";
 import { Answer, CommandLine, Lines, Steps, ThingLink } from "./AnswerParts";
 
@@ -62,6 +63,7 @@ function Story({ thing, history }: { thing: store.Thing; history: History }) {
     <section class="story">
       <Heading thing={thing} history={history} />
       <Facts thing={thing} history={history} />
+      {!isSaved && (thing.kind === "place" || thing.kind === "object") && <Way thing={thing} history={history} at={at} />}
       <Answer asked={asked}>
         {(answer) => (
           <>

@@ -1,7 +1,7 @@
 /** What panels' answers draw on the map. */
 
 import { computed, signal } from "@preact/signals";
-import type { Bridge, LostOverlay } from "../map/scene";
+import type { Bridge, LostOverlay, WayOverlay } from "../map/scene";
 import type { MapChange } from "../api/types";
 import { compareMoments } from "../model/compare";
 import { findObject } from "../model/names";
@@ -12,6 +12,9 @@ export const bridge = signal<Bridge | null>(null);
 /** Where on the map a question was just asked from, metres. */
 export const lostPoint = signal<{ x: number; y: number } | null>(null);
 export const lostOverlay = signal<LostOverlay | null>(null);
+
+/** To what is selected. */
+export const way = signal<WayOverlay | null>(null);
 
 /** What changed between the two moments compared; null where that is not known. */
 export const sureChanges = signal<readonly MapChange[] | null>(null);
@@ -28,4 +31,5 @@ export const difference = computed(() => {
 });
 
 export const shownBridge = computed(() => (panel.value === "why" ? bridge.value : null));
+export const shownWay = computed(() => (panel.value === "why" ? way.value : null));
 export const shownLost = computed(() => (panel.value === "lost" ? lostOverlay.value : null));

@@ -91,6 +91,8 @@ export const asked = signal({ what: "", room: "", every: false });
 export type Column = "class" | "room" | "seen" | "last seen";
 export const COLUMNS: readonly Column[] = ["class", "room", "seen", "last seen"];
 export const sorted = signal<{ by: Column; down: boolean }>({ by: "seen", down: true });
+/** Where the way to what is selected begins: `robot`, an id, or `goal` for no way but the end of one; null for no way. */
+export const wayFrom = signal<string | null>(null);
 /** The condition of Find. */
 export const condition = signal("");
 

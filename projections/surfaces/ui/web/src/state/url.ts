@@ -25,6 +25,7 @@ export function readAddress(hash: string) {
     settings: found.get("compare") === "settings",
     asked: { what: found.get("what") ?? "", room: found.get("in") ?? "", every: found.has("once") },
     sorted: sortedBy(found.get("sort")),
+    wayFrom: found.get("from"),
     condition: found.get("if") ?? "",
     layers: layersOf(found.get("layers")),
     box: boxOf(found.get("box")),
@@ -71,6 +72,7 @@ export function applyAddress(hash: string) {
     store.compareMode.value = found.settings || found.eps !== null || found.minSamples !== null ? "settings" : "moments";
     store.asked.value = found.asked;
     store.sorted.value = found.sorted;
+    store.wayFrom.value = found.wayFrom;
     store.condition.value = found.condition;
     store.layers.value = found.layers;
     showBox(found.box === null ? null : shifted(found.box, -1));
@@ -101,6 +103,7 @@ export function writtenAddress(still = false): string {
       if (store.otherMinSamples.value !== null) found.set("min_samples", String(store.otherMinSamples.value));
     }
   }
+  if (store.wayFrom.value !== null) found.set("from", store.wayFrom.value);
   const { what, room, every } = store.asked.value;
   if (what !== "") found.set("what", what);
   if (room !== "") found.set("in", room);

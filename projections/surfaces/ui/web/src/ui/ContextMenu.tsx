@@ -31,6 +31,9 @@ export function ContextMenu() {
       items.push(["Where would a robot be that sees this?", () => { select(thing); openPanel("lost"); }]);
     }
   }
+  if (thing !== null && (thing.kind === "place" || thing.kind === "object") && !isSaved) {
+    items.push(["Way from here to what I click next", () => { select(null); store.wayFrom.value = thing.id; openPanel("why"); }]);
+  }
   items.push(["Compare from this moment", () => { store.compareWith.value = store.at.value; store.compareMode.value = "moments"; openPanel("compare"); }]);
   const corrections = thing === null || isSaved ? [] : correctionsFor(thing);
   const keys = (event: KeyboardEvent) => {
