@@ -15,7 +15,7 @@ The class is the one that was recorded, letter by letter, or a label that the lo
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Final, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -135,10 +135,7 @@ class ClassDropper(Generic[Item]):
 
     def _stored(self, payload: bytes, document: object, count: int) -> Stripped:
         self._detections += count
-        if not count:
-            return Stripped(payload)
-        text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-        return Stripped(text.encode())
+        return Stripped(_encoded(document) if count else payload)
 
     def release(self, stripped: Stripped) -> list[Item]:
         """Note which detections of an envelope are kept; the crops that waited for them."""
@@ -205,6 +202,28 @@ class ClassDropper(Generic[Item]):
         return RejectedPayload.encode(
             found.key, self.reason(found.reason), excerpt._replace(start=b"")
         )
+
+
+def without_detections(
+    payload: bytes,
+    version: int,
+    det_ids: Sequence[DetId],
+    left: Sequence[int],
+    fields: Mapping[str, object],
+) -> bytes:
+    """A valid envelope of this version with only the detections ``left``, by index, which keep
+    their ids, and with ``fields``, which a bare list has no place for."""
+    document = from_json(payload)
+    given = document if version == BARE_LIST_VERSION else document["detections"]
+    kept = [{**given[i], "det_id": det_ids[i]} for i in left]
+    if version == BARE_LIST_VERSION:
+        return _encoded(kept)
+    return _encoded({**document, "detections": kept, **fields})
+
+
+def _encoded(document: object) -> bytes:
+    text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return text.encode()
 
 
 def _note(known: dict[str, None], det_ids: Iterable[str]) -> None:

@@ -9,6 +9,8 @@
 ``mapfold/map``       an occupancy grid: where walls are (`.occupancy_map`)
 ``mapfold/embeddings``  vectors of another space for older detections (`NewVectors`)
 ``mapfold/drop``      classes whose detections are never stored (`.dropped_classes`)
+``mapfold/redaction`` what was erased from the log, by whom and why (`eventsrc.log.redact`)
+``mapfold/redacted``  a tombstone, in place of an event that was erased
 
 The docstrings of the models are part of the JSON schema in every segment: do not change them.
 """
@@ -33,6 +35,8 @@ MAP_KEY = "mapfold/map"
 ROS_KEY = "mapfold/ros"
 EMBEDDINGS_KEY = "mapfold/embeddings"
 DROP_KEY = "mapfold/drop"
+REDACTION_KEY = "mapfold/redaction"
+REDACTED_KEY = "mapfold/redacted"
 
 
 def is_system_key(key: str) -> bool:

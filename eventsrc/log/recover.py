@@ -23,6 +23,7 @@ from .active_segment import ActiveSegment
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
+from .redact import Pending
 from .rewrite_segments import (
     Moved,
     adjacent_times,
@@ -110,6 +111,8 @@ class _Recovery:
         self._previous: names.SegmentPath | None = None
 
     def run(self) -> RecoveryReport:
+        if (redaction := Pending.of(self._log)) is not None:
+            redaction.replace_segments()
         for path in names.leftovers(self._log):
             unlink_quietly(path)
         noted = sealed_end(self._log)

@@ -6,27 +6,90 @@ In the files: magic, checksums, hash chain, dense offsets, torn ends. In the eve
 An archive is verified by its manifest, segment by segment, without the log.
 """
 
+import hashlib
 import os
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog, ObjectMissing
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
+from eventsrc.envelope.system_events import REDACTED_KEY
 
 from . import format as names
 from .archive import Archive, ManifestEntry, chain_faults
+from .event import event_hash
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
+from .reader import LogReader
+from .redact import Redaction, read_redactions, unfinished
 from .scan import scan_active, scan_sealed, scanned_events
 from .seal import NO_PREVIOUS, REPLACES
 from .sealed_end import InvalidSealedEnd, SealedEnd, read_sealed_end, sealed_end, segments_left
 from .sealed_segment import check_sealed
 from .segment import Scan
 from .verify_events import EventFindings, Finding, Kind
+
+
+class Redacted(NamedTuple):
+    """One redaction: its id, who issued it and why, and how many payloads it changed."""
+
+    redaction_id: str
+    issued_by: str
+    reason: str
+    selection: str
+    payloads: int
+
+
+class Proof(NamedTuple):
+    """The redactions of a log, and what contradicts them: offset and text."""
+
+    redactions: tuple[Redacted, ...]
+    faults: tuple[tuple[Offset, str], ...]
+
+
+def check(reader: LogReader) -> Proof:
+    """Prove the redactions of a log: payloads are those that are listed, and of each segment
+    nothing else has changed since its last redaction."""
+    known = read_redactions(reader)
+    by_id: dict[str, Redacted] = {}
+    now: dict[Offset, str] = {}
+    last: dict[Offset, tuple[str, str]] = {}
+    for _, each in known:
+        before = by_id.get(each.redaction_id)
+        count = len(each.offsets) + (0 if before is None else before.payloads)
+        about = each.redaction_id, each.issued_by, each.reason, each.selection
+        by_id[each.redaction_id] = Redacted(*about, count)
+        now.update(zip(map(Offset, each.offsets), each.now, strict=False))
+        last[Offset(each.base)] = each.kept_sha256, each.redaction_id
+    faults: list[tuple[Offset, str]] = []
+    kept: defaultdict[Offset, hashlib._Hash] = defaultdict(hashlib.sha256)
+    for base, end in _spans(known):
+        for event in reader.read(base, end, on_gap=lambda _: None):
+            if event.offset in now:
+                if hashlib.sha256(event.payload).hexdigest() != now[event.offset]:
+                    text = "the payload is not the one that the redaction put there"
+                    faults.append((event.offset, text))
+            else:
+                kept[base].update(f"{event_hash(event)}\n".encode())
+    for base in sorted(last):
+        expected, redaction_id = last[base]
+        if kept[base].hexdigest() != expected:
+            text = f"events that redaction {redaction_id} left as they were have changed since"
+            faults.append((base, text))
+    tombstones = reader.read(keys={REDACTED_KEY}, on_gap=lambda _: None)
+    unlisted = "a tombstone that no redaction lists"
+    faults += [(event.offset, unlisted) for event in tombstones if event.offset not in now]
+    return Proof(tuple(by_id.values()), tuple(sorted(faults)))
+
+
+def _spans(known: Iterable[tuple[Offset, Redaction]]) -> list[tuple[Offset, Offset]]:
+    return sorted({(Offset(each.base), Offset(each.following)) for _, each in known})
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +102,8 @@ class Verification:
     events: int
     size_bytes: int
     findings: tuple[Finding, ...]
+    redactions: tuple[Redacted, ...] = ()
+    """What was erased, by whom and why."""
 
 
 def verify_log(log: Path) -> Verification:
@@ -85,6 +150,7 @@ class _Verifier:
         self._check_sealed_end()
         for path in names.not_files(self._log):
             self._add("crc", "is no file, but a folder, a pipe or a device", path.name)
+        redactions = self._check_redactions()
         report_progress("verifying", 1, 1, "MB")
         return Verification(
             self._log,
@@ -93,7 +159,23 @@ class _Verifier:
             self._count,
             size,
             (*self._found, *self._events.findings()),
+            redactions,
         )
+
+    def _check_redactions(self) -> tuple[Redacted, ...]:
+        """Prove what the log says was erased, and report what contradicts it."""
+        if (text := unfinished(self._log)) is not None:
+            self._found.append(Finding("redaction", text))
+        try:
+            with LogReader(self._log) as reader:
+                proof = check(reader)
+        except LogDamaged:
+            return ()  # reported before
+        for offset, text in proof.faults:
+            at = next((s for s in reversed(self._segments) if s.base <= offset), None)
+            name = None if at is None else at.path.name
+            self._found.append(Finding("redaction", text, name, offset, offset))
+        return proof.redactions
 
     def _verify_segment(self, segment: names.SegmentPath, reach: Offset | None) -> int:
         """Verify one segment, which ends at ``reach`` if that is known; its size in bytes."""

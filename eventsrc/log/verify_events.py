@@ -139,7 +139,9 @@ class RunStamps:
                     )
 
 
-Kind = Literal["crc", "gap", "chain", "log_id", "torn", "schema", "duplicate", "time", "loss"]
+Kind = Literal[
+    "crc", "gap", "chain", "log_id", "torn", "schema", "duplicate", "time", "loss", "redaction"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +158,7 @@ class Finding:
     duplicate  a keyframe that stands more than once (the fold takes the first)
     time       a clock that ran backwards, or was set while a robot drove
     loss       what the log says never came and did not come late either, or was lost to damage
+    redaction  a payload is not what a redaction put there, or one is not finished
     """
 
     kind: Kind

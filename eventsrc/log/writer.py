@@ -21,7 +21,7 @@ from eventsrc.base.errors import LogError, MapfoldError, NotALog
 from eventsrc.base.machine import Clock, system_clock
 from eventsrc.base.text import advised, visible
 from eventsrc.envelope.model import ENVELOPE_VERSION, Offset
-from eventsrc.envelope.system_events import is_system_key
+from eventsrc.envelope.system_events import REDACTION_KEY, is_system_key
 
 from .active_segment import ActiveSegment, SegmentFault
 from .durable_files import GROUP_COMMIT, FsyncPolicy, make_directory_durably, unlink_quietly
@@ -29,6 +29,7 @@ from .event import MessageFormat, NewEvent
 from .format import LOCK, leftovers, list_segments
 from .lock import WriterLock
 from .mcap_records import MAX_EVENT_BYTES
+from .redact import Pending
 from .restart import Restart, restart
 from .sealer import Sealer
 
@@ -57,7 +58,8 @@ class Sealing(NamedTuple):
 
 class LogWriter:
     """A context manager: creates the log if there is none, takes its lock, recovers what a killed
-    writer left. Raises LogBusy, NotALog, LogDamaged or LogError.
+    writer left, and goes on with a redaction that was begun. Raises LogBusy, NotALog, LogDamaged or
+    LogError.
 
     A segment file that somebody deletes, moves or cuts short while it is written is given up, and
     writing goes on in a new one behind the last recorded offset: see `faults`; `close` then raises
@@ -101,6 +103,9 @@ class LogWriter:
         _make_log_directory(self.path)
         self._lock = WriterLock(self.path, self._clock)
         try:
+            redaction = Pending.of(self.path)
+            if redaction is not None:
+                redaction.replace_segments()
             self.restart: Restart = restart(self.path)
             self.log_id = self.restart.log_id or uuid.uuid4().hex
             self._sealer = Sealer(
@@ -113,6 +118,11 @@ class LogWriter:
             self._active.create()
             for base, following in self.restart.unsealed:
                 self._sealer.submit(base, following)
+            if redaction is not None:
+                for payload in redaction.missing(self.next_offset):
+                    self.append(REDACTION_KEY, payload)
+                self.sync()
+                redaction.note_recorded()
         except BaseException:
             self._lock.release()
             raise

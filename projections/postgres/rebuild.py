@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeAlias
 
+import psycopg
+
 from eventsrc.base.machine import gc_paused
 from eventsrc.envelope.forms import read_envelope
 from eventsrc.envelope.ingest import Accepted
@@ -24,7 +26,7 @@ from projections.map.parsed_log import ParsedLog, default_workers
 from projections.map.parsing import ParsedEvent
 from projections.map.records import seen_once
 
-from .connection import Targets
+from .connection import Targets, connect
 from .inputs import LogInputs, MapInputs, SettingsOf
 from .live_fold import LiveFold
 from .origin import command_for
@@ -63,6 +65,20 @@ def first_foreign_embedding(fold: LiveFold, reader: LogReader) -> ForeignEmbeddi
     return ForeignEmbedding(
         offset, first.det_id, first.embedding_model, len(vector), space.model, dim
     )
+
+
+def give_up_replaced(targets: Targets) -> list[str]:
+    """Have the servers write all files, so that those of replaced rows are gone; lines on what they
+    keep. Only some roles may."""
+    lines = []
+    for url in targets.urls:
+        with connect(url, application="mapfold redact", autocommit=True) as connection:
+            try:
+                connection.execute("VACUUM (FULL) pg_catalog.pg_statistic")
+                connection.execute("CHECKPOINT")
+            except psycopg.errors.InsufficientPrivilege:
+                lines.append("this role may not CHECKPOINT: files of old rows go at the next one")
+    return [*lines, "not reached: the server's pg_wal, until it is written over, and its backups"]
 
 
 TICK_EVENTS: Final = 256

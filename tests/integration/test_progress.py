@@ -53,6 +53,7 @@ WITHOUT = {
     "db reset": "reads no log",
     "db roles": "reads no log",
     "log info": "reads indexes only",
+    "log redact": "tests/integration/test_redact.py",
     "log archive": "tests/integration/test_archive.py",
     "log restore": "tests/integration/test_archive.py",
     "completion": "reads no log",

@@ -20,6 +20,8 @@ from eventsrc.envelope.grid_messages import GRID_SCHEMA
 from eventsrc.envelope.model import RunId
 from eventsrc.envelope.system_events import (
     EMBEDDINGS_KEY,
+    REDACTED_KEY,
+    REDACTION_KEY,
     REJECTED_KEY,
     Excerpt,
     InvalidEmbeddings,
@@ -142,7 +144,8 @@ def looks_like_envelope(payload: bytes) -> bool:
 
 
 _MAY_SHOW: Final = "may show what the log drops"
-_SHOW_NOTHING: Final = (
+_OF_ITS_OWN_LOG: Final = "about its own log"
+SHOW_NOTHING: Final = (
     *(ros.TF, ros.ODOMETRY, ros.POSE, ros.CAMERA_INFO, ros.GRID),
     *(ros.LABELS, ros.VISION_INFO, ros.PARAMETERS, measured.LASER_SCAN),
 )
@@ -161,7 +164,7 @@ def not_dropped(
         except InvalidCrop:  # another picture
             return [replace(message, form=None, unread=f"{form.schema}, {_MAY_SHOW}")]
         return dropper.crop(det_id, message, len(message.payload))
-    if form is not None and form.schema not in _SHOW_NOTHING:
+    if form is not None and form.schema not in SHOW_NOTHING:
         what = f"{form.encoding} {form.schema}".strip()
         return [replace(message, form=None, unread=f"{what}, {_MAY_SHOW}")]
     try:
@@ -309,4 +312,5 @@ class OtherLog(Source):
                 form = event.format if isinstance(event, VerbatimEvent) else None
                 about = event.logged_ns, event.stamp_ns, event.version, form
                 begins = event.offset in begun
-                yield ImportedMessage(event.payload, event.key, *about, begins=begins)
+                own = _OF_ITS_OWN_LOG if event.key in (REDACTION_KEY, REDACTED_KEY) else None
+                yield ImportedMessage(event.payload, event.key, *about, begins=begins, unread=own)

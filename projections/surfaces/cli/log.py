@@ -32,6 +32,7 @@ from .event_text import event_document, event_line, finding_text, iso_time
 from .folded_log import LogArgument
 from .new_log import say_camera
 from .options import JsonOption, option
+from .redact_command import redact
 from .terminal import Bar, display, emit, emit_lines, finish, say
 
 
@@ -235,6 +236,10 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
     else:
         for finding in result.findings:
             display(finding_text(finding))
+    for each in result.redactions:
+        said = f": {each.reason}" if each.reason else ""
+        by = f"{counted(each.payloads, 'payload')} redacted by {each.issued_by}"
+        say(visible(f"{log}: {by} ({each.selection}){said}"))
     size = f"{counted(result.events, 'event')} in {counted(result.segments, 'segment')}"
     found = counted(len(result.findings), "finding") if result.findings else "all good"
     say(f"{log}: {size}, {result.size_bytes:,} bytes: {found}")
@@ -244,6 +249,9 @@ def verify(log: LogArgument, json_: JsonOption = False) -> None:
 def verification_document(result: Verification) -> dict[str, Any]:
     """The output of `log verify --json`."""
     return {**asdict(result), "path": str(result.path)}
+
+
+log_commands.command()(redact)
 
 
 @log_commands.command()
