@@ -160,7 +160,10 @@ def square_to_nearest(xy: Floats, points: Floats) -> Floats:
     """The squared distance of each position to its nearest point."""
     dx = xy[:, 0, None] - points[None, :, 0]
     dy = xy[:, 1, None] - points[None, :, 1]
-    squared: Floats = (dx * dx + dy * dy).min(1)
+    dx *= dx
+    dy *= dy
+    dx += dy
+    squared: Floats = dx.min(1)
     return squared
 
 

@@ -62,7 +62,8 @@ class Terms:
     """Factors of the likelihood for pairs of a landmark and a position, arrays of one shape:
     ``looks``, already times seen_from; ``box`` without the bearing; ``heading``, at which the
     landmark is where the crop shows it (without a box: in the middle of the picture); ``variance``
-    of its bearing; ``near``, whether it is within twice the usual distance.
+    of its bearing (without a box: of the heading); ``near``, whether it is within twice the usual
+    distance.
 
     The shape is (n, h) for all pairs of n landmarks and h positions, or one axis for some of them.
     ``slot`` is the number of the landmark's crop times h, plus that of the position.
@@ -187,31 +188,33 @@ def terms_at(
     square = np.maximum(dx * dx + dy * dy, _NEAREST_M2)
     reach = np.sqrt(square)
     towards = np.arctan2(dy, dx)
-    per = 1.0 / reach
-    ux, uy = dx * per, dy * per
-    xx, xy_, yy = spread = tuple(pairs.of(marks.spread.T))
-    across = (xx * uy * uy - 2.0 * xy_ * ux * uy + yy * ux * ux + pose_m2) / square
     seen = -0.5 * pairs.nearest(marks.seen_from, marks.starts) / seen_m2
     log_reach = np.log(reach)
     if group.boxed:
+        per = 1.0 / reach
+        ux, uy = dx * per, dy * per
+        xx, xy_, yy = spread = tuple(pairs.of(marks.spread.T))
+        across = (xx * uy * uy - 2.0 * xy_ * ux * uy + yy * ux * ux + pose_m2) / square
+        bearing = np.where(group.sight.cut, evidence.bearing_cut_rad, evidence.bearing_rad)
+        variance = across + pairs.of((bearing * bearing).take(group.owner))
         offset = _Offset(ux, uy, per, log_reach, pose_m2, spread)
         box = _by_size(group, pairs, offset, model) + _by_edges(group, pairs, offset, model)
         heading = towards - pairs.of(group.sight.bearing.take(group.owner))
     else:
         off = (log_reach - math.log(evidence.range_m)) / evidence.range_spread
         box = np.maximum(-0.5 * off * off, -_MOST_BY_SIZE)
+        variance = np.full_like(box, (0.5 * half_field_rad(scene.camera)) ** 2)
         heading = towards - scene.camera.yaw_rad
     by_heading = evidence.side_by == "heading" and group.boxed
     looks = _ratio_towards(marks.ratios, pairs.row, heading if by_heading else towards)
     looks *= np.exp(seen)
     if scene.walls is not None:
         looks[_hidden(group, pairs, xy, looks, scene.walls)] *= model.through_walls
-    bearing = np.where(group.sight.cut, evidence.bearing_cut_rad, evidence.bearing_rad)
     return Terms(
         looks,
         np.exp(box),
         heading,
-        across + pairs.of((bearing * bearing).take(group.owner)),
+        variance,
         reach < model.twice * evidence.range_m,
         pairs.slot,
         len(group.first),
@@ -248,10 +251,11 @@ def _ratio_towards(ratios: Floats, row: Indices, towards: Floats) -> Floats:
     place = towards * (DIRECTIONS / _TURN)
     low = np.floor(place)
     part = place - low
-    first = low.astype(np.intp) % DIRECTIONS
-    second = np.where(first == DIRECTIONS - 1, 0, first + 1)
-    row, flat = row * DIRECTIONS, ratios.ravel()
-    found: Floats = flat.take(row + first) * (1.0 - part) + flat.take(row + second) * part
+    low -= DIRECTIONS * np.floor(low / DIRECTIONS)
+    row_of = DIRECTIONS + 1
+    around = np.concatenate((ratios, ratios[:, :1]), axis=1).ravel()
+    first = row * row_of + low.astype(np.intp)
+    found: Floats = around.take(first) * (1.0 - part) + around.take(first + 1) * part
     return found
 
 
@@ -362,10 +366,7 @@ def _mixture(terms: Terms, fit: Floats, scene: Scene) -> Floats:
     return found.reshape(times, terms.crops, terms.positions)
 
 
-def headings(group: CropGroup, terms: Terms, scene: Scene) -> tuple[Floats, Floats, Floats]:
+def headings(terms: Terms) -> tuple[Floats, Floats, Floats]:
     """For each landmark and position the heading that puts the landmark where the crop shows it,
     its variance, and how likely it is, up to a factor that all crops share."""
-    variance = terms.variance
-    if not group.boxed:
-        variance = np.full_like(variance, (0.5 * half_field_rad(scene.camera)) ** 2)
-    return terms.heading, variance, terms.looks * terms.box / np.sqrt(variance)
+    return terms.heading, terms.variance, terms.looks * terms.box / np.sqrt(terms.variance)

@@ -239,8 +239,8 @@ def _hypotheses(asked: _Asked, terms: _TermsOfViews) -> tuple[Floats, Floats]:
     """Headings (k, h) of the last view at the cells, and the density of a cell's headings there."""
     found = []
     for view, of_view in zip(asked.views, terms, strict=True):
-        for group, each in zip(view.groups, of_view, strict=True):
-            yaw, variance, weight = headings(group, each, asked.scene)
+        for each in of_view:
+            yaw, variance, weight = headings(each)
             found.append((yaw + view.behind.turn, variance + view.behind.yaw2, weight))
     yaws, variances, weights = (
         part[0] if len(part) == 1 else np.concatenate(part) for part in zip(*found, strict=True)
