@@ -185,7 +185,7 @@ def test_a_lost_robot_is_found_by_the_map_before_its_run(
 
 
 def test_lost_opens_with_crops_of_the_last_run_of_which_some_are_chosen(
-    two_runs: UiServer, visit: Visit
+    two_runs: UiServer, visit: Visit, pictures: Path
 ) -> None:
     page = visit(two_runs, "#panel=lost")
     picked = two_runs.api("question")
@@ -201,7 +201,14 @@ def test_lost_opens_with_crops_of_the_last_run_of_which_some_are_chosen(
     with page.expect_request("**/api/relocalize*") as asked:
         page.get_by_role("button", name="Where is it?").click()
     assert [each["det_id"] for each in asked.value.post_data_json["crops"]] == [crops[0]["det_id"]]
-    expect(page.locator(".summary")).to_be_visible()
+    body = json.dumps({"crops": crops[:1]}).encode()
+    path = f"/api/relocalize?at={picked['ask_at']}"
+    _, *others = two_runs.ask(path, method="POST", body=body).json["spots"]
+    assert others  # one thing is seen from several spots
+    for spot in others:
+        said = f"at ({spot['x']:.1f}, {spot['y']:.1f}) m, {spot['share']:.0%}".replace("%", " %")
+        expect(page.locator("#panel .answer")).to_contain_text(said)
+    page.screenshot(path=pictures / "lost-spots.png")
     buttons.first.click()
     expect(page.get_by_role("button", name="Where is it?")).to_be_disabled()
 

@@ -230,6 +230,8 @@ function LikelyPlaces({ answer: found }: { answer: LostAnswer }) {
   const history = store.history.value;
   if (history === null) return null;
   const { pose, places, confidence, unknown, spots } = found;
+  /** As the map shown calls it, which may know more than the one that was asked. */
+  const nameNow = ({ place_id, name }: LostAnswer["places"][number]) => store.map.value?.name[findPlace(history, place_id)] ?? name ?? shortPlace(history, findPlace(history, place_id));
   return (
     <div class="answer">
       <p class="summary">
@@ -250,7 +252,7 @@ function LikelyPlaces({ answer: found }: { answer: LostAnswer }) {
         {places.map((place) => (
           <li key={place.place_id}>
             <div class="score">
-              {findPlace(history, place.place_id) >= 0 ? <ThingLink thing={{ kind: "place", id: place.place_id }}>{label(place.name ?? shortPlace(history, findPlace(history, place.place_id)), 40)}</ThingLink> : <bdi>{label(place.name ?? place.place_id, 40)}</bdi>}
+              {findPlace(history, place.place_id) >= 0 ? <ThingLink thing={{ kind: "place", id: place.place_id }}>{label(nameNow(place), 40)}</ThingLink> : <bdi>{label(place.name ?? place.place_id, 40)}</bdi>}
               <meter min={0} max={1} value={Math.min(1, place.score)} aria-label="Score" />
               <span>{place.score.toFixed(3)}</span>
             </div>
