@@ -23,6 +23,7 @@ changed since.
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -55,6 +56,7 @@ from .sealed_segment import SealedFile
 
 MOST_CHANGES: Final = 50_000
 """Bound of the changed events in one event on ``mapfold/redaction``."""
+_SEGMENT: Final = re.compile(r"[0-9]{20}\.mcap")
 _JOURNAL: Final = "journal.json"
 _UNFINISHED: Final = "journal.new"
 
@@ -128,6 +130,8 @@ class Pending:
             self.is_recorded = bool(document["recorded"])
         except (ValueError, KeyError, TypeError) as error:
             raise LogDamaged(f"{path} cannot be read: {error}") from None
+        if not all(map(_SEGMENT.fullmatch, self._segments)):
+            raise LogDamaged(f"{path} names what is no segment")
 
     @classmethod
     def of(cls, log: Path) -> "Pending | None":

@@ -103,6 +103,8 @@ class Erasure:
     counts: Counter[str] = field(default_factory=Counter)
     """How many detections, keyframes, crops, vectors, refused payloads and messages go, and how
     many events could not be read."""
+    changed: list[Offset] = field(default_factory=list)
+    """The events that change, but for commands."""
     _recordings: list[_Recording] = field(default_factory=list)
     _starts: list[Offset] = field(default_factory=list)
     _commands: dict[Offset, bytes] = field(default_factory=dict)
@@ -249,6 +251,7 @@ class Erasure:
         change, counts = self.decide(event), self.counts
         if change is None:
             return
+        self.changed.append(event.offset)
         if event.is_envelope and change.whole:
             counts["keyframes"] += 1
         elif event.is_envelope:

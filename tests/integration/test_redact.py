@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from eventsrc.base.errors import LogBusy
+from eventsrc.base.errors import LogBusy, LogDamaged
 from eventsrc.envelope.commands import Reembed, encode_command
 from eventsrc.envelope.crops import CROPS_TOPIC, Crop, decode_crop, encode_crop
 from eventsrc.envelope.model import DetId, KeyframeId, RunId, default_det_id
@@ -132,6 +132,8 @@ def test_a_class_is_erased_and_the_log_proves_it(run: Commands, tmp_path: Path) 
     plan = run("log", "redact", "log", "--class", "person", "--dry-run", "--json")
     assert plan.json["detections"] == plan.json["crops"] == len(PEOPLE)
     assert plan.json["keyframes_in_part"] == len(PEOPLE)
+    assert plan.json["segments"] == 3
+    assert "events in 3 segments would change: 14 detections" in plan.err
     assert read_log(log) == before
     people = [person(number) for number in PEOPLE]
     run("edit", "log", "drop-detection", *people, "--reason", "forgotten first")
@@ -278,6 +280,19 @@ def test_misuse_is_one_line(run: Commands) -> None:
     ):
         assert text in run("log", "redact", "log", *words, code=2).err
     assert "no redaction was begun" in run("log", "redact", "log", "--resume").err
+    run("log", "redact", "none", "--run", "a", *WHO, code=2)
+    assert not (run.folder / "none").exists()
+
+
+def test_a_forged_journal_moves_no_other_file(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    write(log, events=1)
+    staging_folder(log).mkdir()
+    (staging_folder(log) / "theirs").write_bytes(b"?")
+    document = {"segments": ["../.redaction/theirs"], "first": 0, "payloads": [], "recorded": 0}
+    (staging_folder(log) / "journal.json").write_text(json.dumps(document))
+    with pytest.raises(LogDamaged, match="names what is no segment"):
+        LogWriter(log)
 
 
 @pytest.mark.seconds

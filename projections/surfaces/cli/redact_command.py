@@ -4,6 +4,7 @@ import contextlib
 import secrets
 import shutil
 import uuid
+from bisect import bisect_right
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -78,10 +79,13 @@ def redact(
     if dry_run:
         with LogReader(log) as reader:
             erasure = _erasure(reader, selection)
-        _say_plan(log, erasure, as_json=json_)
+            bases = [segment.base for segment in reader.segments]
+        hit = {bisect_right(bases, offset) for offset in erasure.changed}
+        _say_plan(log, erasure, len(hit), as_json=json_)
         return
     if not (resume or reason.strip()):
         raise MisuseError("--reason TEXT is missing: say why, for those who read the log later")
+    LogReader(log).close()  # before a writer would make the folder
     databases = None if db is None else Databases(db=db, vector_db=vector_db)
     went_on = _go_on(log, databases)
     if resume:
@@ -126,10 +130,10 @@ def _erase(log: Path, selection: Selection, reason: str, issued_by: str) -> Eras
     with Redactor(log) as redactor:
         with LogReader(log) as reader:
             erasure = _erasure(reader, selection)
+        if not erasure.changed:
+            return None
         salt = secrets.token_bytes(32)
         changes = redactor.stage(erasure.decide, salt)
-        if not changes:
-            return None
         about: dict[str, object] = {
             "redaction_id": erasure.redaction_id,
             "issued_by": issued_by,
@@ -208,10 +212,11 @@ def _counts_text(erasure: Erasure) -> str:
     return ", ".join(parts)
 
 
-def _say_plan(log: Path, erasure: Erasure, *, as_json: bool) -> None:
+def _say_plan(log: Path, erasure: Erasure, segments: int, *, as_json: bool) -> None:
     if as_json:
-        emit(_document(erasure))
-    say(f"{log}: would go: {_counts_text(erasure)}; nothing is changed")
+        emit({**_document(erasure), "segments": segments})
+    events = f"{counted(len(erasure.changed), 'event')} in {counted(segments, 'segment')}"
+    say(f"{log}: {events} would change: {_counts_text(erasure)}; nothing is changed")
     for folder, size in cache_sizes(log):
         say(f"{folder.name}: {size:,} bytes of kept histories and folds would go")
     say(_NOT_REACHED)
