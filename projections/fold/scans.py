@@ -11,7 +11,9 @@
 The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, ends of beams multiples of
 2⁻¹⁶ cells, and for the cells crossed the sensor is at one of `_PARTS`² points of its cell: integers
 from there on. A scan that would make a side of the grid longer than
-`MOST_CELLS` is left out, so that no map has more cells than one may have.
+`MOST_CELLS` is left out, so that no map has more cells than one may have. If more are left out in a
+row than the grid has scans, at most `FIRST_DOUBLING`, it begins anew with the last of them: a robot
+is often somewhere else before it knows where it is.
 """
 
 import math
@@ -82,10 +84,14 @@ class ScannedFloor:
     """The grid of one floor. ``column`` and ``row`` are those of its first cell."""
 
     def __init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
         self.column = self.row = 0
         self.odds: Odds = np.zeros((0, 0), np.int8)
         self.scans = self.scans_at_map = 0
         self.news = self.known = 0
+        self.left_out = 0  # in a row
 
     def cast(self, pose: Pose, scan: StatedScan) -> bool:
         """Add a scan taken at a pose of the robot; False if it is left out, too far away."""
@@ -95,7 +101,12 @@ class ScannedFloor:
         y_um = pose.y_um + metres_to_um(sin * scan.x + cos * scan.y)
         column, row = x_um // CELL_UM, y_um // CELL_UM
         if not self._has_room(column, row):
-            return False
+            self.left_out += 1
+            if self.left_out <= self.scans or self.scans > FIRST_DOUBLING:
+                return False
+            self._begin()
+            self._has_room(column, row)
+        self.left_out = 0
         ranges = scan.ranges()
         angles = (yaw + scan.yaw + scan.angle_min) + np.arange(len(ranges)) * scan.angle_step
         numbers = np.rint(angles * (_DIRECTIONS / _TURN)).astype(np.int64) & (_DIRECTIONS - 1)
@@ -175,7 +186,7 @@ class ScannedFloor:
         return OccupancyMap(None, CELL_UM / UM_PER_M, origin, SCANS, cells, floor)
 
 
-_NUMBERS: Final = ("column", "row", "scans", "scans_at_map", "news", "known")
+_NUMBERS: Final = ("column", "row", "scans", "scans_at_map", "news", "known", "left_out")
 
 
 class Scans:

@@ -221,6 +221,42 @@ def test_a_scan_far_away_is_left_out_rather_than_filling_the_memory() -> None:
     assert "1 scan left out, too far from the first" in state_text(folded.view, None)
 
 
+def cast_at(grid: scans.ScannedFloor, x_um: int) -> bool:
+    return grid.cast(Pose(x_um, 0, 0.0), StatedScan(**scan([1000] * 8)))
+
+
+@pytest.mark.parametrize("wrong", [1, 2, scans.FIRST_DOUBLING])
+def test_a_wrong_beginning_is_given_up_once_more_scans_were_left_out(wrong: int) -> None:
+    km, grid, anew = 10**9, scans.ScannedFloor(), scans.ScannedFloor()
+    assert all(cast_at(grid, km) for _ in range(wrong))
+    assert not any(cast_at(grid, 0) for _ in range(wrong))
+    assert cast_at(grid, 0)
+    assert cast_at(anew, 0)
+    assert np.array_equal(grid.odds, anew.odds)
+    assert (grid.column, grid.scans, grid.left_out) == (anew.column, 1, 0)
+
+
+def test_neither_a_grid_of_many_scans_nor_one_that_goes_on_is_given_up() -> None:
+    many, alternating = scans.ScannedFloor(), scans.ScannedFloor()
+    for _ in range(scans.FIRST_DOUBLING + 1):
+        assert cast_at(many, 0)
+        assert cast_at(alternating, 0)
+        assert not cast_at(alternating, 10**9)
+    assert not any(cast_at(many, 10**9) for _ in range(100))
+    assert many.scans == scans.FIRST_DOUBLING + 1
+
+
+def test_the_map_of_a_run_that_began_a_kilometre_away_is_that_of_the_rest() -> None:
+    wrong = envelope(0, 1000.0, 0.0, map_yaw=0.0, scan=scan([1000] * 8))
+    documents = drive(9)  # of which the second is left out
+    begun = Folded.start(ROOMS).extend([wrong, *documents[1:]])
+    whole = Folded.start(ROOMS).extend(documents[2:])
+    assert begun.view.counts()["scan_too_far"] == 1
+    made, same = (folded.all(MapGiven)[-1].map for folded in (begun, whole))
+    assert np.array_equal(made.cells, same.cells)
+    assert made.origin == same.origin
+
+
 def test_the_largest_map_of_scans_has_no_more_cells_than_a_map_may_have() -> None:
     grid = scans.ScannedFloor()
     open_space = StatedScan(**scan([NO_RETURN_MM] * 8))
