@@ -76,7 +76,9 @@ export const selection = signal<Thing | null>(null);
 export const hovered = signal<Thing | null>(null);
 /** What the search found, as long as its list is open. */
 export const found = signal<readonly Thing[]>([]);
-export const panel = signal<PanelName | null>("why");
+/** On a phone or tablet the map comes first, and the panel when it is asked for. */
+const isNarrow = globalThis.matchMedia?.("(max-width: 900px)").matches ?? false;
+export const panel = signal<PanelName | null>(isNarrow ? null : "why");
 export const compareMode = signal<CompareMode>("moments");
 /** The other moment of a comparison; null until one is chosen. */
 export const compareWith = signal<number | null>(null);

@@ -60,7 +60,7 @@ function Transport() {
           <span class="hidden">Moment: number of events</span>
           <input class="at" inputMode="numeric" value={String(at)} size={7} title="Number of events that the map covers" onChange={(event) => goTo(Number(event.currentTarget.value.replace(/\D/g, "") || at))} />
         </label>
-        <span class="dim">of {(history?.through ?? 0).toLocaleString("en")} events</span>
+        <span class="dim of">of {(history?.through ?? 0).toLocaleString("en")} events</span>
         <Clock />
       </div>
       <MarkLegend />
