@@ -9,11 +9,12 @@ An object is put only if it is not there, read back and compared, and only then 
 the manifest: what no entry names does not count. So an archiver may be killed at any moment, run
 again, or run twice at once. Two archivers of one log put the same bytes.
 
-An entry is replaced in one case: its segment was redacted here, which the head says (`REDACTED`).
+An entry is replaced in one case: its segment was redacted here, which an event says.
 A segment that was *recovered* here is not put in the place of the original, which has more events.
 """
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,10 +32,17 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from . import format as names
 from .durable_files import write_all
 from .lock import is_held
-from .log_identity import cache_folder
+from .reader import LogReader
+from .redact import read_redactions
 from .seal import NO_PREVIOUS, REPLACES, file_sha256
 from .sealed_end import segments_of
-from .sealed_segment import SealedFile, check_sealed
+from .sealed_segment import (
+    ArchivePlace,
+    SealedFile,
+    archive_place,
+    check_sealed,
+    note_archive_place,
+)
 from .verify_events import Kind
 from .writer import LogWriter
 
@@ -42,7 +50,8 @@ FORMAT: Final = 1
 IDENTITY: Final = "archive.json"
 MANIFEST: Final = "manifest/"
 KEPT: Final = "kept/"
-_READERS: Final = 16
+SEGMENTS: Final = "segments/"
+READERS: Final = 16
 """Threads that read small objects: each waits for the network."""
 
 _Natural = Annotated[int, msgspec.Meta(ge=0)]
@@ -84,7 +93,7 @@ class ManifestEntry(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def _object_name(base: int, sha256: str) -> str:
-    return f"segments/{base:020d}-{sha256[:16]}{names.SEALED}"
+    return f"{SEGMENTS}{base:020d}-{sha256[:16]}{names.SEALED}"
 
 
 def _segment_entry(path: Path, base: Offset, sha256: str) -> ManifestEntry:
@@ -140,7 +149,7 @@ class Archive:
         """`entries`, without comparing them to each other."""
         by_name = {each.name: each for each in known}
         listed = list(self.store.sizes(MANIFEST))
-        with ThreadPoolExecutor(_READERS) as pool:
+        with ThreadPoolExecutor(READERS) as pool:
             return list(pool.map(lambda name: by_name.get(name) or self._entry(name), listed))
 
     def _entry(self, name: str) -> ManifestEntry:
@@ -158,6 +167,10 @@ class Archive:
                 f"{place} is of log {entry.log_id}, but the archive of log {self.log_id}"
             )
         return entry
+
+    def entry_at(self, base: int) -> ManifestEntry:
+        """The entry of the segment at ``base``."""
+        return self._entry(f"{MANIFEST}{base:020d}.json")
 
     def kept_files(self) -> dict[str, int]:
         """Names and sizes of the archived files of the kept history."""
@@ -265,6 +278,8 @@ class _Archiver:
     def __init__(self, log: Path, archive: Archive) -> None:
         self._log, self._archive, self._store = log, archive, archive.store
         self._entries = {each.base: each for each in archive.entries()}
+        with LogReader(log) as reader:
+            self._redacted = {each.replaces_sha256 for _, each in read_redactions(reader)}
         self._at: int = FIRST_OFFSET
         self._expected = frozenset({NO_PREVIOUS})
         self._added = self._bytes = self._replaced = 0
@@ -273,10 +288,16 @@ class _Archiver:
         total = len(sealed)
         for number, segment in enumerate(sealed):
             report_progress("archiving", number, total, "segments")
+            if segment.away:
+                continue
             self._skip_to(segment.base)
             entry = self._archived(segment, is_last=number + 1 == total)
             self._at, self._expected = entry.following, entry.successor_names
         report_progress("archiving", total, total, "segments")
+        place = archive_place(self._log)
+        is_other = place is None or (place.url != self._store.url and not place.objects)
+        if is_other and os.access(self._log, os.W_OK):
+            note_archive_place(self._log, ArchivePlace(self._store.url))
         events = max((each.following for each in self._entries.values()), default=0)
         return Archived(
             self._archive.log_id,
@@ -294,7 +315,7 @@ class _Archiver:
             entry = self._entries.get(self._at)
             if entry is None:
                 raise LogDamaged(
-                    f"{self._log}: offsets {self._at} to {base - 1} are neither in the log nor in"
+                    f"{self._log}: offsets {self._at} to {base - 1} are neither here nor in"
                     f" {self._store.url}; run `{advised('log', 'verify', self._log)}`"
                 )
             self._at, self._expected = entry.following, entry.successor_names
@@ -311,7 +332,7 @@ class _Archiver:
         known = self._entries.get(segment.base)
         if known is None:
             return self._add(segment)
-        if known.sha256 in head.get(names.REDACTED, "").split(","):
+        if known.sha256 in self._redacted:
             return self._replace(segment, known)
         if known.sha256 == head.get(REPLACES):
             return known  # recovered here, whole there
@@ -362,18 +383,3 @@ class _Archiver:
             self._store.delete(KEPT + name)
         self._replaced += 1
         return entry
-
-
-def archive_kept(log: Path, store: ObjectStore, files: Sequence[str]) -> int:
-    """Put these files of the kept history of a log, and delete those in the archive that are not
-    among them; returns the number of bytes put."""
-    folder, there = cache_folder(log), Archive(store).kept_files()
-    put = 0
-    for number, name in enumerate(files):
-        report_progress("archiving the kept history", number, len(files), "files")
-        if name not in there and store.put_new(KEPT + name, folder / name):
-            put += (folder / name).stat().st_size
-    report_progress("archiving the kept history", max(len(files), 1), max(len(files), 1), "files")
-    for name in there.keys() - set(files):
-        store.delete(KEPT + name)
-    return put

@@ -1,4 +1,5 @@
-"""Bring a log back from its archive (`eventsrc.log.archive`).
+"""Logs of which segments are away, in an archive only (`eventsrc.log.archive`): let segments go,
+bring them back, and read a log that is here with none of them.
 
 Restoring writes `.sealed.json` first, with the end that the log will have. So a log that is not
 restored to its end is one with missing segments: readers and recorders refuse it by themselves.
@@ -7,23 +8,44 @@ restored to its end is one with missing segments: readers and recorders refuse i
 import contextlib
 import os
 import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
-from eventsrc.base.errors import ArchiveError, LogError, NotALog, ObjectMissing
+import msgspec
+
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog, ObjectMissing
 from eventsrc.base.machine import system_clock
+from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
-from eventsrc.envelope.model import Offset
+from eventsrc.base.text import advised
+from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
-from .archive import KEPT, Archive, ManifestEntry
-from .durable_files import make_directory_durably, replace_durably, sync_file, unlink_quietly
+from .archive import KEPT, READERS, SEGMENTS, Archive, ManifestEntry
+from .durable_files import (
+    delete_durably,
+    make_directory_durably,
+    replace_durably,
+    sync_file,
+    unlink_quietly,
+)
 from .lock import WriterLock
 from .log_identity import cache_folder, make_cache_folder, write_cache_file
 from .seal import file_sha256
-from .sealed_end import SealedEnd, sealed_end, write_sealed_end
+from .sealed_end import SealedEnd, sealed_end, segments_of, write_sealed_end
+from .sealed_segment import (
+    ArchivePlace,
+    SealedFile,
+    archive_place,
+    note_archive_place,
+    stand_in,
+)
 
 _KEPT_NAME: Final = re.compile(r"[0-9a-f]{16}-(?:\d{20}-)?(\d{20})(?:\.\d+)?\.\w+")
 
@@ -39,14 +61,28 @@ class Restored:
     events: int
 
 
-def restore_log(archive: Archive, log: Path, *, until: Offset | None = None) -> Restored:
-    """Bring back the segments that hold the first ``until`` events, all for None, and the kept
-    history of these. A log that was restored in part is restored further. Raises ArchiveError, and
-    LogError if ``log`` is another log or has anything that the archive has not."""
+def restore_log(
+    archive: Archive,
+    log: Path,
+    *,
+    start: Offset = FIRST_OFFSET,
+    until: Offset | None = None,
+) -> Restored:
+    """Bring back the segments with the events from ``start`` to before ``until`` (None: the end),
+    and the kept history; earlier segments are away. A log that was restored in part is restored
+    further, and one that has segments away gets them. Raises ArchiveError, and LogError if ``log``
+    is another log or has anything else that the archive has not."""
     entries = archive.entries()
     if not entries:
         raise ArchiveError(f"{archive.store.url} has no segment yet")
     wanted = [each for each in entries if until is None or each.base < max(until, 1)]
+    here = [each for each in wanted if each.following > start] or wanted[-1:]
+    if _has_away(log, archive):
+        fetched = _bring_back(log, archive, here)
+        end = sealed_end(log)
+        events = wanted[-1].following if end is None else end.following
+        there = len(names.list_growing(log))
+        return Restored(archive.log_id, len(fetched), sum(e.size for e in fetched), there, events)
     _check_target(log, archive, wanted)
     make_directory_durably(log)
     with WriterLock(log, system_clock):
@@ -55,11 +91,180 @@ def restore_log(archive: Archive, log: Path, *, until: Offset | None = None) -> 
         end = SealedEnd(archive.log_id, Offset(last.base), Offset(last.following))
         if sealed_end(log) != end:
             write_sealed_end(log, end)
-        fetched = _fetch_segments(log, archive, wanted)
+        _make_away(log, archive, wanted[: len(wanted) - len(here)])
+        fetched = _fetch_segments(log, archive, here)
     _fetch_kept(log, archive, Offset(last.following))
     return Restored(
         archive.log_id, len(fetched), sum(e.size for e in fetched), len(wanted), last.following
     )
+
+
+def _has_away(log: Path, archive: Archive) -> bool:
+    """Whether a log is whole, but for segments that are away in this archive."""
+    place = archive_place(log) if log.is_dir() else None
+    if place is None or place.url != archive.store.url:
+        return False
+    segments, end = names.list_growing(log), sealed_end(log)
+    is_whole = end is not None and end.base in {each.base for each in segments if each.sealed}
+    return is_whole and any(each.away for each in segments)
+
+
+def _bring_back(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> list[ManifestEntry]:
+    away = {each.base for each in names.list_growing(log) if each.away}
+    fetched = _fetch_segments(log, archive, [each for each in wanted if each.base in away])
+    for each in fetched:
+        delete_durably(_away_path(log, each))
+    return fetched
+
+
+def _away_path(log: Path, entry: ManifestEntry) -> Path:
+    return names.segment_path(log, Offset(entry.base), names.AWAY)
+
+
+def _make_away(log: Path, archive: Archive, entries: Sequence[ManifestEntry]) -> None:
+    """Make files that stand for archived segments which are not here. Where they are is noted
+    first."""
+    place = archive_place(log)
+    noted = {} if place is None or place.url != archive.store.url else dict(place.objects)
+    objects = noted | {_away_path(log, each).name: each.object for each in entries}
+    if place is None or (place.url, place.objects) != (archive.store.url, objects):
+        note_archive_place(log, ArchivePlace(archive.store.url, objects))
+
+    def make(entry: ManifestEntry) -> None:
+        ends = {
+            at: archive.store.part(entry.object, at, end)
+            for at, end in (
+                (0, min(names.HEAD_BYTES, entry.index_at)),
+                (entry.index_at, entry.size),
+            )
+        }
+        stand_in(_away_path(log, entry), entry.size, ends)
+
+    missing = [each for each in entries if not _away_path(log, each).exists()]
+    with ThreadPoolExecutor(READERS) as pool:
+        for number, _ in enumerate(pool.map(make, missing)):
+            report_progress("reading indexes", number, len(missing), "segments")
+    report_progress("reading indexes", max(len(missing), 1), max(len(missing), 1), "segments")
+
+
+_ENTRIES: Final = ".manifest.json"
+
+
+def archived_log(url: str, home: Path) -> Path:
+    """A log in the folder ``home`` that reads an archive: all of its segments are away. What was
+    read of it before is still there, and what was archived or redacted since is taken over."""
+    archive = Archive(ObjectStore(url))
+    log = home.joinpath("archives", *re.findall(r"[^/:]+", archive.store.url))
+    end = sealed_end(log)
+    if end is not None and end.log_id != archive.log_id:
+        _forget(log)
+    make_directory_durably(log)
+    log.chmod(0o700)
+    known = _known_entries(log / _ENTRIES)
+    there = archive.store.sizes(SEGMENTS) if known else {}
+    entries = archive.entries([each for each in known if each.object in there])
+    if not entries:
+        raise ArchiveError(f"{archive.store.url} has no segment yet")
+    if any(each not in entries for each in known):  # redacted since
+        _forget(log)
+        make_directory_durably(log)
+    _make_away(log, archive, entries)
+    last = entries[-1]
+    write_sealed_end(log, SealedEnd(archive.log_id, Offset(last.base), Offset(last.following)))
+    write_cache_file(log / _ENTRIES, partial(_write, msgspec.json.encode(entries)))
+    return log
+
+
+def _known_entries(path: Path) -> list[ManifestEntry]:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=list[ManifestEntry])
+    except (FileNotFoundError, msgspec.MsgspecError):
+        return []
+
+
+def _forget(log: Path) -> None:
+    """Delete what was read of an archive."""
+    for folder in (log, cache_folder(log)):
+        if folder.exists():
+            shutil.rmtree(folder)
+
+
+def fetch_kept(log: Path) -> None:
+    """Bring back the kept history of a log that is read from an archive, if there is one."""
+    last = names.list_growing(log)[-1]
+    place = archive_place(log)
+    if last.away and place is not None:
+        end = sealed_end(log)
+        _fetch_kept(log, Archive(ObjectStore(place.url)), end.following if end else FIRST_OFFSET)
+
+
+class Retained(NamedTuple):
+    """What `retain_log` did: how many segments and bytes went ``away``, and what is still here."""
+
+    away_segments: int
+    away_bytes: int
+    segments: int
+    size_bytes: int
+
+
+def retain_log(
+    log: Path, *, before_ns: int | None = None, keep_bytes: int | None = None
+) -> Retained:
+    """Let the oldest segments go whose events were all logged ``before_ns``, or as many as leave
+    ``keep_bytes`` here; the last sealed segment stays. Each goes only after the archived one, read
+    just now, was equal. Raises LogError, ArchiveError; what is left is whole then."""
+    segments_of(log)
+    place = archive_place(log)
+    if place is None:
+        raise LogError(
+            f"{log} is not archived: run `{advised('log', 'archive', log, 'URL')}` first"
+        )
+    archive = Archive(ObjectStore(place.url))
+    entries = {each.base: each for each in archive.entries()}
+    here = [each for each in names.list_growing(log) if each.sealed and not each.away]
+    size = sum(each.path.stat().st_size for each in here)
+    gone = gone_bytes = 0
+    for number, segment in enumerate(here[:-1]):
+        report_progress("verifying", number, len(here), "segments")
+        length = segment.path.stat().st_size
+        if keep_bytes is not None and size - gone_bytes <= keep_bytes:
+            break
+        if before_ns is not None and _last_logged_ns(segment) >= before_ns:
+            break
+        entry = entries.get(segment.base)
+        if entry is None or file_sha256(segment.path) != entry.sha256:
+            raise ArchiveError(
+                f"{segment.path} is not archived as it is here; run"
+                f" `{advised('log', 'archive', log, place.url)}`"
+            )
+        archive.check(entry)
+        _let_go(log, archive, segment, entry)
+        gone, gone_bytes = gone + 1, gone_bytes + length
+    report_progress("verifying", max(len(here), 1), max(len(here), 1), "segments")
+    return Retained(gone, gone_bytes, len(here) - gone, size - gone_bytes)
+
+
+def _last_logged_ns(segment: names.SegmentPath) -> int:
+    file = SealedFile(segment.path, segment.base)
+    try:
+        return int(file.statistics.message_end_time)
+    finally:
+        file.close()
+
+
+def _let_go(log: Path, archive: Archive, segment: names.SegmentPath, entry: ManifestEntry) -> None:
+    """Replace a segment by a file that stands for it."""
+    place = archive_place(log) or ArchivePlace(archive.store.url)
+    path = _away_path(log, entry)
+    note_archive_place(
+        log, ArchivePlace(archive.store.url, {**place.objects, path.name: entry.object})
+    )
+    file = SealedFile(segment.path, segment.base)
+    try:
+        stand_in(path, entry.size, file.ends())
+    finally:
+        file.close()
+    delete_durably(segment.path)
 
 
 def _check_target(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> None:
@@ -141,3 +346,32 @@ def _fetch_kept(log: Path, archive: Archive, end: Offset) -> None:
 
 def _write(data: bytes, file: BinaryIO) -> None:
     file.write(data)
+
+
+def archive_kept(log: Path, store: ObjectStore, files: Sequence[str]) -> int:
+    """Put these files of the kept history of a log, and delete those in the archive that are not
+    among them; returns the number of bytes put."""
+    folder, there = cache_folder(log), Archive(store).kept_files()
+    put = 0
+    for number, name in enumerate(files):
+        report_progress("archiving the kept history", number, len(files), "files")
+        if name not in there and store.put_new(KEPT + name, folder / name):
+            put += (folder / name).stat().st_size
+    report_progress("archiving the kept history", max(len(files), 1), max(len(files), 1), "files")
+    for name in there.keys() - set(files):
+        store.delete(KEPT + name)
+    return put
+
+
+@contextlib.contextmanager
+def fetched_whole(segment: names.SegmentPath) -> Iterator[Path]:
+    """A file with the bytes of a segment that is away, fetched and compared with the manifest."""
+    place = archive_place(segment.path.parent)
+    if place is None:
+        raise LogDamaged(f"{segment.path}: nothing says where this segment is archived")
+    with tempfile.TemporaryDirectory(prefix="mapfold-") as folder:
+        archive = Archive(ObjectStore(place.url))
+        path = names.segment_path(Path(folder), segment.base, names.SEALED)
+        with path.open("wb") as file:
+            archive.write_checked(archive.entry_at(segment.base), file.fileno())
+        yield path

@@ -2,12 +2,14 @@
 
     00000000000000000000.mcap          sealed: immutable, compressed, indexed
     00000000000000004711.mcap.active   growing, or left over and not sealed yet
+    00000000000000000000.mcap.away     stands for a segment that is in an archive only: `away`
     ….mcap.new / .mcap.sealing         being made; worthless until renamed, safe to delete
     ….mcap.damaged, .mcap.active.damaged   originals that `mapfold log recover` replaced
     ….foreign, ….duplicate                 set aside by it: of another log; events of other segments
     ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
     .ledger.json                       the gap ledger, folded from the events: a cache
+    .archive.json                      where the log is archived: see `away`
     .sealed.json                       how far the log is sealed: see `sealed_end`
 
 A segment is named by its base, the offset of its first event. While a sealed file replaces its
@@ -40,8 +42,6 @@ PREVIOUS = "previous_sha256"
 FOLLOWING = "following"
 """In the head of a sealed segment: the offset after its last event, so that a file that was cut
 tells what is missing."""
-REDACTED = "redacted"
-"""In the head of a redacted segment: the hashes that it had before, separated by commas."""
 MARK_SEED = "mark_seed"
 """In the head of an active segment, in hex: see `mcap_records.encode_mark`."""
 _SEED = re.compile(r"[0-9a-f]{1,8}")
@@ -196,6 +196,7 @@ def _checked_head(metadata: Metadata) -> dict[str, str]:
 
 SEALED = ".mcap"
 ACTIVE = ".mcap.active"
+AWAY = ".mcap.away"
 NEW = ".mcap.new"
 SEALING = ".mcap.sealing"
 DAMAGED = ".damaged"
@@ -205,18 +206,24 @@ MISNAMED = ".misnamed"
 LOCK = "lock"
 LEDGER = ".ledger.json"
 SEALED_END = ".sealed.json"
+ARCHIVE = ".archive.json"
 
-_NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active)")
+_NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active|\.mcap\.away)")
 _MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentPath:
-    """A segment's file, its base offset and whether it is sealed."""
+    """A segment's file, its base offset and whether it is sealed, here or away."""
 
     path: Path
     base: Offset
     sealed: bool
+
+    @property
+    def away(self) -> bool:
+        """Whether the segment is in an archive only, and the file stands for it."""
+        return self.path.name.endswith(AWAY)
 
 
 def segment_path(log: Path, base: Offset, suffix: str) -> Path:
@@ -225,10 +232,12 @@ def segment_path(log: Path, base: Offset, suffix: str) -> Path:
 
 
 def list_segments(log: Path) -> list[SegmentPath]:
-    """The segments of ``log`` in offset order, one for each base."""
+    """The segments of ``log`` in offset order, one for each base: what is here before what is away,
+    sealed before active."""
     found: dict[int, SegmentPath] = {}
     for segment in segment_files(log):
-        if segment.sealed or segment.base not in found:
+        known = found.get(segment.base)
+        if known is None or (segment.sealed and not known.sealed):
             found[segment.base] = segment
     return [found[base] for base in sorted(found)]
 
@@ -252,7 +261,7 @@ def _with_segment_names(log: Path) -> list[SegmentPath]:
     matches = ((entry, _NAME.fullmatch(entry.name)) for entry in log.iterdir())
     return sorted(
         (
-            SegmentPath(entry, Offset(int(m[1])), m[2] == SEALED)
+            SegmentPath(entry, Offset(int(m[1])), m[2] != ACTIVE)
             for entry, m in matches
             if m is not None
         ),

@@ -28,7 +28,7 @@ from .event import Event
 from .format import ACTIVE, SEALED, SegmentPath, list_growing, segment_path
 from .log_identity import mixed_logs_message
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_of
-from .sealed_segment import SealedFile
+from .sealed_segment import SealedFile, open_sealed
 from .segment import ActiveFile, Unreadable, chunk_events
 
 _OPEN_SEGMENTS = 8
@@ -345,7 +345,7 @@ def _open_segment(log: Path, entry: SegmentPath) -> OpenSegment:
         if not entry.sealed:
             with contextlib.suppress(FileNotFoundError):
                 return ActiveFile(entry.path, entry.base)
-        return SealedFile(segment_path(log, entry.base, SEALED), entry.base)
+        return open_sealed(log, entry.base)
     except OSError as error:
         reason = error.strerror or str(error)
         raise LogDamaged(f"{entry.path}: {reason}; check the file and the disk") from error

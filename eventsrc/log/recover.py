@@ -35,7 +35,7 @@ from .rewrite_segments import (
 from .scan import scan_active, scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_left, write_sealed_end
-from .sealed_segment import check_sealed
+from .sealed_segment import check_sealed, refuse_away
 from .segment import Scan
 
 DEFAULT_MAX_LOSSES: Final = 100_000
@@ -89,7 +89,7 @@ def recover_log(log: Path, *, max_losses: int = DEFAULT_MAX_LOSSES) -> RecoveryR
     have held; LogError when the disk fails.
     """
     if not (log.is_dir() and names.half_renamed(log)):
-        segments_left(log)
+        refuse_away(log, segments_left(log))
     try:
         with WriterLock(log, system_clock):
             return _Recovery(log, max_losses).run()

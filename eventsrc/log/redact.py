@@ -52,7 +52,7 @@ from .event import Event, event_hash
 from .lock import WriterLock
 from .reader import LogReader
 from .seal import REPLACES, SegmentPlan, file_sha256, write_sealed
-from .sealed_segment import SealedFile
+from .sealed_segment import SealedFile, refuse_away
 
 MOST_CHANGES: Final = 50_000
 """Bound of the changed events in one event on ``mapfold/redaction``."""
@@ -192,6 +192,7 @@ class Redactor:
         """Write the changed segments; what is changed in each. Afterwards `staging_folder` can be
         read as a log."""
         segments = names.list_segments(self._log)
+        refuse_away(self._log, segments)
         if any(not segment.sealed for segment in segments):
             raise LogError(f"{self._log} has a segment that is not sealed; try again")
         self._folder.mkdir()

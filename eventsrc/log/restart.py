@@ -31,7 +31,7 @@ from .log_identity import common_log_id
 from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from .sealed_end import SealedEnd, note_sealed, sealed_end_of
-from .sealed_segment import SealedFile
+from .sealed_segment import SealedFile, refuse_away
 from .segment import ActiveFile, Scan
 
 
@@ -89,6 +89,7 @@ def restart(log: Path) -> Restart:
     segments = names.list_segments(log)
     common_log_id(segments)
     for segment in [s for s in segments if s.sealed][-1:]:
+        refuse_away(log, [segment])
         SealedFile(segment.path, segment.base).close()  # before anything is changed
     for segment in segments:
         if segment.sealed:

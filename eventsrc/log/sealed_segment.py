@@ -3,22 +3,48 @@
 Summary and seal name every chunk with its first offset and channels, so nothing before a wanted
 event is read. `check_sealed` compares every byte with a checksum: the CRC in DataEnd covers all
 before it, the CRC in the footer the summary and the footer, and the magic ends the file.
+
+A segment that is *away* is in an archive only. A sparse file, `names.AWAY`, stands for it: as long
+as the segment, with its head, seal and summary in their places. So everything but events is read as
+from the segment itself. A chunk is fetched by its range when it is first read, checked by its CRC
+like any other, and written into the file, from which it may go again when these take too much.
+``LOG/.archive.json`` says where: the URL of the archive, and the object of each segment away.
 """
 
+import contextlib
 import hashlib
 import os
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Final
 
-from eventsrc.base.errors import LogDamaged
+import msgspec
+
+from eventsrc.base.errors import LogDamaged, LogError
 from eventsrc.base.machine import crc32
+from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
 from .channels import NO_SCHEMA, is_verbatim
-from .format import end_in, is_metadata_of
+from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
+from .format import (
+    ARCHIVE,
+    AWAY,
+    HEAD_BYTES,
+    SEALED,
+    SEALING,
+    SegmentPath,
+    end_in,
+    is_metadata_of,
+    list_segments,
+    segment_path,
+)
 from .segment import ChunkRef, SegmentFile
 
 SEAL_METADATA = "mapfold.seal"
@@ -51,6 +77,14 @@ class SealedFile(SegmentFile):
         except BaseException:
             self.close()
             raise
+
+    def ends(self) -> dict[int, bytes]:
+        """What is before and behind the chunks, by position: enough for a file to `stand_in`."""
+        head = os.pread(self._fd, min(HEAD_BYTES, self.index_at), 0)
+        return {
+            0: head,
+            self.index_at: os.pread(self._fd, self.size() - self.index_at, self.index_at),
+        }
 
     def channels_of(self, body: bytes) -> dict[int, _mcap.Channel]:  # noqa: ARG002
         """All channels, from the summary."""
@@ -140,6 +174,146 @@ class SealedFile(SegmentFile):
                 indexes, pairwise(edges), strict=True
             )
         ]
+
+
+class ArchivePlace(msgspec.Struct, frozen=True):
+    """Where a log is archived: a URL, and by the name of its file the object of each segment that
+    is away."""
+
+    url: str
+    objects: Mapping[str, str] = msgspec.field(default_factory=dict)
+
+
+def archive_place(log: Path) -> ArchivePlace | None:
+    """Where a log is archived; None if it has never been. Raises LogDamaged, OSError."""
+    try:
+        return msgspec.json.decode((log / ARCHIVE).read_bytes(), type=ArchivePlace)
+    except FileNotFoundError:
+        return None
+    except msgspec.MsgspecError as error:
+        raise LogDamaged(
+            f"{log / ARCHIVE} is not what mapfold writes ({error}); delete it and run"
+            f" `{advised('log', 'archive', log, 'URL')}`"
+        ) from None
+
+
+def refuse_away(log: Path, segments: Sequence[SegmentPath]) -> None:
+    """Raise LogError, with what to do, if one of ``segments`` is away. Raises OSError."""
+    away = [each for each in segments if each.away]
+    if away:
+        place = archive_place(log)
+        url = "URL" if place is None else place.url
+        raise LogError(
+            f"{away[0].path}: this segment is in the archive only;"
+            f" `{advised('log', 'restore', url, log)}` brings it back"
+        )
+
+
+def note_archive_place(log: Path, place: ArchivePlace) -> None:
+    """Write where a log is archived, durably. Raises OSError."""
+    data = msgspec.json.format(msgspec.json.encode(place, order="sorted"), indent=1)
+    stand_in(log / ARCHIVE, len(data), {0: data})
+
+
+def stand_in(path: Path, size: int, parts: Mapping[int, bytes]) -> None:
+    """Write a file of ``size`` bytes durably that has only these ``parts``, by position: for a
+    segment away its head and what is behind its chunks. Raises OSError."""
+    beside = path.with_name(f"{path.name}.{os.getpid()}{SEALING}")
+    unlink_quietly(beside)
+    fd = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+    try:
+        os.ftruncate(fd, size)
+        for at, data in parts.items():
+            os.lseek(fd, at, os.SEEK_SET)
+            write_all(fd, data)
+        sync_file(fd)
+        replace_durably(beside, path)
+    except BaseException:
+        unlink_quietly(beside)
+        raise
+    finally:
+        os.close(fd)
+
+
+FETCHED_BYTES: Final = 1024 * 1024 * 1024
+"""What the fetched chunks of a log may take on the disk."""
+_FETCHED_AT_ONCE: Final = 8
+"""Chunks that one request fetches when they are read in turn: 8 MB before they are compressed."""
+
+
+class AwayFile(SealedFile):
+    """A segment that is away. Its chunks raise ArchiveError when the archive does not answer."""
+
+    def __init__(self, path: Path, base: Offset) -> None:
+        super().__init__(path, base)
+        self._next = -1
+        """The index of the chunk behind those fetched last."""
+
+    def read_chunk(self, chunk: ChunkRef) -> bytes:
+        """The chunk's body, fetched if it is not in the file; LogDamaged if it is wrong there."""
+        with contextlib.suppress(LogDamaged):
+            return super().read_chunk(chunk)
+        start = chunk.position
+        index = bisect_left(self.chunks, start, key=lambda each: each.position)
+        count = _FETCHED_AT_ONCE if index == self._next else 1
+        self._next = min(index + count, len(self.chunks))
+        last = self.chunks[self._next - 1]
+        place, name = self._place()
+        data = _store(place.url).part(name, start, last.position + last.length)
+        try:
+            body = _mcap.read_chunk(lambda n, at: data[at - start :][:n], chunk.length, start)
+        except _mcap.BadRecord as error:
+            raise LogDamaged(f"{place.url}/{name} at byte {start}: {error}") from None
+        self._keep(data, start)
+        return body
+
+    def _place(self) -> tuple[ArchivePlace, str]:
+        place = archive_place(self.path.parent)
+        if place is None or self.path.name not in place.objects:
+            raise LogDamaged(f"{self.path}: {ARCHIVE} does not say where this segment is archived")
+        return place, place.objects[self.path.name]
+
+    def _keep(self, data: bytes, at: int) -> None:
+        """Write a fetched part into the file; where it cannot be written it is fetched again."""
+        with contextlib.suppress(OSError):
+            with self.path.open("r+b") as file:
+                os.pwrite(file.fileno(), data, at)
+            empty_oldest(self.path.parent, but=self.path)
+
+
+def open_sealed(log: Path, base: Offset) -> SealedFile:
+    """The sealed segment at ``base``, here or away: it may have changed since it was listed."""
+    for suffix, kind in ((SEALED, SealedFile), (AWAY, AwayFile)):
+        with contextlib.suppress(FileNotFoundError):
+            return kind(segment_path(log, base, suffix), base)
+    return SealedFile(segment_path(log, base, SEALED), base)
+
+
+@lru_cache(maxsize=8)
+def _store(url: str) -> ObjectStore:
+    return ObjectStore(url)
+
+
+def empty_oldest(log: Path, *, but: Path | None = None) -> None:
+    """While fetched chunks take more than `FETCHED_BYTES`, drop those of the segment that was
+    fetched to longest ago. Raises OSError."""
+    status = {each.path: each.path.stat() for each in list_segments(log) if each.away}
+    taken = sum(each.st_blocks * 512 for each in status.values())
+    for path in sorted(status, key=lambda path: status[path].st_mtime_ns):
+        if taken <= FETCHED_BYTES:
+            return
+        if path != but:
+            taken -= status[path].st_blocks * 512
+            empty(path)
+
+
+def empty(path: Path) -> None:
+    """Drop the chunks of the file that stands for a segment away. Raises OSError, LogError."""
+    file = AwayFile(path, Offset(int(path.name[:20])))
+    try:
+        stand_in(path, file.size(), file.ends())
+    finally:
+        file.close()
 
 
 def sealed_edges(text: str, base: Offset) -> list[Offset]:

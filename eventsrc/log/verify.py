@@ -22,7 +22,8 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import REDACTED_KEY, REDACTION_KEY
 
 from . import format as names
-from .archive import Archive, ManifestEntry, chain_faults
+from .archive import SEGMENTS, Archive, ManifestEntry, chain_faults
+from .away import fetched_whole
 from .event import event_hash
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
@@ -187,6 +188,10 @@ class _Verifier:
             segment = names.SegmentPath(
                 names.segment_path(self._log, segment.base, names.SEALED), segment.base, True
             )
+        if segment.away:
+            with fetched_whole(segment) as path:
+                here = names.SegmentPath(path, segment.base, True)
+                return self._verify_segment(here, reach)
         name = segment.path.name
         if segment.base != self._next_offset:
             last = max(Offset(segment.base - 1), self._next_offset)
@@ -350,7 +355,7 @@ def verify_archive(store: ObjectStore) -> ArchiveVerification:
     archive = Archive(store)
     entries = archive.read_entries()
     found: list[Finding] = []
-    there = store.sizes("segments/")
+    there = store.sizes(SEGMENTS)
     for number, (each, fault) in enumerate(zip(entries, chain_faults(entries), strict=True)):
         report_progress("verifying", number, len(entries), "segments")
         wrong = [fault] if fault is not None else []

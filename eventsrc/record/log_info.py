@@ -23,7 +23,7 @@ from eventsrc.log.channels import carries_envelopes
 from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
-from eventsrc.log.sealed_segment import SealedFile
+from eventsrc.log.sealed_segment import AwayFile, SealedFile, archive_place
 from eventsrc.log.segment import ActiveFile, formats_of
 
 from .gap_history import ledger_of, loss_of
@@ -35,6 +35,7 @@ class SegmentInfo:
 
     ``begun_ns`` is when it was begun, by the clock of the machine that wrote it; None after a
     recovery that could not read it. In an ``imported`` one the log times are those of the drive.
+    One that is ``away`` is in the archive only.
     """
 
     name: str
@@ -44,6 +45,7 @@ class SegmentInfo:
     sealed: bool
     begun_ns: int | None
     imported: bool
+    away: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,8 @@ class LogInfo:
     first_stamp_ns: int | None
     last_stamp_ns: int | None
     formats: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    archive: str | None = None
+    """The URL at which the log was archived last."""
 
 
 @dataclass(slots=True)
@@ -143,6 +147,7 @@ def log_info(path: Path, *, note: Callable[[str], None] | None = None) -> LogInf
             first_stamp_ns=tally.stamps.first,
             last_stamp_ns=tally.stamps.last,
             formats={key: tuple(sorted(tally.formats[key])) for key in sorted(tally.formats)},
+            archive=None if (place := archive_place(path)) is None else place.url,
         )
 
 
@@ -175,6 +180,7 @@ def _count(reader: LogReader, entry: SegmentPath, tally: _Tally) -> SegmentInfo:
         sealed=isinstance(segment, SealedFile),
         begun_ns=int(segment.head[BEGUN]) if BEGUN in segment.head else None,
         imported=IMPORTED in segment.head,
+        away=isinstance(segment, AwayFile),
     )
 
 

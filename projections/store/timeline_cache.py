@@ -149,8 +149,7 @@ class TimelineCache:
         end = max((each for each in self._fold_ends() if each <= limit), default=FIRST_OFFSET)
         parts = self._parts_to(end, "npz")
         paths = [file.path for file in parts] + [self._fold_path(end), self._digest_path(end)]
-        whole = parts and parts[-1].start == FIRST_OFFSET
-        return [path.name for path in paths if whole and path.exists()]
+        return [each.name for each in paths if parts and not parts[-1].start and each.exists()]
 
     def digest_at(self, end: Offset) -> str | None:
         """The digest of the map after ``end`` events; None if it is not cached."""

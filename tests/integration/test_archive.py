@@ -4,6 +4,7 @@ S3, also where the store answers wrongly: then nothing is taken for archived."""
 import hashlib
 import os
 import runpy
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,11 @@ from eventsrc.base.errors import (
     ObjectMissing,
 )
 from eventsrc.base.object_store import ObjectStore
-from eventsrc.log import LogWriter, verify_log
+from eventsrc.envelope.model import Offset
+from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log.archive import Archive, Archived, archive_log
-from eventsrc.log.away import restore_log
+from eventsrc.log.away import archived_log, restore_log, retain_log
+from eventsrc.log.redact import Redactor
 from eventsrc.log.verify import verify_archive
 from projections.fold.semantic_map import SemanticMap
 from tests.integration.test_kept_maps import nothing_is_folded
@@ -32,6 +35,7 @@ from tests.support.buckets import BUCKET, Answer, Fault, Proxy, proxy_of, s3_env
 from tests.support.commands import Commands
 from tests.support.envelopes import envelope, payload
 from tests.support.fixtures_log import KEY, flip
+from tests.support.logs import SAMPLE
 from tests.support.shared_data import ROOT
 
 RECORDED = 60
@@ -310,3 +314,126 @@ def test_what_is_no_url_of_an_archive() -> None:
         with pytest.raises((MisuseError, MapfoldError)) as raised:
             ObjectStore(text)
         assert "abc" not in str(raised.value)
+
+
+def test_an_archive_is_read_by_its_url(log: Path, url: str, tmp_path: Path) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    mapfold("log", "archive", log, url)
+    for words in (("state", "LOG", "--digest"), ("log", "cat", "LOG", "--json"), ("merges", "LOG")):
+        of_log, of_url = ([str(at) if w == "LOG" else w for w in words] for at in (log, url))
+        assert mapfold(*of_url).out == mapfold(*of_log).out
+    assert mapfold("log", "verify", url, "--json").json["findings"] == []
+    info = mapfold("log", "info", url, "--json").json
+    assert [each["away"] for each in info["segments"]] == [True] * SEGMENTS
+    recorded(log, RECORDED, 15)
+    mapfold("log", "archive", log, url)
+    assert mapfold("log", "info", url, "--json").json["events"] == RECORDED + 15
+    (tmp_path / "x.jsonl").write_bytes(payload(envelope(1)))
+    for words in (("log", "recover", url), ("import", url, "x.jsonl")):
+        assert "in the archive only" in mapfold(*words, code=1).err
+    assert "no archive" in mapfold("state", folder_url(tmp_path), code=1).err
+
+
+@pytest.mark.seconds
+def test_reading_takes_what_it_needs_from_the_archive(proxy: Proxy, tmp_path: Path) -> None:
+    log = shutil.copytree(SAMPLE, tmp_path / "log")
+    url = f"s3://{BUCKET}/{tmp_path.name}"
+    archived(log, url)
+    size = sum(path.stat().st_size for path in log.glob("*.mcap"))
+    before = proxy.sent
+    away = archived_log(url, tmp_path / "home")
+    with LogReader(away) as reader:
+        indexes = proxy.sent - before
+        list(reader.read(Offset(10), Offset(11)))
+    assert indexes < size // 2
+    proxy.fault = says_500
+    with LogReader(away) as reader, pytest.raises(ArchiveError, match="500"):
+        list(reader.read())
+    proxy.fault = Proxy().fault
+    with LogReader(away) as reader, LogReader(log) as here:
+        assert list(reader.read()) == list(here.read())
+    whole = proxy.sent
+    with LogReader(archived_log(url, tmp_path / "home")) as reader:
+        list(reader.read())
+    assert proxy.sent - whole < 4_000  # the manifest's names; the rest is here
+
+
+def test_retained_segments_come_back(log: Path, url: str, tmp_path: Path) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    whole, digest = bytes_of(log), mapfold("state", log, "--digest").out
+    assert "not archived" in mapfold("log", "retain", log, "--keep-bytes", "0", code=1).err
+    mapfold("log", "archive", log, url)
+    assert "0 segments" in mapfold("log", "retain", log, "--keep", "30d").err
+    said = mapfold("log", "retain", log, "--keep-bytes", "0", "--json").json
+    assert (said["away_segments"], said["segments"]) == (SEGMENTS - 1, 1)
+    assert len(list(log.glob("*.mcap"))) == 1
+    assert mapfold("state", log, "--digest", "--no-cache").out == digest
+    assert "archive only" in mapfold("log", "info", log).out
+    assert mapfold("log", "verify", log, "--json").json["findings"] == []
+    recorded(log, RECORDED, 15)  # a recorder goes on
+    mapfold("log", "archive", log, url)
+    assert "in the archive only" in mapfold("log", "recover", log, code=1).err
+    with LogWriter(log):  # beside a recorder
+        mapfold("log", "restore", url, log)
+    assert bytes_of(log).items() >= whole.items()
+    assert not list(log.glob("*.away"))
+
+
+def test_nothing_goes_that_the_archive_has_not(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    one = sorted((tmp_path / "an archive" / "segments").iterdir())[1]
+    flip(one, 700)
+    with pytest.raises(ArchiveError, match="the store gives"):
+        retain_log(log, keep_bytes=0)
+    assert len(list(log.glob("*.mcap"))) == SEGMENTS - 1
+    flip(one, 700)
+    flip(min(log.glob("*.mcap")), 700)
+    with pytest.raises(ArchiveError, match="not archived as it is here"):
+        retain_log(log, keep_bytes=0)
+    (tmp_path / "an archive").rename(tmp_path / "unplugged")
+    with pytest.raises(ObjectMissing, match="no such folder"):
+        retain_log(log, keep_bytes=0)
+
+
+def test_a_part_of_a_log_is_restored(log: Path, url: str, tmp_path: Path) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    mapfold("log", "archive", log, url)
+    mapfold("log", "restore", url, "early", "--at", "20")
+    assert mapfold("log", "info", "early", "--json").json["events"] == 32
+    mapfold("log", "restore", url, "late", "--from", "run-a:40")
+    assert len(list((tmp_path / "late").glob("*.mcap"))) == 2
+    assert mapfold("state", "late", "--digest").out == mapfold("state", log, "--digest").out
+    assert (
+        "after --to"
+        in mapfold("log", "restore", url, "x", "--from", "30", "--to", "20", code=2).err
+    )
+    assert bytes_of(tmp_path / "early").items() <= bytes_of(log).items()
+
+
+def test_fetched_chunks_take_no_more_than_allowed(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    away = archived_log(url, tmp_path / "home")
+    with patch("eventsrc.log.sealed_segment.FETCHED_BYTES", 0), LogReader(away) as reader:
+        assert len(list(reader.read())) == RECORDED
+    with LogReader(away) as reader:
+        assert len(list(reader.read())) == RECORDED
+
+
+def test_a_redacted_segment_takes_the_place_of_the_archived_one(
+    log: Path, url: str, tmp_path: Path
+) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    mapfold("log", "archive", log, url)
+    store, before = ObjectStore(url), Archive(ObjectStore(url)).entries()
+    archived_log(url, tmp_path / "home")
+    mapfold("log", "redact", log, "--run", "run-a", "--reason", "a test")
+    assert archived(log, url).replaced_segments == SEGMENTS
+    there = store.sizes("segments/")
+    assert not {each.object for each in before} & set(there)
+    assert verify_archive(store).findings == ()
+    assert archived(log, url).replaced_segments == 0
+    with LogReader(archived_log(url, tmp_path / "home")) as reader, LogReader(log) as here:
+        assert list(reader.read()) == list(here.read())
+    mapfold("log", "retain", log, "--keep-bytes", "0")
+    with Redactor(log) as redactor, pytest.raises(LogError, match="in the archive only"):
+        redactor.stage(lambda _: None, b"salt")

@@ -56,6 +56,7 @@ WITHOUT = {
     "log redact": "tests/integration/test_redact.py",
     "log archive": "tests/integration/test_archive.py",
     "log restore": "tests/integration/test_archive.py",
+    "log retain": "tests/integration/test_archive.py",
     "completion": "reads no log",
     "help": "reads no log",
 }

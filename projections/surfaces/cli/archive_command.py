@@ -1,26 +1,27 @@
-"""`mapfold log archive` and `log restore`: a log in object storage, and back."""
+"""`mapfold log archive`, `log restore`, `log retain`: a log in object storage, and back."""
 
+import re
 from dataclasses import asdict
 from typing import Annotated, Final
 
 import typer
 
 from eventsrc.base.errors import ArchiveError, MapfoldError, MisuseError
+from eventsrc.base.machine import system_clock
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from eventsrc.log.archive import Archive, Archived, archive_kept, archive_log
-from eventsrc.log.away import restore_log
+from eventsrc.log.archive import Archive, Archived, archive_log
+from eventsrc.log.away import archive_kept, restore_log, retain_log
+from eventsrc.log.seek import resolve_start
 from eventsrc.log.verify import verify_archive
-from projections.map.parsing import read_corrections
-from projections.store.history_recorder import HistoryRecorder
-from projections.store.timeline_cache import TimelineCache
 
+from .composition import log_of
 from .event_text import finding_text
-from .folded_log import LogArgument, settings_from
-from .options import JsonOption
+from .folded_log import LogArgument, point, settings_from
+from .options import JsonOption, option
 from .signals import stop_on_signals
 from .terminal import display, emit, finish, say
 
@@ -88,6 +89,10 @@ def _say_archived(log: LogArgument, store: ObjectStore, done: Archived) -> None:
 def _put_fold(log: LogArgument, store: ObjectStore, end: Offset) -> int | None:
     """Archive the kept history of the first ``end`` events under the settings of the log; returns
     the bytes put. A log that cannot be folded is archived without: None."""
+    from projections.map.parsing import read_corrections
+    from projections.store.history_recorder import HistoryRecorder
+    from projections.store.timeline_cache import TimelineCache
+
     try:
         with LogReader(log) as reader:
             corrections = read_corrections(reader, end)
@@ -143,13 +148,32 @@ def _verify(url: str, *, json_: bool) -> None:
     finish(findings=bool(result.findings))
 
 
-def restore(url: UrlArgument, log: LogArgument, json_: JsonOption = False) -> None:
+def restore(
+    url: UrlArgument,
+    log: LogArgument,
+    at: Annotated[str | None, option("W", "Only up to here, by whole segments.", "--at")] = None,
+    from_: Annotated[
+        str, option("W", "From here on; earlier segments stay in the archive only.", "--from")
+    ] = "0",
+    to: Annotated[str, option("W", "As --at.", "--to")] = "end",
+    json_: JsonOption = False,
+) -> None:
     """Bring a log back from its archive, byte for byte, into a new folder.
 
     Killed at any moment, it goes on when run again. It never writes over another log, nor over one
-    that was recorded on.
+    that was recorded on. A log that `mapfold log retain` has thinned out gets its segments back.
     """
-    done = restore_log(Archive(ObjectStore(url)), log)
+    if at is not None and (from_, to) != ("0", "end"):
+        raise MisuseError("--at stands for --from 0 --to W: give one of them")
+    archive = Archive(ObjectStore(url))
+    if (from_, at or to) == ("0", "end"):
+        done = restore_log(archive, log)
+    else:
+        with LogReader(log_of(url)) as reader:
+            start, until = resolve_start(reader, from_), point(reader, at or to)
+        if start > until:
+            raise MisuseError(f"--from {from_} (offset {start}) is after --to {to} ({until})")
+        done = restore_log(archive, log, start=start, until=until)
     if json_:
         emit({"url": url, "path": str(log), **asdict(done)})
         return
@@ -158,3 +182,42 @@ def restore(url: UrlArgument, log: LogArgument, json_: JsonOption = False) -> No
         f"{log}: fetched {fetched}, {done.fetched_bytes:,} bytes; it has"
         f" {counted(done.events, 'event')} in {counted(done.segments, 'segment')}"
     )
+
+
+_DAY_S: Final = 86_400
+_UNITS: Final = {"h": 3_600, "d": _DAY_S, "w": 7 * _DAY_S}
+
+
+def retain(
+    log: LogArgument,
+    keep: Annotated[
+        str | None, option("TIME", "Keep what was logged in this time: 36h, 30d, 8w.")
+    ] = None,
+    keep_bytes: Annotated[
+        int | None, option("N", "Keep the newest segments that take N bytes.", min=0)
+    ] = None,
+    json_: JsonOption = False,
+) -> None:
+    """Delete the oldest segments of a log here, once the archive was compared with them.
+
+    Each is read in the archive just before. The log remembers where they are: what needs one of
+    them fetches what it reads. The last sealed segment stays.
+    """
+    if (keep is None) == (keep_bytes is None):
+        raise MisuseError("say what to keep: --keep 30d, or --keep-bytes N")
+    before_ns = None if keep is None else system_clock() - _seconds(keep) * 1_000_000_000
+    done = retain_log(log, before_ns=before_ns, keep_bytes=keep_bytes)
+    if json_:
+        emit({"path": str(log), **done._asdict()})
+        return
+    say(
+        f"{log}: deleted {counted(done.away_segments, 'segment')}, {done.away_bytes:,} bytes, here;"
+        f" {counted(done.segments, 'sealed segment')}, {done.size_bytes:,} bytes, stay"
+    )
+
+
+def _seconds(text: str) -> int:
+    found = re.fullmatch(r"([0-9]{1,6})([hdw])", text)
+    if found is None:
+        raise MisuseError(f"--keep {text!r} is no time; try 36h, 30d or 8w")
+    return int(found[1]) * _UNITS[found[2]]

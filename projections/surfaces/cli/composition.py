@@ -28,6 +28,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.models import ArgumentInfo
 
+from eventsrc.base.object_store import is_store_url
 from eventsrc.base.text import complete_by, shorten_by
 
 from . import COMMANDS, SECTIONS
@@ -163,12 +164,28 @@ class _GivenPath(type(Path())):  # type: ignore[misc]
         return core_schema.no_info_plain_validator_function(cls)
 
 
+class _GivenLog(_GivenPath):
+    """Makes the path of a log; for the URL of an archive, of a log that reads it."""
+
+    def __new__(cls, text: str | Path) -> Path:  # type: ignore[misc]
+        return log_of(str(text)) if is_store_url(str(text)) else _GivenPath(text)
+
+
+def log_of(url: str) -> Path:
+    """A log that reads the archive at ``url``, in the home of mapfold."""
+    from eventsrc.log.away import archived_log
+    from projections.postgres.embedded import mapfold_home
+
+    return archived_log(url, mapfold_home())
+
+
 def _refuse_empty_paths(command: Callable[..., Any]) -> None:
-    """Make every path of a command a `_GivenPath`."""
+    """Make every path of a command a `_GivenPath`, and that of a log a `_GivenLog`."""
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         if _has_path(parameter.annotation):
             for note in parameter.annotation.__metadata__:
-                note.path_type = _GivenPath
+                is_log = note.metavar == "LOG"
+                note.path_type = _GivenLog if is_log else _GivenPath
 
 
 def _has_path(annotation: Any) -> bool:

@@ -133,6 +133,7 @@ def _info_text(report: LogInfo) -> str:
     begun = [segment.begun_ns for segment in report.segments if segment.begun_ns is not None]
     if begun:
         rows.append(("written", _span(begun[0], begun[-1])))
+    rows += [("archive", report.archive)] if report.archive is not None else []
     rows += [("key", _key_text(key, report)) for key in report.keys]
     rows += [("segment", _segment_text(segment)) for segment in report.segments]
     rows += [
@@ -150,6 +151,7 @@ def _key_text(key: str, report: LogInfo) -> str:
 def _segment_text(segment: SegmentInfo) -> str:
     state = "sealed" if segment.sealed else "active"
     state += ", imported" if segment.imported else ""
+    state += ", in the archive only" if segment.away else ""
     return (
         f"{segment.name}: {counted(segment.events, 'event')}, {segment.size_bytes:,} bytes, {state}"
     )
@@ -321,5 +323,5 @@ def spaces(log: LogArgument, json_: JsonOption = False) -> None:
         display(f"  {name}, dimension {each.dim:,}: {', '.join(parts) or 'none'}")
 
 
-for _command in (archive_command.archive, archive_command.restore):
+for _command in (archive_command.archive, archive_command.restore, archive_command.retain):
     log_commands.command()(_command)
