@@ -211,8 +211,9 @@ def retain_log(
     log: Path, *, before_ns: int | None = None, keep_bytes: int | None = None
 ) -> Retained:
     """Let the oldest segments go whose events were all logged ``before_ns``, or as many as leave
-    ``keep_bytes`` here; the last sealed segment stays. Each goes only after the archived one, read
-    just now, was equal. Raises LogError, ArchiveError; what is left is whole then."""
+    ``keep_bytes`` here; the last sealed segment stays, and what is not archived yet. Each goes only
+    after the archived one, read just now, was equal. Raises LogError, ArchiveError; what is left is
+    whole then."""
     segments_of(log)
     place = archive_place(log)
     if place is None:
@@ -232,7 +233,9 @@ def retain_log(
         if before_ns is not None and _last_logged_ns(segment) >= before_ns:
             break
         entry = entries.get(segment.base)
-        if entry is None or file_sha256(segment.path) != entry.sha256:
+        if entry is None:
+            break  # not archived yet
+        if file_sha256(segment.path) != entry.sha256:
             raise ArchiveError(
                 f"{segment.path} is not archived as it is here; run"
                 f" `{advised('log', 'archive', log, place.url)}`"

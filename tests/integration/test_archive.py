@@ -84,7 +84,7 @@ def url(tmp_path: Path) -> str:
 
 def test_the_same_bytes_come_back(log: Path, url: str, tmp_path: Path) -> None:
     stages = {each[0] for each in reports_of(lambda: archived(log, url))}
-    assert stages == {"archiving"}
+    assert "archiving" in stages
     made = archived(log, folder_url(tmp_path / "another"))
     assert (made.added_segments, made.events, made.not_sealed) == (SEGMENTS, RECORDED, False)
     again = archived(log, url)
