@@ -8,7 +8,7 @@ Which site's map a question is from is found by asking the databases of all site
 Scores of places cannot be compared across maps: they are shares of one map's poses. The two
 probabilities of an answer can, as each map calibrates them: `known`, that it has the things shown,
 and `confidence`, that the pose found is right. Their logits are the evidence for a map against
-"none of them" (docs/decisions/which-building.md). The prior is equal for all sites; that of "none"
+"none of them" (docs/decisions/relocalization.md). The prior is equal for all sites; that of "none"
 is its share in the questions that the weights were fitted on.
 """
 
