@@ -11,7 +11,7 @@ without a traceback, and exits with ``exit_code``.
     │   ├── LogBusy                 1  another writer holds it
     │   └── LogDamaged              1  recorded events cannot be read
     ├── ArchiveError                1  an archive of a log cannot be used as asked
-    │   └── ObjectMissing           1  nothing is there under that name
+    │   └── NoSuchObject            1  nothing is there under that name
     ├── InvalidEnvelope             1  a payload is not an envelope; the message is the reason
     └── TransportError              1  Zenoh cannot connect, listen or send
         └── SpoolError              1  a robot's spool cannot be used
@@ -61,7 +61,7 @@ class ArchiveError(MapfoldError):
     """An archive of a log cannot be used as asked, or its store does not answer."""
 
 
-class ObjectMissing(ArchiveError):
+class NoSuchObject(ArchiveError):
     """A store has no such object, or there is no such store."""
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
-from .errors import ArchiveError, MisuseError, ObjectMissing
+from .errors import ArchiveError, MisuseError, NoSuchObject
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, RetryConfig
@@ -48,7 +48,7 @@ def is_store_url(text: str) -> bool:
 
 
 class ObjectStore:
-    """The objects under a URL. Its methods raise ArchiveError, and ObjectMissing for an object that
+    """The objects under a URL. Its methods raise ArchiveError, and NoSuchObject for an object that
     is not there. With ``make`` a missing folder is made.
     """
 
@@ -64,7 +64,7 @@ class ObjectStore:
         if parts.scheme == "file":
             self._folder = _folder(url, parts.netloc, parts.path)
             if not make and not self._folder.is_dir():
-                raise ObjectMissing(f"{self.url}: there is no such folder; check the URL")
+                raise NoSuchObject(f"{self.url}: there is no such folder; check the URL")
         try:
             import obstore
             from obstore import exceptions, store
@@ -135,7 +135,7 @@ class ObjectStore:
 
     def delete(self, name: str) -> None:
         """Delete an object, which may be missing."""
-        with contextlib.suppress(ObjectMissing), self._told(name):
+        with contextlib.suppress(NoSuchObject), self._told(name):
             self._library.delete(self._store, name)
 
     def _sync(self, name: str) -> None:
@@ -154,7 +154,7 @@ class ObjectStore:
         try:
             yield
         except FileNotFoundError:
-            raise ObjectMissing(
+            raise NoSuchObject(
                 f"{place}: there is no such object or bucket; check the URL"
             ) from None
         except (self._errors.PermissionDeniedError, self._errors.UnauthenticatedError) as error:

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
-from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, ObjectMissing
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NoSuchObject
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.base.text import advised
@@ -124,8 +124,8 @@ class Archive:
             identity: Any = msgspec.json.decode(store.read(IDENTITY))
             self.log_id = str(identity["log_id"])
             known = identity["format"] == FORMAT
-        except ObjectMissing:
-            raise ObjectMissing(
+        except NoSuchObject:
+            raise NoSuchObject(
                 f"{store.url}: there is no archive of a log; check the URL"
             ) from None
         except (msgspec.MsgspecError, KeyError, TypeError):

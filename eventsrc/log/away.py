@@ -19,7 +19,7 @@ from typing import BinaryIO, Final, NamedTuple
 
 import msgspec
 
-from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog, ObjectMissing
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NoSuchObject, NotALog
 from eventsrc.base.machine import system_clock
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
@@ -342,7 +342,7 @@ def _fetch_kept(log: Path, archive: Archive, end: Offset) -> None:
         if found is None or int(found[1]) > end or (path.exists() and path.stat().st_size == size):
             continue
         make_cache_folder(log)
-        with contextlib.suppress(ObjectMissing):
+        with contextlib.suppress(NoSuchObject):
             data = archive.store.read(KEPT + name)
             write_cache_file(path, partial(_write, data))
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog, ObjectMissing
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NoSuchObject, NotALog
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.base.text import advised, counted, visible
@@ -378,7 +378,7 @@ def _archived_faults(archive: Archive, entry: ManifestEntry) -> Iterator[tuple[K
     try:
         archive.check(entry)
         head = archive.head_of(entry)
-    except ObjectMissing as error:
+    except NoSuchObject as error:
         yield "gap", str(error)
     except (ArchiveError, LogDamaged, NotALog) as error:
         yield "crc", str(error)

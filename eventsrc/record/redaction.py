@@ -42,7 +42,6 @@ from eventsrc.envelope.system_events import (
 )
 from eventsrc.log import Event, LogReader, VerbatimEvent
 from eventsrc.log.redact import Change
-from eventsrc.ros.derivation import read_recording
 
 from .importers.sources import SHOW_NOTHING
 
@@ -128,6 +127,8 @@ class Erasure:
         return found
 
     def _begin_recording(self, event: Event) -> None:
+        from eventsrc.ros.derivation import read_recording  # here: few logs have messages of ROS
+
         try:
             streams = read_recording(event.payload).streams
         except ValidationError:

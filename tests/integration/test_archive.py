@@ -17,8 +17,8 @@ from eventsrc.base.errors import (
     LogError,
     MapfoldError,
     MisuseError,
+    NoSuchObject,
     NotALog,
-    ObjectMissing,
 )
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.envelope.model import Offset
@@ -232,7 +232,7 @@ def test_nothing_is_put_over_an_object(place: str, url: str, proxy: Proxy, tmp_p
     assert store.sizes("a/") == {"a/b": 5}
     store.delete("a/b")
     store.delete("a/b")
-    with pytest.raises(ObjectMissing, match="no such object"):
+    with pytest.raises(NoSuchObject, match="no such object"):
         store.read("a/b")
 
 
@@ -391,7 +391,7 @@ def test_nothing_goes_that_the_archive_has_not(log: Path, url: str, tmp_path: Pa
     with pytest.raises(ArchiveError, match="not archived as it is here"):
         retain_log(log, keep_bytes=0)
     (tmp_path / "an archive").rename(tmp_path / "unplugged")
-    with pytest.raises(ObjectMissing, match="no such folder"):
+    with pytest.raises(NoSuchObject, match="no such folder"):
         retain_log(log, keep_bytes=0)
 
 

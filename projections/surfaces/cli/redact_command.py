@@ -24,9 +24,9 @@ from .options import Databases, JsonOption, LiveDbOption, VectorsOption, option,
 from .terminal import emit, say
 
 _NOT_REACHED: Final = (
-    "not reached: exports, pictures and copies made before; archives and backups; spools of robots;"
-    " programs that read the log now, until they are started again; blocks of the disk that the old"
-    " files had"
+    "not reached: exports, pictures and copies made before; archives, until `log archive` is run"
+    " again; backups; spools of robots; programs that read the log now, until they are started"
+    " again; blocks of the disk that the old files had"
 )
 
 
