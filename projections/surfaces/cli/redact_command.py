@@ -228,5 +228,5 @@ def _left(log: Path, db: str | None) -> Iterator[str]:
     if aside:
         yield f"{log}: {', '.join(aside)} may hold it; delete them"
     if db is None:
-        yield "databases have it until they are rebuilt: --db URL does so, as `mapfold replay` does"
+        yield "databases have it until they are rebuilt; --db URL does so"
     yield _NOT_REACHED
