@@ -6,6 +6,7 @@ restored to its end is one with missing segments: readers and recorders refuse i
 """
 
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -154,7 +155,8 @@ def archived_log(url: str, home: Path) -> Path:
     """A log in the folder ``home`` that reads an archive: all of its segments are away. What was
     read of it before is still there, and what was archived or redacted since is taken over."""
     archive = Archive(ObjectStore(url))
-    log = home.joinpath("archives", *re.findall(r"[^/:]+", archive.store.url))
+    named = hashlib.sha256(archive.store.url.encode()).hexdigest()[:16]  # no part of it is a path
+    log = home / "archives" / named
     end = sealed_end(log)
     if end is not None and end.log_id != archive.log_id:
         _forget(log)

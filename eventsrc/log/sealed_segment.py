@@ -24,7 +24,7 @@ from typing import Final
 
 import msgspec
 
-from eventsrc.base.errors import LogDamaged, LogError
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError
 from eventsrc.base.machine import crc32
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.text import advised
@@ -259,7 +259,12 @@ class AwayFile(SealedFile):
         self._next = min(index + count, len(self.chunks))
         last = self.chunks[self._next - 1]
         place, name = self._place()
-        data = _store(place.url).part(name, start, last.position + last.length)
+        try:
+            data = _store(place.url).part(name, start, last.position + last.length)
+        except ArchiveError as error:
+            raise type(error)(
+                f"{self.path}: this segment is in the archive only: {error}"
+            ) from None
         try:
             body = _mcap.read_chunk(lambda n, at: data[at - start :][:n], chunk.length, start)
         except _mcap.BadRecord as error:

@@ -43,8 +43,6 @@ from eventsrc.envelope.system_events import (
 from eventsrc.log import Event, LogReader, VerbatimEvent
 from eventsrc.log.redact import Change
 
-from .importers.sources import SHOW_NOTHING
-
 REDACTED_FIELD: Final = "redacted_detections"
 _PICTURES: Final = (CROP_SCHEMA, "sensor_msgs/msg/Image")
 
@@ -54,14 +52,15 @@ class Selection:
     """What is to be erased. Of several kinds of names each must fit; of one kind any.
 
     ``classes`` are recorded classes, or names of labels. ``before_ns`` compares with stamps of
-    keyframes, and of other messages with their log times. With ``crops_only`` pictures go, and
-    nothing else.
+    keyframes, and of other messages with their log times; ``before`` is the time as given. With
+    ``crops_only`` pictures go, and nothing else.
     """
 
     det_ids: frozenset[str] = frozenset()
     runs: frozenset[str] = frozenset()
     classes: frozenset[str] = frozenset()
     before_ns: int | None = None
+    before: str = ""
     crops_only: bool = False
 
     def __bool__(self) -> bool:
@@ -75,7 +74,7 @@ class Selection:
     def __str__(self) -> str:
         named = (("det", self.det_ids), ("run", self.runs), ("class", self.classes))
         parts = [f"{name} {', '.join(sorted(names))}" for name, names in named if names]
-        parts += [] if self.before_ns is None else [f"before {self.before_ns} ns"]
+        parts += [] if self.before_ns is None else [f"before {self.before}"]
         parts += ["crops only"] if self.crops_only else []
         return "; ".join(parts)[:2_000]
 
@@ -245,6 +244,8 @@ class Erasure:
             return False
         all_runs_go = by.takes_keyframes and self._recordings[at].runs <= by.runs
         early = by.before_ns is None or event.logged_ns < by.before_ns
+        from .importers.sources import SHOW_NOTHING  # here: few logs have messages of ROS
+
         return early and (all_runs_go or schema not in SHOW_NOTHING)
 
     def _count(self, event: Event) -> None:

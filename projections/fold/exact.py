@@ -236,7 +236,9 @@ def unit_rows(rows: NDArray[np.floating]) -> NDArray[np.float64]:
     scaled *= np.ldexp(1.0, _component_bits(dim) - exponents)[:, np.newaxis]
     np.rint(scaled, out=scaled)
     scaled *= (UNIT / np.sqrt(squared_norms(scaled)))[:, np.newaxis]
-    return np.rint(scaled, out=scaled)
+    np.rint(scaled, out=scaled)
+    scaled += 0.0  # makes -0.0 the 0.0 that an integer is
+    return scaled
 
 
 def squared_norms(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -335,6 +335,17 @@ def test_an_archive_is_read_by_its_url(log: Path, url: str, tmp_path: Path) -> N
 
 
 @pytest.mark.seconds
+def test_no_url_leads_out_of_the_folder_of_archives(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    victim = tmp_path / "an archive"
+    home = tmp_path / "a" / "b" / "c" / "home"
+    before = {each: each.read_bytes() for each in victim.rglob("*") if each.is_file()}
+    there = archived_log("file:///" + "../" * 9 + str(victim).lstrip("/"), home)
+    assert there.parent == home / "archives"
+    assert {each: each.read_bytes() for each in victim.rglob("*") if each.is_file()} == before
+    assert archived_log(f"{url}/../an archive", home).parent == home / "archives"
+
+
 def test_reading_takes_what_it_needs_from_the_archive(proxy: Proxy, tmp_path: Path) -> None:
     log = shutil.copytree(SAMPLE, tmp_path / "log")
     url = f"s3://{BUCKET}/{tmp_path.name}"

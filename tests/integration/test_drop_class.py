@@ -134,7 +134,7 @@ def test_it_is_said_once_and_later_recordings_obey(tmp_path: Path) -> None:
         payload(envelope(5, detections=[detection("0", PERSON, note="4f2c.5")]))
     )
     said = run("import", "log", "1.jsonl", "--drop-class", "person", "--json")
-    assert "detections of person are not stored, as this log says" in said.err
+    assert "detections of person are not stored in this log" in said.err
     assert "1 detection dropped by class" in said.err
     assert said.json["dropped"] == {"detections": 1, "crops": 0}
     run("import", "log", "unnamed.jsonl")

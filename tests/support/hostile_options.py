@@ -12,7 +12,7 @@ _NO_DATABASE = "postgresql://127.0.0.1:1/none"
 _NO_ADDRESS = "203.0.113.1"
 VALUES = (
     *("", " ", "-", "-1", "0", "1e400", "nan", "9" * 5_000, "a" * 5_000, "é" * 200),
-    *("fifo", "file", "none/none", "=", ":", "..", "a=b", "1,,2", "0x0", "*/**", "a\n\x1b[2J"),
+    *("fifo", "file", "none/none", "=", ":", "..", "a=b", "1,,2", "1x0", "*/**", "a\n\x1b[2J"),
     b"\xff".decode(errors="surrogateescape"),
 )
 """``fifo`` and ``file`` are made by `prepared`."""

@@ -212,7 +212,8 @@ def retain(
         return
     say(
         f"{log}: deleted {counted(done.away_segments, 'segment')}, {done.away_bytes:,} bytes, here;"
-        f" {counted(done.segments, 'sealed segment')}, {done.size_bytes:,} bytes, stay"
+        f" {counted(done.segments, 'sealed segment')}, {done.size_bytes:,} bytes, kept; the last"
+        " one stays whatever its age"
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import ValidationError
 
@@ -24,7 +24,6 @@ from eventsrc.envelope.model import FIRST_OFFSET, MAX_ID_LENGTH, Offset
 from eventsrc.envelope.system_events import COMMAND_KEY, DROP_KEY
 from eventsrc.log import LogReader, LogWriter
 from eventsrc.record.append import dropped_classes
-from eventsrc.record.importers.known_log import LogCommands
 from projections.fold.corrections import RecordedCommand, compile_corrections
 from projections.fold.map_errors import FoldError
 from projections.fold.presets import PRESETS
@@ -35,6 +34,9 @@ from projections.map.state_output import camera_advice
 from .folded_log import NamedSettings, complete_preset
 from .options import option, user_at_host
 from .terminal import say
+
+if TYPE_CHECKING:
+    from eventsrc.record.importers.known_log import LogCommands
 
 ROS_PRESET: Final = "full"
 _ROS_REASON: Final = "the preset of ROS input"
@@ -208,7 +210,7 @@ class LogStart:
         """What leaves out the classes that the log drops."""
         return ClassDropper(self.dropped, compile_corrections(self.commands).labels)
 
-    def for_import(self) -> LogCommands:
+    def for_import(self) -> "LogCommands":
         """The same for an importer."""
         document = None if self.known is None else self.known.model_dump(mode="json")
         if self.command is not None:
@@ -216,6 +218,8 @@ class LogStart:
         labels = compile_corrections(self.commands).labels
         given = [recorded.command for recorded in self.commands]
         dropped = self.drops, self.dropped
+        from eventsrc.record.importers.known_log import LogCommands  # here: it loads all importers
+
         return LogCommands(self.command, document, labels, given, self._differs, *dropped)
 
     def _differs(self, here: Mapping[str, object] | None, there: Mapping[str, object]) -> str:
@@ -261,7 +265,7 @@ class LogStart:
         Also where ROS goes into a log that says nothing. And one on the classes that it drops."""
         if self.dropped:
             named = ", ".join(sorted(self.dropped))
-            say(visible(f"{self.log}: detections of {named} are not stored, as this log says"))
+            say(visible(f"{self.log}: detections of {named} are not stored in this log"))
         if self.command is not None:
             named = " ".join(self.options.words()) or f"--preset {ROS_PRESET}, for input of ROS"
             say(visible(f"{self.log}: a new log with {named}, said at offset 0"))

@@ -114,8 +114,10 @@ def _selection(
     before_ns = None if before is None else time_of(before)
     if before is not None and before_ns is None:
         raise MisuseError(f"--before {visible(before)[:80]}: give an ISO time, as 2026-03-24")
+    if not all(name.strip() for names in (det, run, class_) for name in names or ()):
+        raise MisuseError("an empty --det, --run or --class names nothing; leave it out")
     det_ids, runs, classes = (frozenset(each or ()) for each in (det, run, class_))
-    return Selection(det_ids, runs, classes, before_ns, crops_only)
+    return Selection(det_ids, runs, classes, before_ns, before or "", crops_only)
 
 
 def _erasure(reader: LogReader, selection: Selection) -> Erasure:
