@@ -137,6 +137,8 @@ class ObjectStore:
         """Delete an object, which may be missing."""
         with contextlib.suppress(NoSuchObject), self._told(name):
             self._library.delete(self._store, name)
+            if self._folder is not None:
+                _sync((self._folder / name).parent)
 
     def _sync(self, name: str) -> None:
         """Bring an object in a folder to the disk, which the library leaves to the system."""

@@ -54,6 +54,11 @@ SEGMENTS: Final = "segments/"
 READERS: Final = 16
 """Threads that read small objects: each waits for the network."""
 
+
+class NothingSealed(LogError):
+    """A log has no sealed segment yet."""
+
+
 _Natural = Annotated[int, msgspec.Meta(ge=0)]
 _Sha256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
@@ -251,7 +256,7 @@ def _archive_sealed(log: Path, store: ObjectStore) -> Archived:
     segments = names.list_growing(log)
     sealed = [each for each in segments if each.sealed]
     if not sealed:
-        raise LogError(f"{log} has no sealed segment yet: there is nothing to archive")
+        raise NothingSealed(f"{log} has no sealed segment yet: there is nothing to archive")
     log_id = names.head_of(sealed[0].path, sealed[0].base)["log_id"]
     identity = msgspec.json.format(msgspec.json.encode({"format": FORMAT, "log_id": log_id}))
     store.put_new(IDENTITY, identity + b"\n")
@@ -279,7 +284,7 @@ class _Archiver:
         self._log, self._archive, self._store = log, archive, archive.store
         self._entries = {each.base: each for each in archive.entries()}
         with LogReader(log) as reader:
-            self._redacted = {each.replaces_sha256 for _, each in read_redactions(reader)}
+            self._redacted = {each.base for _, each in read_redactions(reader)}
         self._at: int = FIRST_OFFSET
         self._expected = frozenset({NO_PREVIOUS})
         self._added = self._bytes = self._replaced = 0
@@ -294,6 +299,7 @@ class _Archiver:
             entry = self._archived(segment, is_last=number + 1 == total)
             self._at, self._expected = entry.following, entry.successor_names
         report_progress("archiving", total, total, "segments")
+        self._delete_redacted()
         place = archive_place(self._log)
         is_other = place is None or (place.url != self._store.url and not place.objects)
         if is_other and os.access(self._log, os.W_OK):
@@ -332,7 +338,7 @@ class _Archiver:
         known = self._entries.get(segment.base)
         if known is None:
             return self._add(segment)
-        if known.sha256 in self._redacted:
+        if segment.base in self._redacted and file_sha256(segment.path) != known.sha256:
             return self._replace(segment, known)
         if known.sha256 == head.get(REPLACES):
             return known  # recovered here, whole there
@@ -376,10 +382,20 @@ class _Archiver:
     def _replace(self, segment: names.SegmentPath, known: ManifestEntry) -> ManifestEntry:
         """Put a redacted segment, and delete the archived one and what was folded from it."""
         entry = self._put(segment)
+        for name in self._archive.kept_files():
+            self._store.delete(KEPT + name)
         self._store.replace(entry.name, entry.encoded())
         self._entries[entry.base] = entry
         self._store.delete(known.object)
-        for name in self._archive.kept_files():
-            self._store.delete(KEPT + name)
         self._replaced += 1
         return entry
+
+    def _delete_redacted(self) -> None:
+        """Delete what an archiver that was killed in `_replace` left."""
+        if not self._redacted:
+            return
+        named = {each.object for each in self._entries.values()}
+        redacted = tuple(f"{SEGMENTS}{base:020d}-" for base in self._redacted)
+        for name in self._store.sizes(SEGMENTS).keys() - named:
+            if name.startswith(redacted):
+                self._store.delete(name)

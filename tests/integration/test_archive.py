@@ -1,6 +1,7 @@
 """`mapfold log archive` and `log restore`: the same bytes back, from a folder and from a server of
 S3, also where the store answers wrongly: then nothing is taken for archived."""
 
+import contextlib
 import hashlib
 import os
 import runpy
@@ -8,6 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -448,3 +450,27 @@ def test_a_redacted_segment_takes_the_place_of_the_archived_one(
     mapfold("log", "retain", log, "--keep-bytes", "0")
     with Redactor(log) as redactor, pytest.raises(LogError, match="in the archive only"):
         redactor.stage(lambda _: None, b"salt")
+
+
+@pytest.mark.parametrize("call", ["put_new", "replace", "delete"])
+def test_an_archiver_killed_while_it_replaces_leaves_nothing_redacted(
+    call: str, log: Path, url: str, tmp_path: Path
+) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    mapfold("log", "archive", log, url)
+    before = {each.object for each in Archive(ObjectStore(url)).entries()}
+    mapfold("log", "redact", log, "--run", "run-a", "--reason", "a test")
+    real = getattr(ObjectStore, call)
+    for calls in range(4):
+        done = iter([*range(calls)])
+
+        def killed(*given: Any, done: Iterator[int] = done, **more: Any) -> Any:
+            if next(done, None) is None:
+                raise KeyboardInterrupt
+            return real(*given, **more)
+
+        with patch.object(ObjectStore, call, killed), contextlib.suppress(KeyboardInterrupt):
+            archived(log, url)
+    archived(log, url)
+    assert not before & ObjectStore(url).sizes("segments/").keys()
+    assert verify_archive(ObjectStore(url)).unnamed == ()

@@ -13,7 +13,7 @@ from eventsrc.base.progress import report_progress
 from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
-from eventsrc.log.archive import Archive, Archived, archive_log
+from eventsrc.log.archive import Archive, Archived, NothingSealed, archive_log
 from eventsrc.log.away import archive_kept, restore_log, retain_log
 from eventsrc.log.seek import resolve_start
 from eventsrc.log.verify import verify_archive
@@ -125,6 +125,8 @@ def _follow(log: LogArgument, store: ObjectStore, *, fold: bool) -> None:
                 if fold and (done.events > folded + folded // 10 or done.replaced_segments):
                     _put_fold(log, store, Offset(done.events))
                     folded = Offset(done.events)
+                pause_s = _POLL_S
+            except NothingSealed:
                 pause_s = _POLL_S
             except ArchiveError as error:
                 pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)

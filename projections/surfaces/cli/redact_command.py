@@ -14,6 +14,7 @@ import typer
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.text import counted, visible
 from eventsrc.log import LogReader, LogWriter, cache_folder, cache_sizes
+from eventsrc.log.durable_files import sync_directory
 from eventsrc.log.redact import Pending, Redactor, end_of, redactions_of, staging_folder
 from eventsrc.log.seek import time_of
 from eventsrc.record.gap_history import delete_ledger
@@ -90,6 +91,8 @@ def redact(
     went_on = _go_on(log, databases)
     if resume:
         say(f"{log}: {'finished what was begun' if went_on else 'no redaction was begun'}")
+        for line in _left(log, db) if went_on else ():
+            say(line)
         return
     erased = _erase(log, selection, reason, issued_by or user_at_host())
     if erased is None:
@@ -178,6 +181,7 @@ def _go_on(log: Path, databases: Databases | None) -> bool:
     delete_ledger(log)
     with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(cache_folder(log))
+    sync_directory(cache_folder(log).parent)
     if databases is not None:
         _rebuild(log, databases)
     pending.finish()
