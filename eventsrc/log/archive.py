@@ -299,7 +299,8 @@ class _Archiver:
             entry = self._archived(segment, is_last=number + 1 == total)
             self._at, self._expected = entry.following, entry.successor_names
         report_progress("archiving", total, total, "segments")
-        self._delete_redacted()
+        if self._redacted:
+            self._delete_redacted()
         place = archive_place(self._log)
         is_other = place is None or (place.url != self._store.url and not place.objects)
         if is_other and os.access(self._log, os.W_OK):
@@ -392,8 +393,6 @@ class _Archiver:
 
     def _delete_redacted(self) -> None:
         """Delete what an archiver that was killed in `_replace` left."""
-        if not self._redacted:
-            return
         named = {each.object for each in self._entries.values()}
         redacted = tuple(f"{SEGMENTS}{base:020d}-" for base in self._redacted)
         for name in self._store.sizes(SEGMENTS).keys() - named:

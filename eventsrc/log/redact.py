@@ -61,14 +61,14 @@ _JOURNAL: Final = "journal.json"
 _UNFINISHED: Final = "journal.new"
 
 
-class Change(NamedTuple):
+class Rewritten(NamedTuple):
     """What an event becomes: its new ``payload``, or if it is ``whole`` gone a tombstone."""
 
     payload: bytes
     whole: bool = False
 
 
-Decide = Callable[[Event], Change | None]
+Decide = Callable[[Event], Rewritten | None]
 """What an event becomes; None if it stays as it is."""
 
 

@@ -262,9 +262,7 @@ class AwayFile(SealedFile):
         try:
             data = _store(place.url).part(name, start, last.position + last.length)
         except ArchiveError as error:
-            raise type(error)(
-                f"{self.path}: this segment is in the archive only: {error}"
-            ) from None
+            raise type(error)(f"{self.path} is in the archive only: {error}") from None
         try:
             body = _mcap.read_chunk(lambda n, at: data[at - start :][:n], chunk.length, start)
         except _mcap.BadRecord as error:
@@ -365,8 +363,7 @@ def _check(path: Path) -> FileCheck:
             return FileCheck("", fault)  # damaged, so its hash does not matter
         data_end_at = summary_start - _DATA_END_BYTES
         sha256 = hashlib.sha256()
-        crc = 0
-        at = 0
+        crc = at = 0
         while block := file.read(_BLOCK):
             sha256.update(block)
             crc = crc32(block[: max(0, data_end_at - at)], crc)
@@ -389,9 +386,8 @@ def _summary_start(tail: bytes, size: int) -> tuple[int, str | None]:
 
 
 def _data_end_fault(fd: int, at: int, crc: int) -> str | None:
-    if os.pread(fd, _DATA_END_BYTES, at) != _mcap.encode(_mcap.DataEnd(crc)):
-        return "the data section does not match its CRC"
-    return None
+    is_right = os.pread(fd, _DATA_END_BYTES, at) == _mcap.encode(_mcap.DataEnd(crc))
+    return None if is_right else "the data section does not match its CRC"
 
 
 def _summary_fault(fd: int, start: int, size: int, tail: bytes) -> str | None:

@@ -41,7 +41,7 @@ from eventsrc.envelope.system_events import (
     decode_embeddings,
 )
 from eventsrc.log import Event, LogReader, VerbatimEvent
-from eventsrc.log.redact import Change
+from eventsrc.log.redact import Rewritten
 
 REDACTED_FIELD: Final = "redacted_detections"
 _PICTURES: Final = (CROP_SCHEMA, "sensor_msgs/msg/Image")
@@ -163,7 +163,7 @@ class Erasure:
             )
         ]
 
-    def decide(self, event: Event) -> Change | None:
+    def decide(self, event: Event) -> Rewritten | None:
         """What an event becomes; None if it stays."""
         if isinstance(event, VerbatimEvent):
             return self._tombstone(event) if self._shows(event) else None
@@ -176,13 +176,13 @@ class Erasure:
         if event.key == EMBEDDINGS_KEY:
             return self._of_embeddings(event)
         corrected = self._commands.get(event.offset)
-        return None if corrected is None else Change(corrected)
+        return None if corrected is None else Rewritten(corrected)
 
-    def _tombstone(self, event: Event) -> Change:
+    def _tombstone(self, event: Event) -> Rewritten:
         document = {"redaction": self.redaction_id, "key": event.key}
-        return Change(json.dumps(document, separators=(",", ":")).encode(), whole=True)
+        return Rewritten(json.dumps(document, separators=(",", ":")).encode(), whole=True)
 
-    def _of_envelope(self, event: Event) -> Change | None:
+    def _of_envelope(self, event: Event) -> Rewritten | None:
         accepted = read_envelope(event, max_bytes=sys.maxsize)
         found = self._selected(event, accepted) if isinstance(accepted, Accepted) else None
         if not isinstance(accepted, Accepted) or found is None:
@@ -195,9 +195,9 @@ class Erasure:
         left = [i for i in range(len(accepted.det_ids)) if i not in gone]
         fields = {REDACTED_FIELD: len(found), "redaction": self.redaction_id}
         of = event.payload, event.version, accepted.det_ids, left
-        return Change(without_detections(*of, fields))
+        return Rewritten(without_detections(*of, fields))
 
-    def _of_rejected(self, event: Event) -> Change | None:
+    def _of_rejected(self, event: Event) -> Rewritten | None:
         """A refused payload without its bytes, if these may say what is erased."""
         try:
             refused = RejectedPayload.model_validate_json(event.payload)
@@ -212,9 +212,9 @@ class Erasure:
         if names and not says and refused.size is None:
             return None
         hiding = ClassDropper[Any]([*names, REDACTED_FIELD])
-        return Change(hiding.refused_again(event.payload))
+        return Rewritten(hiding.refused_again(event.payload))
 
-    def _of_embeddings(self, event: Event) -> Change | None:
+    def _of_embeddings(self, event: Event) -> Rewritten | None:
         try:
             made = decode_embeddings(event.payload)
         except InvalidEmbeddings:
@@ -225,7 +225,7 @@ class Erasure:
         if not left:
             return self._tombstone(event)
         det_ids, rows = tuple(made.det_ids[i] for i in left), np.array(left)
-        return Change(made._replace(det_ids=det_ids, vectors=made.vectors[rows]).encode())
+        return Rewritten(made._replace(det_ids=det_ids, vectors=made.vectors[rows]).encode())
 
     def _shows(self, event: VerbatimEvent) -> bool:
         """Whether a verbatim message is a crop of what is selected, or may show it."""

@@ -243,9 +243,9 @@ def test_changes_after_a_redaction_are_found(run: Commands, tmp_path: Path) -> N
         at = next(e.offset for e in read_log(forged) if wanted(e))
 
         def decide(event: Event, at: int = at) -> Any:
-            from eventsrc.log.redact import Change
+            from eventsrc.log.redact import Rewritten
 
-            return Change(event.payload + b" ") if event.offset == at else None
+            return Rewritten(event.payload + b" ") if event.offset == at else None
 
         with Redactor(forged) as redactor:
             redactor.stage(decide, b"")

@@ -8,7 +8,7 @@ import pytest
 
 from eventsrc.envelope.system_events import REDACTED_KEY, REDACTION_KEY
 from eventsrc.log import Event, LogReader, LogWriter, MessageFormat, NewEvent, verify_log
-from eventsrc.log.redact import Change, Pending, Redactor, end_of, redactions_of
+from eventsrc.log.redact import Pending, Redactor, Rewritten, end_of, redactions_of
 from tests.support.byte_search import holds
 from tests.support.fixtures_log import KEY, MEMORY_DISK, envelope, read_log
 from tests.support.thorough import rounds
@@ -30,8 +30,8 @@ def _write(log: Path, chance: random.Random) -> None:
             writer.sync()
 
 
-def _redact(log: Path, chosen: dict[int, Change], name: str) -> None:
-    def decide(event: Event) -> Change | None:
+def _redact(log: Path, chosen: dict[int, Rewritten], name: str) -> None:
+    def decide(event: Event) -> Rewritten | None:
         return chosen.get(event.offset)
 
     with Redactor(log) as redactor:
@@ -59,7 +59,7 @@ def test_what_is_not_chosen_stays() -> None:
             for number in range(chance.randint(1, 3)):
                 share = chance.choice([0.0, 0.1, 0.5, 1.0])
                 chosen = {
-                    offset: Change(f"new {number}".encode(), whole=chance.random() < 0.5)
+                    offset: Rewritten(f"new {number}".encode(), whole=chance.random() < 0.5)
                     for offset in expected
                     if chance.random() < share
                 }
