@@ -123,10 +123,9 @@ class ClassDropper(Generic[Item]):
         before = document.get(DROPPED_FIELD)
         number = count + (before if type(before) is int and before > 0 else 0)
         stored = {**document, "detections": left, DROPPED_FIELD: number}
-        dropped = tuple({*ids} - {ids[i] for i in kept})
-        return Stripped(
-            self._stored(payload, stored, count).payload, tuple(ids[i] for i in kept), dropped
-        )
+        stay = tuple(ids[i] for i in kept)
+        dropped = tuple(det_id for det_id in dict.fromkeys(ids) if det_id not in stay)
+        return Stripped(self._stored(payload, stored, count).payload, stay, dropped)
 
     def drops(self, detection: Mapping[str, Any]) -> bool:
         """Whether a detection, as it came, is of a dropped class."""

@@ -11,7 +11,7 @@ A log is redacted in steps, each of which may be the last before a kill:
    is the log as it will be. Until there is a journal in it, nothing has happened: the next
    redaction deletes it.
 2. The journal is written: which segments are to be replaced, and the events to be appended. From
-   here on it goes on, whoever opens the log for writing next: `Pending`.
+   here on the next writer of the log finishes a killed redaction: `Pending`.
 3. Each segment is replaced under its name; then the events are appended. The journal then says
    that only copies elsewhere are left to be cleared, by who redacts.
 
@@ -173,8 +173,15 @@ class Redactor:
         self._lock = WriterLock(log, system_clock)
         self._folder = staging_folder(log)
         self._staged: list[str] = []
-        if Pending.of(log) is None and self._folder.exists():
-            shutil.rmtree(self._folder)  # prepared, and never begun
+        try:
+            self._delete_what_never_began()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _delete_what_never_began(self) -> None:
+        if Pending.of(self._log) is None and self._folder.exists():
+            shutil.rmtree(self._folder)
 
     def __enter__(self) -> "Redactor":
         return self
@@ -183,8 +190,7 @@ class Redactor:
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
         try:
-            if Pending.of(self._log) is None and self._folder.exists():
-                shutil.rmtree(self._folder)
+            self._delete_what_never_began()
         finally:
             self._lock.release()
 

@@ -12,8 +12,8 @@ The pose is the corrected one. Directions are multiples of 2⁻¹³ turns, ends 
 2⁻¹⁶ cells, and for the cells crossed the sensor is at one of `_PARTS`² points of its cell: integers
 from there on. A scan that would make a side of the grid longer than
 `MOST_CELLS` is left out, so that no map has more cells than one may have. If more are left out in a
-row than the grid has scans, at most `FIRST_DOUBLING`, it begins anew with the last of them: a robot
-is often somewhere else before it knows where it is.
+row than the grid has scans, at most `FIRST_DOUBLING`, the grid is discarded and the last of them
+starts a new one: the first poses of a robot may be wrong, before it is localised.
 """
 
 import math

@@ -95,7 +95,7 @@ def page_of_sample(mapfold: Commands, tmp_path_factory: pytest.TempPathFactory) 
 
 @contextmanager
 def saved(chromium: Browser, file: Path, moment: str = "") -> Iterator[Page]:
-    """The page from the disk, which must ask nobody and complain about nothing."""
+    """The saved page, opened from the disk: it sends no request and logs no error."""
     context = chromium.new_context(accept_downloads=True, viewport={"width": 1280, "height": 720})
     faults: list[str] = []
     page = context.new_page()
