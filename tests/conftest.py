@@ -7,11 +7,11 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import is_hypothesis_test, settings
 from hypothesis.internal.conjecture import providers
 
 from eventsrc.base.text import shorten_by
-from tests.support import prefork
+from tests.support import prefork, thorough
 from tests.support.commands import Commands
 from tests.support.thorough import THOROUGH, examples
 
@@ -58,7 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Start the process that forks commands for all workers: each would take two seconds to."""
     workers = getattr(config.option, "numprocesses", None)
     is_worker = "PYTEST_XDIST_WORKER" in os.environ
-    if workers and not (is_worker or THOROUGH or config.option.markexpr == "unit"):
+    if workers and not (is_worker or config.option.markexpr == "unit"):
         os.environ[prefork.SHARED] = prefork.start_server()
 
 
@@ -88,12 +88,24 @@ def pytest_runtest_logfinish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of tests/unit that are quick and need neither a database nor a network."""
+    """Mark the tests of tests/unit that are quick and need neither a database nor a network, and
+    the tests that try more, or may do so, when thorough."""
     for item in items:
+        if _tries_more(item):
+            item.add_marker(pytest.mark.thorough)
         slow = any(item.get_closest_marker(name) for name in ("slow", "seconds"))
         network = NETWORK & set(getattr(item, "fixturenames", ()))
         if UNIT in item.path.parents and not slow and not network:
             item.add_marker(pytest.mark.unit)
+
+
+def _tries_more(item: pytest.Item) -> bool:
+    """Whether the test or its module has more examples, sizes or cases under scripts/test_slow."""
+    if item.get_closest_marker("slow") or is_hypothesis_test(getattr(item, "obj", None)):
+        return True
+    imported = vars(getattr(item, "module", thorough))
+    amounts = ("THOROUGH", "examples", "every_other", "rounds", "stride")
+    return any(name in imported for name in amounts)
 
 
 @pytest.fixture

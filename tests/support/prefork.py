@@ -2,7 +2,7 @@
 
 A program started so is a process of its own, with its own arguments, folder, environment, streams
 and exit code. Only the interpreter's start and most imports are shared, nine tenths of what a short
-command costs. Under scripts/test_slow each is a new program instead.
+command costs. Tests of what an interpreter does at its start use `subprocess` instead.
 """
 
 import atexit
@@ -21,8 +21,6 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
-
-from tests.support.thorough import THOROUGH
 
 ROOT = Path(__file__).parents[2]
 
@@ -185,9 +183,7 @@ def run(
 
 
 def folder_with_mapfold() -> Path:
-    """A folder for PATH whose ``mapfold`` is forked; the program's own folder when thorough."""
-    if THOROUGH:
-        return Path(sys.executable).parent
+    """A folder for PATH whose ``mapfold`` is forked."""
     return Path(_server()).parent
 
 
@@ -199,7 +195,7 @@ def _must_be_new(env: Mapping[str, str]) -> bool:
         if name.startswith(("PYTHON", "LC_", "LANG", "OPENBLAS", "OMP_", "NPY_", "LD_"))
         and name != "PYTHONUNBUFFERED"  # which `prefork_server` obeys
     ]
-    return THOROUGH or any(env.get(name) != os.environ.get(name) for name in names)
+    return any(env.get(name) != os.environ.get(name) for name in names)
 
 
 @functools.cache
