@@ -23,9 +23,10 @@ from projections.localize.relocalize import read_question
 from projections.postgres.connection import Targets, connect
 from projections.postgres.embedded import EmbeddedServer
 from tests.integration.test_time_travel_commands import InProcess
+from tests.property.test_align import HERE, in_frame
 from tests.support.commands import Commands
 from tests.support.fleets import extend, fleet_databases, write_sites, wrong_rows
-from tests.support.logs import append_raw, bridge, walk, write_log
+from tests.support.logs import append_raw, bridge, simulated, walk, write_log
 from tests.support.servers import furnish
 from tests.support.thorough import THOROUGH
 
@@ -275,6 +276,40 @@ def test_what_cannot_be_is_refused_before_anything_is_done(fleet: Fleet) -> None
         (["--set", "eps_m=-1"], "--set eps_m=-1"),
     ):
         assert wrong in fleet.run("fleet", "replay", fleet.sites, *options, code=2).err
+
+
+def test_logs_that_cannot_be_compared_are_named(in_process: InProcess, tmp_path: Path) -> None:
+    sites = write_sites(tmp_path / "sites", ["a", "b"], 5)
+    (sites / "bad").mkdir()
+    (sites / "bad" / "00000000000000000000.mcap").write_bytes(b"no segment")
+    said = in_process("fleet", "align", sites, "--json", code=3).json
+    assert said["buildings"] == []
+    assert [each["site"] for each in said["alone"]] == ["a", "b"]
+    assert said["failed"].keys() == {"bad"}
+    assert "is no MCAP file" in said["failed"]["bad"]
+
+
+@pytest.mark.slow
+def test_logs_of_one_building_are_found_in_any_frame(in_process: InProcess, tmp_path: Path) -> None:
+    camera = {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
+    for name, seed, run, frame in (
+        ("a", 7, "a", HERE),
+        ("b", 7, "b", (40.0, -7.0, 2.1)),
+        ("other", 3, "a", HERE),
+    ):
+        seen = simulated(seed, run).envelopes[::2]
+        write_log(
+            tmp_path / "sites" / name, [in_frame(e, frame) | {"camera": camera} for e in seen]
+        )
+    said = in_process("fleet", "align", tmp_path / "sites", "--json").json
+    assert [each["sites"] for each in said["buildings"]] == [["a", "b"]]
+    assert [each["site"] for each in said["alone"]] == ["other"]
+    text = in_process("fleet", "align", tmp_path / "sites").out
+    assert [line.split()[:2] for line in text.splitlines()[1:4]] == [
+        ["1", "a"],
+        ["1", "b"],
+        ["-", "other"],
+    ]
 
 
 def test_a_server_that_is_not_there_is_said_once(

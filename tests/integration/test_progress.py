@@ -45,6 +45,7 @@ WITHOUT = {
     "fleet status": "reads indexes only",
     "fleet verify": "has a bar of its own",
     "fleet relocalize": "asks the databases",
+    "fleet align": "has a bar of its own",
     "fleet url": "reads no log",
     "db check": "tests/integration/test_db_check.py",
     "db url": "reads no log",

@@ -63,7 +63,7 @@ def advice_for(databases: Targets) -> Iterator[None]:
         complete_by(None)
 
 
-def _error_text(error: MapfoldError | OSError, site: Site) -> str:
+def error_text(error: MapfoldError | OSError, site: Site) -> str:
     """The text of an error, of a file error with its path."""
     if isinstance(error, MapfoldError):
         return str(error)
@@ -121,7 +121,7 @@ def replay_site(request: ReplayRequest, progress: Progress) -> SiteReplay:
         try:
             return _replay(request, progress)
         except (MapfoldError, OSError) as error:
-            return SiteReplay("failed", error=_error_text(error, request.site))
+            return SiteReplay("failed", error=error_text(error, request.site))
 
 
 def _replay(request: ReplayRequest, progress: Progress) -> SiteReplay:
@@ -237,7 +237,7 @@ def look_at_site(request: StatusRequest, _: Progress) -> SiteStatus:
             info = log_info(request.site.log)
             return SiteStatus(info, _databases(request, info))
         except (MapfoldError, OSError) as error:
-            return SiteStatus(error=_error_text(error, request.site))
+            return SiteStatus(error=error_text(error, request.site))
 
 
 def _databases(request: StatusRequest, info: LogInfo) -> Status:
@@ -280,6 +280,6 @@ def verify_site(site: Site, progress: Progress) -> SiteVerification:
     try:
         found = verify_log(site.log)
     except (MapfoldError, OSError) as error:
-        return SiteVerification(error=_error_text(error, site))
+        return SiteVerification(error=error_text(error, site))
     progress(found.events)
     return SiteVerification(found)

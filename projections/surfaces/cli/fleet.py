@@ -12,7 +12,7 @@ import typer
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.base.machine import usable_processors
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import counted, table, visible
 from projections.adapters.fleet.engines import Ended
 from projections.adapters.fleet.site_databases import check_server, template_of
 from projections.adapters.fleet.sites import Site
@@ -21,7 +21,7 @@ from . import fleet_options
 from .event_text import iso_time
 from .folded_log import FoldSettings, settings_from
 from .options import CameraOptions, JsonOption, QuestionArgument, option, question_from
-from .terminal import display, emit, finish, say
+from .terminal import Bar, display, emit, finish, say
 
 if TYPE_CHECKING:
     from projections.adapters.fleet.site_databases import WhichSite
@@ -36,7 +36,7 @@ fleet = typer.Typer(
 _HEADS: Final = (
     "site", "state", "events", "MB", "keys", "last keyframe", "rejected", "lost", "graph", "vectors"
 )  # fmt: skip
-_NUMBERS: Final = frozenset({2, 3, 4, 6, 7})
+_NUMBERS: Final = frozenset({"events", "MB", "keys", "rejected", "lost"})
 _MB: Final = 1_000_000
 _LISTED: Final = 10
 
@@ -252,14 +252,8 @@ def relocalize(
     question, asked_by = question_from(query), camera.camera
     sites = fleet_options.sites_of(place)
     with stores.opened(sites) as databases:
-        answer = ask_sites(
-            sites,
-            databases,
-            question,
-            top=top,
-            camera=asked_by,
-            jobs=jobs or 2 * usable_processors(),
-        )
+        workers = jobs or 2 * usable_processors()
+        answer = ask_sites(sites, databases, question, top=top, camera=asked_by, jobs=workers)
     best = answer.which.best
     if as_json:
         emit(
@@ -275,6 +269,53 @@ def relocalize(
     for name, reason in answer.not_asked.items():
         say(f"not asked: {visible(name)}: {reason}")
     finish(findings=bool(answer.not_asked))
+
+
+@fleet.command()
+def align(
+    *,
+    place: fleet_options.SitesArgument,
+    jobs: fleet_options.JobsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find which of many logs are of one building, in whatever frames: a table, by building.
+
+    Every two maps are aligned, as `mapfold align` aligns runs; only what is sure makes a building.
+    Exit 3 when a log could not be compared or pairs contradict each other.
+    """
+    try:
+        from projections.adapters.fleet import buildings
+    except ModuleNotFoundError as error:
+        raise MisuseError(
+            f"mapfold fleet align needs {error.name}, which is not installed; pip install"
+            " 'mapfold[align]'"
+        ) from None
+    sites, task = fleet_options.sites_of(place), buildings.things_of_site
+    made = [buildings.SiteThings(None)] * len(sites)
+    with fleet_options.ended_sites(task, sites, sites, "local", jobs) as results:
+        for ended in results:
+            made[ended.index] = ended.result or buildings.SiteThings(None, ended.error)
+    named = [(site.name, each) for site, each in zip(sites, made, strict=True)]
+    failed = [(name, each.error) for name, each in named if each.error]
+    things = {name: each.things for name, each in named if each.things is not None}
+    pairs, others = buildings.comparable(things)
+    requests, found = [(things[one], things[other]) for one, other in pairs], dict.fromkeys(pairs)
+    with fleet_options.open_engine("local", jobs, len(pairs)) as engine, Bar() as bar:
+        for number, ended in enumerate(engine.run(buildings.align_pair, requests), start=1):
+            found[pairs[ended.index]] = ended.result
+            bar.show("aligning", number, len(pairs), "pairs")
+            if ended.error is not None:
+                failed.append((" and ".join(pairs[ended.index]), ended.error))
+    all_ = buildings.Buildings.of(things, found)
+    if as_json:
+        emit(all_.document() | {"other_space": others, "failed": dict(failed)})
+    else:
+        display(all_.text())
+    if others:
+        names = ", ".join(map(visible, others[:_LISTED])) + (", …" if others[_LISTED:] else "")
+        say(f"embeddings of another space than most, compared with their like only: {names}")
+    _say_failed(failed)
+    finish(findings=bool(failed or others or all_.is_in_doubt))
 
 
 @fleet.command()
@@ -299,18 +340,8 @@ def url(
 
 def status_table(sites: Sequence[Site], found: "Sequence[SiteStatus]") -> str:
     """One line a site."""
-    rows = [list(_HEADS)]
-    rows += [_row(site, each) for site, each in zip(sites, found, strict=True)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
-    return "".join(_line(row, widths) for row in rows)
-
-
-def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    cells = (
-        cell.rjust(width) if column in _NUMBERS else cell.ljust(width)
-        for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-    )
-    return "  ".join(cells).rstrip() + "\n"
+    rows = [_row(site, each) for site, each in zip(sites, found, strict=True)]
+    return table(_HEADS, rows, right=_NUMBERS)
 
 
 def _row(site: Site, found: "SiteStatus") -> list[str]:
