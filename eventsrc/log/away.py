@@ -8,7 +8,6 @@ restored to its end is one with missing segments: readers and recorders refuse i
 import contextlib
 import hashlib
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ from typing import BinaryIO, Final, NamedTuple
 
 import msgspec
 
-from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NoSuchObject, NotALog
+from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NotALog
 from eventsrc.base.machine import system_clock
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
@@ -28,7 +27,8 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
-from .archive import KEPT, READERS, SEGMENTS, Archive, ManifestEntry
+from .archive import READERS, SEGMENTS, Archive, ManifestEntry
+from .archived_history import restore_kept
 from .durable_files import (
     delete_durably,
     make_directory_durably,
@@ -37,7 +37,7 @@ from .durable_files import (
     unlink_quietly,
 )
 from .lock import WriterLock
-from .log_identity import cache_folder, make_cache_folder, write_cache_file
+from .log_identity import cache_folder, write_cache_file
 from .seal import file_sha256
 from .sealed_end import SealedEnd, sealed_end, segments_of, write_sealed_end
 from .sealed_segment import (
@@ -47,8 +47,6 @@ from .sealed_segment import (
     note_archive_place,
     stand_in,
 )
-
-_KEPT_NAME: Final = re.compile(r"[0-9a-f]{16}-(?:\d{20}-)?(\d{20})(?:\.\d+)?\.\w+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +92,7 @@ def restore_log(
             write_sealed_end(log, end)
         _make_away(log, archive, wanted[: len(wanted) - len(here)])
         fetched = _fetch_segments(log, archive, here)
-    _fetch_kept(log, archive, Offset(last.following))
+    restore_kept(log, archive, Offset(last.following))
     return Restored(
         archive.log_id, len(fetched), sum(e.size for e in fetched), len(wanted), last.following
     )
@@ -189,15 +187,6 @@ def _forget(log: Path) -> None:
     for folder in (log, cache_folder(log)):
         if folder.exists():
             shutil.rmtree(folder)
-
-
-def fetch_kept(log: Path) -> None:
-    """Bring back the kept history of a log that is read from an archive, if there is one."""
-    last = names.list_growing(log)[-1]
-    place = archive_place(log)
-    if last.away and place is not None:
-        end = sealed_end(log)
-        _fetch_kept(log, Archive(ObjectStore(place.url)), end.following if end else FIRST_OFFSET)
 
 
 class Retained(NamedTuple):
@@ -335,37 +324,8 @@ def fetch_segment(archive: Archive, entry: ManifestEntry, path: Path) -> None:
         os.close(fd)
 
 
-def _fetch_kept(log: Path, archive: Archive, end: Offset) -> None:
-    """Bring back the kept history of the first ``end`` events. What the archiver deletes meanwhile
-    is left out: it has put others in its place."""
-    for name, size in archive.kept_files().items():
-        found = _KEPT_NAME.fullmatch(name)
-        path = cache_folder(log) / name
-        if found is None or int(found[1]) > end or (path.exists() and path.stat().st_size == size):
-            continue
-        make_cache_folder(log)
-        with contextlib.suppress(NoSuchObject):
-            data = archive.store.read(KEPT + name)
-            write_cache_file(path, partial(_write, data))
-
-
 def _write(data: bytes, file: BinaryIO) -> None:
     file.write(data)
-
-
-def archive_kept(log: Path, store: ObjectStore, files: Sequence[str]) -> int:
-    """Put these files of the kept history of a log, and delete those in the archive that are not
-    among them; returns the number of bytes put."""
-    folder, there = cache_folder(log), Archive(store).kept_files()
-    put = 0
-    for number, name in enumerate(files):
-        report_progress("archiving the kept history", number, len(files), "files")
-        if name not in there and store.put_new(KEPT + name, folder / name):
-            put += (folder / name).stat().st_size
-    report_progress("archiving the kept history", max(len(files), 1), max(len(files), 1), "files")
-    for name in there.keys() - set(files):
-        store.delete(KEPT + name)
-    return put
 
 
 @contextlib.contextmanager

@@ -175,6 +175,18 @@ def delete_left_over_files(folder: Path) -> None:
                 path.unlink()
 
 
+STANDS_FOR: Final = ".away"
+"""Ends the name of the file that says of which archived object another one is made."""
+
+
+class Span(NamedTuple):
+    """The byte at which a span of a cached file begins, which is archived by itself, and the bytes
+    of one of its numbers."""
+
+    start: int
+    number_bytes: int = 1
+
+
 def cache_sizes(log: Path) -> list[tuple[Path, int]]:
     """The folder with the total size of its files in bytes, if it exists and can be read."""
     folder = cache_folder(log)

@@ -116,9 +116,9 @@ class HistoryRecorder:
     def _opened(self) -> _Folded:
         if self._folded is None:
             if self._cache is not None and self._reader.segments[-1].away:
-                from eventsrc.log.away import fetch_kept  # here: it imports what writes a log
+                from eventsrc.log.archived_history import stand_for_kept  # here: few logs are away
 
-                fetch_kept(self._reader.path)
+                stand_for_kept(self._reader.path)
             found = self._cache.stripes(self._reader.readable_end) if self._cache else []
             self._folded = self._of(found)
         return self._folded

@@ -33,6 +33,7 @@ import numpy as np
 
 from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
+from eventsrc.log.log_identity import STANDS_FOR, Span
 from projections.fold import State
 
 from .columns import TABLES, Array, Stripe, ends_of
@@ -103,6 +104,7 @@ class PartFile:
                 self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             except ValueError:
                 raise DamagedPart(f"{path} is empty") from None
+        self._locations: list[_ArrayLocation] = []
         manifest = self._manifest()
         self.about: dict[str, Any] = manifest["about"]
         self.stripes = [self._stripe(document) for document in manifest["stripes"]]
@@ -119,7 +121,20 @@ class PartFile:
         """Drop the file's pages from this process's memory; access reads them again."""
         _release(self._map, 0, len(self._map))
 
+    def spans(self) -> list[Span]:
+        """The spans of the file: one for each array, and for the manifest."""
+        at = [(each.at, np.dtype(each.dtype).itemsize) for each in self._locations]
+        return [Span(0), *(Span(*each) for each in sorted(at)), Span(self._manifest_at)]
+
     def _manifest(self) -> dict[str, Any]:
+        try:
+            return self._read_manifest()
+        except DamagedPart:
+            if not _fetch(self.path, len(self._map) - 1, None):
+                raise
+        return self._read_manifest()
+
+    def _read_manifest(self) -> dict[str, Any]:
         size = len(self._map)
         found = _COMMENT_PATTERN.search(self._map[max(0, size - _MOST_COMMENT) :])
         if found is None or int(found[1]) != FORMAT:
@@ -131,6 +146,7 @@ class PartFile:
         if crc32(data) != crc:
             raise DamagedPart(f"{self.path}: the checksum of its manifest does not match")
         manifest: dict[str, Any] = json.loads(data)
+        self._manifest_at = at
         return manifest
 
     def _stripe(self, document: dict[str, Any]) -> Stripe:
@@ -146,6 +162,7 @@ class PartFile:
             location.dtype not in _TYPES or min(location[1:]) < 0 for location in locations.values()
         ):
             raise DamagedPart(f"{self.path} has arrays of another kind")
+        self._locations += locations.values()
         arrays = _MappedArrays(self.path, self._map, locations)
         start, end = Offset(document["start"]), Offset(document["end"])
         return Stripe(start, end, document["rows"], arrays, self.release)
@@ -187,13 +204,30 @@ class _MappedArrays(Mapping[str, Array]):
         end = start + location.length * np.dtype(location.dtype).itemsize
         if end > len(self._data):
             raise DamagedPart(f"{self._path} is cut off")
-        with memoryview(self._data)[location.at : end] as member:
-            if crc32(member) != location.crc:
-                raise DamagedPart(
-                    f"{self._path}: a checksum does not match at byte {location.at:,}"
-                )
+        if not self._is_right(location, end) and not (
+            _fetch(self._path, location.at, end) and self._is_right(location, end)
+        ):
+            raise DamagedPart(f"{self._path}: a checksum does not match at byte {location.at:,}")
         _release(self._data, location.at, end)
         return np.frombuffer(self._data, location.dtype, location.length, start)
+
+    def _is_right(self, location: _ArrayLocation, end: int) -> bool:
+        with memoryview(self._data)[location.at : end] as member:
+            return crc32(member) == location.crc
+
+
+def _fetch(path: Path, start: int, end: int | None) -> bool:
+    """Fetch bytes of a file that stands for one in an archive; False if it does not."""
+    if not path.with_name(path.name + STANDS_FOR).exists():
+        return False
+    from eventsrc.log.archived_history import fetch_kept  # here: few logs are read from an archive
+
+    return fetch_kept(path, start, end)
+
+
+def spans_of(path: Path) -> list[Span]:
+    """The spans in which a file is archived. Raises OSError, DamagedPart."""
+    return PartFile(path).spans() if path.suffix == ".npz" else [Span(0)]
 
 
 def _release(data: mmap.mmap, start: int, end: int) -> None:
@@ -246,6 +280,12 @@ def read_state(path: Path) -> State:
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise DamagedPart("it is not a regular file")
+        try:
+            return unpack(file.read())
+        except MalformedState:
+            if not _fetch(path, 0, None):
+                raise
+        file.seek(0)
         return unpack(file.read())
 
 

@@ -65,7 +65,7 @@ PartKind: TypeAlias = Literal["npz", "vectors"]
 _PART: Final = re.compile(r"([0-9a-f]{16})-(\d{20})-(\d{20})\.(npz|vectors)")
 _FOLD: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.fold")
 _DIGEST: Final = re.compile(r"([0-9a-f]{16})-(\d{20})\.\d+\.digest")
-_OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(?:npz|vectors|fold|digest)")
+_OF_A_HISTORY: Final = re.compile(r"([0-9a-f]{16})-[0-9.-]+\.(npz|vectors|fold|digest)(\.away)?")
 _NO_FILE: Final = frozenset({errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.ENODEV})
 """Errors of opening something other than a regular file."""
 _TRIES: Final = 3
@@ -91,8 +91,7 @@ class TimelineCache:
     def __init__(
         self, reader: LogReader, settings: Settings, corrections: Corrections, note: Note
     ) -> None:
-        log = reader.path
-        self.folder = cache_folder(log)
+        self.folder = cache_folder(reader.path)
         self._reader = reader
         self._settings, self._corrections = settings, corrections
         self._note = note
@@ -129,14 +128,14 @@ class TimelineCache:
         return next((fold for fold in found if fold is not None), None)
 
     def _fold_ends(self) -> list[Offset]:
-        found = (path.stem for path in self._paths() if self._is_own(_FOLD, path))
-        return sorted(Offset(int(stem.partition("-")[2])) for stem in found)
+        stems = (path.stem for path in self._paths() if self._is_own(_FOLD, path))
+        return sorted(Offset(int(stem.partition("-")[2])) for stem in stems)
 
     def fold_at(self, end: Offset) -> SemanticMap | None:
         """The fold after ``end`` events; None if it is not cached."""
-        semantic_map = SemanticMap(self._settings, self._corrections)
 
         def load(state: State) -> SemanticMap:
+            semantic_map = SemanticMap(self._settings, self._corrections)
             semantic_map.load(part("map", state))
             semantic_map.use_names(semantic_map.next_offset, self._corrections)
             return semantic_map
@@ -273,7 +272,7 @@ class TimelineCache:
             return None
         except OSError as error:
             self._say(f"{file.path} is not used: {error.strerror}")
-            if error.errno not in _NO_FILE:  # too many open files, or not ours to read: no damage
+            if error.errno not in _NO_FILE:  # too many open files, or not ours to read
                 return None
         except DamagedPart as error:
             self._say(f"{file.path} is not used: {error}")
@@ -291,11 +290,13 @@ class TimelineCache:
             raise DamagedPart("it is of another log or other events, settings or commands")
         signatures = segment_signatures(self._reader.path, end)
         is_same = same_but_sealed(about["segments"], signatures)
-        if not is_same or about["last_event"] != self._event_hash(end):
+        if not is_same or len({about["last_event"], self._event_hash(end)} - {None}) > 1:
             raise DamagedPart("the log has lost events since it was made")
 
-    def _event_hash(self, end: Offset) -> str:
-        """The hash of the last event below ``end``."""
+    def _event_hash(self, end: Offset) -> str | None:
+        """The hash of the last event below ``end``; None in a segment away, which never changes."""
+        if [each for each in self._reader.segments if each.base < end][-1].away:
+            return None
         (event,) = self._reader.read(Offset(end - 1), end)
         return event_hash(event)
 
@@ -342,9 +343,8 @@ class TimelineCache:
 
     def _tidy_parts(self, end: Offset, kind: PartKind) -> None:
         """Delete the parts that those of the first ``end`` events replace."""
-        needed = {file.path for file in self._parts_to(end, kind)}
-        for file in self._files(kind):
-            if file.path not in needed and file.end <= end:
+        for file in set(self._files(kind)) - set(self._parts_to(end, kind)):
+            if file.end <= end:
                 file.path.unlink(missing_ok=True)
 
     def _parts_to(self, end: Offset, kind: PartKind) -> list[_File]:
@@ -363,8 +363,7 @@ class TimelineCache:
         for path in self._paths():
             if (found := _OF_A_HISTORY.fullmatch(path.name)) is not None:
                 with contextlib.suppress(FileNotFoundError):
-                    status = path.stat()
-                    key = found[1]
+                    key, status = found[1], path.stat()
                     sizes[key] = sizes.get(key, 0) + status.st_size
                     used[key] = max(used.get(key, 0.0), status.st_mtime)
                     by_key.setdefault(key, []).append(path)

@@ -10,6 +10,7 @@ OWN_WAY = {
     "eventsrc/envelope/grey_images.py": "into memory",
     "eventsrc/log/log_identity.py": "caches, renamed when they are whole",
     "eventsrc/log/away.py": "a segment of an archive, into a temporary folder",
+    "eventsrc/log/archived_history.py": "a packed file, into a temporary folder; parts of caches",
     "eventsrc/log/durable_files.py": "copies of a log's own files",
     "eventsrc/record/importers/bag_files.py": "a bag, unpacked into a temporary folder",
     "projections/adapters/rerun/rrd_recording.py": "into a pipe",

@@ -14,7 +14,8 @@ from eventsrc.base.text import counted
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.log import LogReader
 from eventsrc.log.archive import Archive, Archived, NothingSealed, archive_log
-from eventsrc.log.away import archive_kept, restore_log, retain_log
+from eventsrc.log.archived_history import archive_kept
+from eventsrc.log.away import restore_log, retain_log
 from eventsrc.log.seek import resolve_start
 from eventsrc.log.verify import verify_archive
 
@@ -91,6 +92,7 @@ def _put_fold(log: LogArgument, store: ObjectStore, end: Offset) -> int | None:
     the bytes put. A log that cannot be folded is archived without: None."""
     from projections.map.parsing import read_corrections
     from projections.store.history_recorder import HistoryRecorder
+    from projections.store.kept_files import spans_of
     from projections.store.timeline_cache import TimelineCache
 
     try:
@@ -99,13 +101,13 @@ def _put_fold(log: LogArgument, store: ObjectStore, end: Offset) -> int | None:
             settings = settings_from(None, None, corrections)
             cache = TimelineCache(reader, settings, corrections, say)
             HistoryRecorder(reader, settings, corrections, cache, _report_fold).up_to(end)
-            names = cache.names_before(end)
+            spans = {name: spans_of(cache.folder / name) for name in cache.names_before(end)}
     except ArchiveError:
         raise
     except MapfoldError as error:
         say(f"{log}: archived without a fold: {error}")
         return None
-    return archive_kept(log, store, names)
+    return archive_kept(log, store, spans)
 
 
 def _report_fold(done: int, total: int) -> None:
