@@ -14,9 +14,9 @@ from projections.map.place_regions import place_regions
 from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
-from .driven_ground import CLEARANCE_M, STEP_M, DrivenGround, Spot
+from .driven_ground import STEP_M, DrivenGround, Spot
 from .find import FoundObject, SeenAt, answer_of, point_of, seen_at
-from .goal_pose import GoalPose
+from .goal_pose import CLEARANCE_M, GoalGround, GoalPose
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,9 +187,9 @@ def path(view: MapView, start: str, end: str, clearance_m: float = CLEARANCE_M) 
 
 
 def goal_of(view: MapView, object_id: str, clearance_m: float = CLEARANCE_M) -> GoalPose:
-    """The pose from which to see an Object; see `DrivenGround.goal`."""
+    """The pose from which to see an Object; see `goal_pose`."""
     found = _object(view, object_id)
-    return view.once(DrivenGround).goal(found, view.sightings(found), clearance_m)
+    return view.once(GoalGround).goal(view, found, clearance_m)
 
 
 def _end_of(
@@ -205,7 +205,7 @@ def _end_of(
     thing = thing_called(text, sure if matches(text, sure)[1] else things, ["place", "object"])
     if thing.kind == "object":
         found = _object(view, thing.id)
-        goal = ground.goal(found, view.sightings(found), clearance_m)
+        goal = view.once(GoalGround).goal(view, found, clearance_m)
         return ground.nearest((goal.x, goal.y)), goal
     place = view.survivors.find(PlaceOrdinal(thing.ordinal))
     record = view.all_places[place]

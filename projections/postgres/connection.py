@@ -236,8 +236,11 @@ def describe_connection(connection: Connection) -> str:
 
 
 def url_without_secrets(url: str) -> str:
-    """A URL of `check_url`, without its password and others that libpq takes as parameters, for
-    command lines that are advised; libpq then reads the password from ~/.pgpass or PGPASSWORD."""
+    """A URL of `check_url`, or the empty one of the embedded server, without its password and
+    others that libpq takes as parameters, for command lines that are advised; libpq then reads the
+    password from ~/.pgpass or PGPASSWORD."""
+    if not url:
+        return url
     scheme, _, rest = url.partition("://")
     rest, question, query = rest.partition("?")
     authority, slash, path = rest.partition("/")

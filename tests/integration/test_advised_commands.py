@@ -237,6 +237,10 @@ def test_what_db_check_advises_repairs_under_the_same_settings_and_databases(
     run("tail", LOG, "--once", "--set", "eps_m=2", "--db", url)
 
 
+def test_the_embedded_server_is_advised_as_it_is_given() -> None:
+    assert url_without_secrets("") == ""
+
+
 @pytest.mark.parametrize(
     ("url", "shown"),
     [

@@ -29,7 +29,8 @@ from eventsrc.log import NEVER, LogReader, LogWriter
 from eventsrc.record.importers.ros_bags import BagReport
 from eventsrc.record.recorder.bridged import Bridge
 from eventsrc.record.transport.session import Session
-from projections.ask.best_views import KeptCrops, views_in_order
+from projections.ask.best_views import views_in_order
+from projections.ask.kept_crops import KeptCrops
 from projections.fold.map_errors import QuestionError
 from projections.fold.presets import PRESETS
 from projections.fold.settings import Settings

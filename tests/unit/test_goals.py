@@ -1,23 +1,46 @@
 """Which of the poses that saw a thing is its goal."""
 
 import math
+from collections.abc import Container
 
-from eventsrc.envelope.model import KeyframeId, Offset, RunId
-from projections.ask.driven_ground import DrivenGround
-from projections.ask.goal_pose import GoalPose
-from projections.fold.deltas import KeyframeOrdinal, ObjectOrdinal, Pose, RunOrdinal
+import numpy as np
+
+from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
+from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
+from projections.ask.goal_pose import GoalGround, GoalPose
+from projections.fold.deltas import (
+    KeyframeOrdinal,
+    MapGiven,
+    ObjectOrdinal,
+    ObservationOrdinal,
+    Pose,
+    RunOrdinal,
+)
 from projections.fold.settings import Settings
-from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
+from projections.map.records import (
+    EstimatedPosition,
+    KeyframeRecord,
+    ObjectRecord,
+    ObservationRecord,
+)
 from projections.map.view import MapView
 
 OFTEN = [(3.0 + 0.1 * step, 0.0) for step in range(4)]
 """Spots beside each other, with the thing at the origin."""
 
 
-def goal_of(*runs: list[tuple[float, float]], other: tuple[float, float] | None = None) -> GoalPose:
-    """The goal of a thing at the origin that was seen from the spots of some runs; another thing
-    may stand somewhere."""
+def goal_of(
+    *runs: list[tuple[float, float]],
+    other: tuple[float, float] | None = None,
+    missed: Container[tuple[float, float]] = (),
+    walls: OccupancyMap | None = None,
+) -> GoalPose:
+    """The goal of a thing at the origin that was seen from the spots of some runs but those
+    ``missed``, which face it too; another thing may stand somewhere."""
     view = MapView(Settings(), keep_embeddings=False)
+    if walls is not None:
+        view.maps[None] = MapGiven(Offset(0), walls)
+    thing = ObjectRecord(ObjectOrdinal(0), "o0", "oven", confirmed=True)
     for run, spots in enumerate(runs):
         for x, y in spots:
             number = len(view.keyframes)
@@ -33,7 +56,24 @@ def goal_of(*runs: list[tuple[float, float]], other: tuple[float, float] | None 
                     *(KeyframeId(number), float(number), pose, view.survivors),
                 )
             )
-    thing = ObjectRecord(ObjectOrdinal(0), "o0", "oven", confirmed=True)
+            if (x, y) not in missed:
+                observation = ObservationOrdinal(len(view.observations))
+                view.observations.append(
+                    ObservationRecord(
+                        ordinal=observation,
+                        keyframe=KeyframeOrdinal(number),
+                        det_id=DetId(f"d{number}"),
+                        class_name="oven",
+                        confidence=1.0,
+                        bbox=(0.0, 0.0, 9.0, 9.0),
+                        embedding_model=None,
+                        embedding=None,
+                        embedding_crc=None,
+                        foreign_space=False,
+                        object=thing.ordinal,
+                    )
+                )
+                thing.observations.append(observation)
     thing.estimate = EstimatedPosition(0, 0, 1, 0, 1, 2)
     view.objects[thing.ordinal] = thing
     if other is not None:
@@ -41,7 +81,7 @@ def goal_of(*runs: list[tuple[float, float]], other: tuple[float, float] | None 
         stands = ObjectRecord(ObjectOrdinal(1), "o1", "chair", confirmed=True)
         stands.estimate = EstimatedPosition(x_um, y_um, 1, 0, 1, 2)
         view.objects[stands.ordinal] = stands
-    return DrivenGround(view).goal(thing, view.keyframes)
+    return GoalGround(view).goal(view, thing)
 
 
 def test_a_goal_is_where_the_thing_was_seen_most() -> None:
@@ -62,3 +102,19 @@ def test_a_goal_is_not_where_another_thing_stands() -> None:
     beside = [(-x - 0.3, y) for x, y in OFTEN]
     assert goal_of([*OFTEN, *beside]).x > 0.0
     assert goal_of([*OFTEN, *beside], other=(3.1, 0.0)).x < 0.0
+
+
+def test_a_goal_is_not_where_others_beside_it_missed_the_thing() -> None:
+    beside = [(-x, y) for x, y in OFTEN]
+    missed = [(x - 0.05, 0.05) for x, _ in OFTEN]
+    assert goal_of([*OFTEN, *beside, *missed]).x > 0.0
+    assert goal_of([*OFTEN, *beside, *missed], missed=missed).x < 0.0
+
+
+def test_a_goal_on_ground_that_no_robot_drove_keeps_away_from_unknown_ground() -> None:
+    cells = np.zeros((80, 80), np.uint8)
+    cells[:, 44:] = UNKNOWN
+    given = OccupancyMap("m", 0.1, (-4.0, -4.0, 0.0), "m", cells)
+    goal = goal_of([(0.3, 0.0)], walls=given)
+    assert goal.ground == "free"
+    assert goal.x + 0.3 <= 0.4

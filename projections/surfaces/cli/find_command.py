@@ -11,8 +11,8 @@ import typer
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised, counted, shorten_by, table, visible
 from projections.ask.best_views import write_best
-from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject, FoundObjects, SeenAt, Wanted, find
+from projections.ask.goal_pose import CLEARANCE_M
 from projections.ask.room_and_path import DrivenPath, NamedPlace, Room, goal_of, path, room
 from projections.ask.words import ObjectVectors, Words
 from projections.map.naming import ShortIds, things_of
@@ -354,11 +354,11 @@ def _last(each: FoundObject) -> str:
 
 def _remarks(wanted: Wanted, found: FoundObjects) -> list[str]:
     remarks = []
-    if found.remark is not None:
-        remarks.append(found.remark)
     if wanted.what is not None and found.match in ("words", "spelling"):
         classes = ", ".join(map(visible, found.classes))
         remarks.append(f"no class {wanted.what!r}; found {classes}")
+    if found.remark is not None:
+        remarks.append(found.remark)
     if found.count > len(found.answers):
         remarks.append(f"{found.count - len(found.answers):,} more; --top {found.count} lists all")
     if found.unconfirmed:

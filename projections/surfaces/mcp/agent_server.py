@@ -19,8 +19,8 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError, MisuseError
-from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import Wanted, find
+from projections.ask.goal_pose import CLEARANCE_M
 from projections.ask.room_and_path import goal_of, path, room
 from projections.edit.make import name_place, undo
 from projections.localize.relocalize import rank, read_question

@@ -14,10 +14,10 @@ from eventsrc.base.user_files import FileFault, read_file
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader
 from eventsrc.log.seek import resolve
-from projections.ask.best_views import KeptCrops, best_views
-from projections.ask.driven_ground import CLEARANCE_M
+from projections.ask.best_views import best_views
 from projections.ask.find import FoundObjects, Wanted, find
-from projections.ask.goal_pose import GoalPose
+from projections.ask.goal_pose import CLEARANCE_M, GoalPose
+from projections.ask.kept_crops import KeptCrops
 from projections.ask.room_and_path import DrivenPath, Room, goal_of, path, room
 from projections.ask.what_changed import MapChanges, map_changes
 from projections.fold.corrections import Corrections

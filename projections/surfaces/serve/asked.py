@@ -18,9 +18,10 @@ from typing_extensions import TypedDict  # pydantic needs it before Python 3.12
 from eventsrc.base.errors import MapfoldError, MisuseError
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
-from projections.ask.best_views import KeptCrops, best_view
-from projections.ask.driven_ground import CLEARANCE_M
+from projections.ask.best_views import best_view
 from projections.ask.find import FoundObject, SeenAt, Wanted, answer_of, find
+from projections.ask.goal_pose import CLEARANCE_M
+from projections.ask.kept_crops import KeptCrops
 from projections.ask.room_and_path import goal_of, path, room
 from projections.ask.what_changed import ChangeKind
 from projections.ask.words import Words

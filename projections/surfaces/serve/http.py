@@ -22,9 +22,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from eventsrc.base.errors import MapfoldError
 from eventsrc.record.metrics import METRICS_TYPE
-from projections.ask.driven_ground import CLEARANCE_M
 from projections.ask.find import FoundObject
-from projections.ask.goal_pose import GoalPose
+from projections.ask.goal_pose import CLEARANCE_M, GoalPose
 from projections.ask.room_and_path import DrivenPath, Room
 from projections.fold.map_errors import QuestionError
 from projections.localize.relocalize import Method, describe_value

@@ -19,7 +19,7 @@ from eventsrc.log import Event, LogReader, Unreadable
 from eventsrc.log.format import list_growing
 from eventsrc.log.reader import OnGap
 from eventsrc.log.seek import resolve
-from projections.ask.best_views import KeptCrops
+from projections.ask.kept_crops import KeptCrops
 from projections.fold.corrections import Corrections, map_fingerprint
 from projections.fold.map_errors import FoldError
 from projections.fold.settings import Settings

@@ -6,8 +6,9 @@ log and databases in ``--data`` (minutes: the HNSW index alone takes most of the
 measure only.
 
     scripts/bench_relocalize [--data DIR] [--observations N]
-    scripts/bench_relocalize --commands       # instead: processor time of find, room and path on
-                                              # 100,200 keyframes of 334 buildings, 20,000 Objects
+    scripts/bench_relocalize --commands       # instead: processor time of find, room, path and
+                                              # changes on 100,200 keyframes of 334
+                                              # buildings, 20,000 Objects
 """
 
 import argparse
@@ -218,6 +219,9 @@ def on_a_large_map(data: Path) -> None:
         "find CLASS --in PLACE": [*run, "find", *full, "class 3", "--in", room],
         "find CLASS --from X,Y": [*run, "find", *full, "class 3", "--from", point],
         "find CLASS --at W": [*run, "find", *full, "class 3", "--at", "50000"],
+        "find CLASS --goal json": [*run, "find", *full, "class 3", "--goal", "json"],
+        "changes": [*run, "changes", *full],
+        "changes --since W": [*run, "changes", *full, "--since", "50000"],
         "room PLACE": [*run, "room", *full[:1], room, *full[1:]],
         "path X,Y X,Y": [*run, "path", *full[:1], point, f"{100 * APART_M + 3},6", *full[1:]],
     }

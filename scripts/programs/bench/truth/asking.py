@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from eventsrc.base.errors import MisuseError
-from projections.ask.driven_ground import DrivenGround
 from projections.ask.find import Wanted, find
+from projections.ask.goal_pose import GoalGround
 from projections.ask.what_changed import KINDS, map_changes
+from projections.localize.evaluate.scores import instances_of
 from projections.localize.evaluate.truth import Truth
 from projections.map.view import MapView
 
@@ -22,8 +23,9 @@ class AskedRow:
     """``first`` of the ``classes`` found have a true thing of the class as their first answer, as
     far from the truth as ``errors_m``. ``told`` and ``true`` are the changes of each kind: a thing
     of a true change stands elsewhere than in run a. ``goals`` are those of confirmed Objects of
-    true things, how many are on free ground, neither wall nor furniture, and from how many the
-    generator's camera sees the thing."""
+    true things, how many are on free ground, neither wall nor furniture, from how many the
+    generator's camera sees the thing, and how many are of things that were moved and not seen
+    since, which no goal can know."""
 
     name: str
     classes: int
@@ -60,6 +62,12 @@ def asked_row(
         first += 1
         errors.append(math.dist((found.x, found.y), thing.moved_to or (thing.x, thing.y)))
     moved = {thing.instance for thing in things.values() if thing.moved_to is not None}
+    last = after.runs[-1].ordinal
+    seen_since = {
+        instance
+        for number, instance in instances_of(after, truth)
+        if after.keyframes[after.observations[number].keyframe].run == last
+    }
     told, true = dict.fromkeys(KINDS, 0), dict.fromkeys(KINDS, 0)
     was = majorities(before, truth)
     was_of = {each.object_id: was.get(number) for number, each in before.objects.items()}
@@ -74,7 +82,7 @@ def asked_row(
         tuple(errors),
         tuple(told.values()),
         tuple(true.values()),
-        building.score_goals(after, owner_of),
+        building.score_goals(after, owner_of, moved - seen_since),
     )
 
 
@@ -93,28 +101,41 @@ class Building:
         self._number = {f"{world}/{thing['id']}": n for n, thing in enumerate(after)}
 
     def score_goals(
-        self, view: MapView, owner_of: Mapping[str, str | None]
-    ) -> tuple[int, int, int]:
-        """Goals, those on free ground, and those in view of the thing."""
-        ground = DrivenGround(view)
-        goals = free = seen = 0
+        self, view: MapView, owner_of: Mapping[str, str | None], lost: Collection[str]
+    ) -> tuple[int, int, int, int]:
+        """Goals, those on free ground, those in view of the thing, and those of things that are
+        ``lost``."""
+        ground = GoalGround(view)
+        goals = free = seen = unknown = 0
         for each in view.objects.values():
             number = self._number.get(owner_of[each.object_id] or "")
             if not each.confirmed or each.missing_in is not None or number is None:
                 continue
             try:
-                goal = ground.goal(each, view.sightings(each))
+                goal = ground.goal(view, each)
             except MisuseError:
                 continue
             goals += 1
+            unknown += owner_of[each.object_id] in lost
             free += bool(self._world.clear[self._world.cell(goal.x, goal.y)] > 0.0)
             seen += any(hit[0] == number for hit in self._camera.see(goal.x, goal.y, goal.yaw))
-        return goals, free, seen
+        return goals, free, seen, unknown
 
 
 def asked_table(rows: Sequence[AskedRow]) -> str:
     """A line for each case, the one with the least share of classes found last; then all."""
-    heads = ["classes", "first", "share", "p50 m", *KINDS, "precise", "goals", "free", "in view"]
+    heads = [
+        "classes",
+        "first",
+        "share",
+        "p50 m",
+        *KINDS,
+        "precise",
+        "goals",
+        "free",
+        "in view",
+        "lost",
+    ]
     lines = [_line("find and changes", heads)]
     ordered = sorted(rows, key=lambda row: -_share(row.first, row.classes))
     lines += [_line(row.name, _cells(row)) for row in ordered]
@@ -140,7 +161,8 @@ def _cells(row: AskedRow) -> list[str]:
         *(f"{true}/{told}" for true, told in zip(row.true, row.told, strict=True)),
         f"{_share(sum(row.true), sum(row.told)):.3f}" if sum(row.told) else "-",
         str(row.goals[0]),
-        *(f"{_share(part, row.goals[0]):.3f}" for part in row.goals[1:]),
+        *(f"{_share(part, row.goals[0]):.3f}" for part in row.goals[1:3]),
+        str(row.goals[3]),
     ]
 
 
