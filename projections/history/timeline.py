@@ -206,6 +206,12 @@ class LogTimeline:
         known = self._known(last, known_at)
         after = known.at(last)
         if after.settings.fusion != "evidence":
+            if self.settings.fusion == "evidence":
+                known_end = last if known_at is None else known_at
+                raise MisuseError(
+                    f"as known after {known_end:,} events the map has no fusion by evidence, which"
+                    " the log states later; ask until a later moment, or with a later --known-at"
+                )
             raise MisuseError(
                 "only a map with fusion by evidence knows what has changed; fold it with"
                 " --preset full"

@@ -103,14 +103,14 @@ def wait_for_pixels(page: Page, wanted: str) -> None:
 
 
 def point_over(page: Page, name: str) -> tuple[float, float]:
-    """A point of the window where the pointer is over the thing of this name."""
+    """A point of the window where the pointer is over the thing of this name or id."""
     box = page.locator("canvas.map").bounding_box()
     assert box is not None
     for share in (0.44, 0.5, 0.38, 0.6):
         for x in range(40, int(box["width"]) - 40, 12):
             at = box["x"] + x, box["y"] + box["height"] * share
             page.mouse.move(*at)
-            tip = page.locator(".tip .first")
-            if tip.count() and tip.inner_text().strip("\u2068\u2069") == name:
+            tip = page.locator(".tip div")
+            if name in (line.strip("\u2068\u2069") for line in tip.all_inner_texts()):
                 return at
     raise AssertionError(f"{name} is nowhere under the pointer")

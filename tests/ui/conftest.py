@@ -32,6 +32,9 @@ else:
 
 WIDE = ("--set", "eps_m=1.0", "--set", "min_samples=8")
 SAMPLE = logs.sample_drive()
+SIZES = {"small": (1280, 720), "large": (1920, 1080), "tablet": (820, 1180), "phone": (390, 844)}
+SCHEMES = {"small": "light", "large": "dark", "tablet": "dark", "phone": "light"}
+"""The colours in which a test of all sizes opens the page, so that both are seen."""
 Visit = Callable[..., "Page"]
 
 

@@ -144,7 +144,7 @@ def test_ids_of_64_bits_are_exact(mapfold: Commands, visit: Visit, tmp_path: Pat
         page = visit(server)
         page.get_by_label("Search places").fill(f"run-a:{first + 4}")
         page.get_by_role("option").first.click()
-        expect(page.locator(".thing")).to_contain_text(f"run-a/{first + 4}")
+        expect(page.locator(".thing")).to_contain_text(f"run-a:{first + 4}")
         expect(page.locator(".answer .summary")).to_contain_text("in p0")
         page.get_by_role("tab", name="Lost").click()
         page.get_by_role("button", name="Where is it?").click()

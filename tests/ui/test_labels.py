@@ -13,9 +13,8 @@ from tests.support.logs import write_log
 from tests.support.shared_data import shared_run
 from tests.support.ui_page import UiServer, showing
 from tests.ui.browser import opened, pixels
-from tests.ui.conftest import Visit
+from tests.ui.conftest import SIZES, Visit
 
-SIZES = {"small": (1280, 720), "large": (1920, 1080), "tablet": (820, 1180), "phone": (390, 844)}
 ROOMS, VISITS = 120, 20
 _RECORDED = """() => {
     const texts = window.drawnTexts = [];

@@ -5,8 +5,7 @@ from playwright.sync_api import Page, expect
 
 from tests.support.ui_page import UiServer
 from tests.ui.browser import answered, whole
-from tests.ui.conftest import Visit
-from tests.ui.test_labels import SIZES
+from tests.ui.conftest import SIZES, Visit
 
 _COVERED = """() => {
     const controls = "button, select, input:not(.hidden), summary, .facts, .scale, .legend label,"

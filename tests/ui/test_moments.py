@@ -50,7 +50,8 @@ def test_the_map_at_a_moment_is_that_of_state(
     page.keyboard.press("/")
     page.keyboard.type("p5")
     page.keyboard.press("Enter")
-    expect(page.locator(".thing h2")).to_have_text("sim-7-a_p5")
+    expect(page.locator(".thing h2")).to_have_text("p5")
+    expect(page.locator(".thing code")).to_have_text("sim-7-a_p5")
     expect(page).to_have_url(re.compile("select=place%3Asim-7-a_p5"))
     box = page.locator("canvas.map").bounding_box()
     assert box is not None
@@ -95,7 +96,7 @@ def test_hovering_tells_what_is_there_and_a_click_selects_it(
     at = point_over(page, "sim-7-a_p6")
     other_pixels(page, plain)
     page.mouse.click(*at)
-    expect(page.locator(".thing h2")).to_have_text("sim-7-a_p6")
+    expect(page.locator(".thing h2")).to_have_text("p6")
     expect(page.locator(".facts-list")).to_contain_text("79")
 
 

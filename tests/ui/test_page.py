@@ -24,7 +24,8 @@ from tests.support.logs import append_raw, write_log
 from tests.support.models import KEY, add_crop
 from tests.support.shared_data import ROOT, shared_run
 from tests.support.ui_page import UiServer, showing
-from tests.ui.conftest import ALL, SAMPLE, WIDE, Visit
+from tests.ui.browser import answered
+from tests.ui.conftest import ALL, SAMPLE, SCHEMES, SIZES, WIDE, Visit
 
 WEB = ROOT / "projections" / "surfaces" / "ui" / "web"
 STATIC = ROOT / "projections" / "surfaces" / "ui" / "static"
@@ -202,14 +203,17 @@ def test_a_server_that_is_gone_is_told_and_the_map_stays(mapfold: Commands, visi
     expect(page.locator(".facts")).to_contain_text("299 keyframes")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, scheme: str) -> None:
+@pytest.mark.parametrize(("size", "scheme"), SCHEMES.items())
+def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, size: str, scheme: str) -> None:
     axe = WEB / "node_modules" / "axe-core" / "axe.min.js"
     if not axe.exists() and not ALL:
         pytest.skip("axe-core is not installed; scripts/test_ui installs it")
-    page = visit(sample, "#at=349", color_scheme=scheme)
+    width, height = SIZES[size]
+    viewport = {"width": width, "height": height}
+    page = visit(sample, "#at=349", color_scheme=scheme, viewport=viewport)
     states = {
-        "overview": lambda: None,
+        "map": lambda: None,
+        "overview": lambda: page.get_by_role("tab", name="Why").click(),
         "merges": lambda: page.get_by_text("of places").click(),
         "merge": lambda: page.get_by_role("button", name="p0 ← p7").click(),
         "compare": lambda: page.get_by_role("tab", name="Compare").click(),
@@ -225,7 +229,7 @@ def test_axe_finds_nothing_serious(sample: UiServer, visit: Visit, scheme: str) 
     page.evaluate(axe.read_text())
     for state, reach in states.items():
         reach()
-        page.wait_for_timeout(300)
+        answered(page)
         found = page.evaluate("() => axe.run()")
         serious = [
             (each["id"], [node["html"] for node in each["nodes"]])
@@ -246,7 +250,7 @@ def test_everything_is_reached_with_the_keyboard(sample: UiServer, visit: Visit)
                 " || document.activeElement.innerText || document.activeElement.id"
             )
         )
-    wanted = {"digest", "Take away", "Help", "Zoom in", "Why", "Play", "Next merge", "Moment"}
+    wanted = {"show digest", "Take away", "Help", "Zoom in", "Why", "Play", "Next merge", "Moment"}
     assert wanted <= reached
     page.keyboard.press("?")
     expect(page.get_by_role("dialog")).to_be_visible()

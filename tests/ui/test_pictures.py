@@ -8,7 +8,7 @@ from playwright.sync_api import Page, expect
 
 from tests.support.ui_page import UiServer
 from tests.ui.browser import whole
-from tests.ui.conftest import Visit
+from tests.ui.conftest import SCHEMES, SIZES, Visit
 
 STATES = {
     "whole": "",
@@ -22,11 +22,9 @@ STATES = {
     "correct": "#panel=correct",
     "closed": "#panel=none",
 }
-SIZES = {"wide": (1440, 900), "small": (1280, 720), "tablet": (820, 1180)}
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("size", "scheme"), SCHEMES.items())
 def test_pictures(sample: UiServer, visit: Visit, pictures: Path, size: str, scheme: str) -> None:
     width, height = SIZES[size]
     page = visit(sample, viewport={"width": width, "height": height}, color_scheme=scheme)

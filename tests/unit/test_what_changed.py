@@ -206,3 +206,5 @@ def test_the_command_says_a_sentence_for_each_change(log: Path, tmp_path: Path) 
     assert document["changes"][0]["from"] is not None
     refused = mapfold("changes", log, "--preset", "classic", code=2).err
     assert "only a map with fusion by evidence knows what has changed" in refused
+    early = mapfold("changes", log, "--until", "0", code=2).err
+    assert "as known after 0 events the map has no fusion by evidence" in early

@@ -1,5 +1,5 @@
 /** When the first map was drawn, as `data-painted`; with `?bench` in the address a function that
- * measures the time from moving the slider to the painted map. */
+ * moves the slider to W and answers with the milliseconds until the map is painted. */
 
 import { painted } from "./map/MapCanvas";
 import { goTo } from "./state/actions";
@@ -7,21 +7,8 @@ import * as store from "./state/store";
 
 declare global {
   interface Window {
-    mapfoldBench?: (moves: number) => Promise<number[]>;
+    mapfoldBench?: (at: number) => Promise<number>;
   }
-}
-
-/** Milliseconds of each of some moves to moments all over the log; the same on every call. */
-async function bench(moves: number): Promise<number[]> {
-  const through = store.history.value?.through ?? 0;
-  const taken: number[] = [];
-  let seed = 12345;
-  for (let move = 0; move < moves; move++) {
-    seed = (seed * 1103515245 + 12345) % 2 ** 31;
-    const at = Math.floor((seed / 2 ** 31) * through);
-    taken.push(await timeOf(at));
-  }
-  return taken;
 }
 
 function timeOf(at: number): Promise<number> {
@@ -47,5 +34,5 @@ export function keepBench() {
     painted.delete(first);
   };
   painted.add(first);
-  if (new URLSearchParams(location.search).has("bench")) window.mapfoldBench = bench;
+  if (new URLSearchParams(location.search).has("bench")) window.mapfoldBench = timeOf;
 }

@@ -32,9 +32,14 @@ let moved = false;
 let wanted: Bounds | null = null;
 
 /** What the counts at the top left cover: a column, on a phone a row. */
-const FACTS_WIDE_PX = 212;
+const FACTS_WIDE_PX = 248;
+/** The buttons at the bottom right. */
+const ZOOM_WIDE_PX = 48;
 const FACTS_HIGH_PX = 44;
 const NARROW_PX = 520;
+
+/** What lies over a map. */
+const CONTROLS = ".facts, .zoom, .scale, .pane-title";
 
 /** How far a pointer moves until it drags. */
 const DRAG_PIXELS = 4;
@@ -47,7 +52,7 @@ export function fitView() {
   moved = false;
   wanted = null;
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  store.view.value = width <= NARROW_PX ? fitted(bounds, width, height, 0, FACTS_HIGH_PX) : fitted(bounds, width, height, FACTS_WIDE_PX);
+  store.view.value = width <= NARROW_PX ? fitted(bounds, width, height, 0, FACTS_HIGH_PX) : fitted(bounds, width, height, FACTS_WIDE_PX, 0, ZOOM_WIDE_PX);
 }
 
 /** What the canvas shows of the map, metres; null for the whole map. */
@@ -160,6 +165,8 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
     schedule();
   });
   observer.observe(canvas);
+  const controls = new ResizeObserver(schedule); // labels stand beside them
+  for (const each of document.querySelectorAll(CONTROLS)) controls.observe(each);
   const stopFitting = effect(() => {
     if (side === "main" && store.drawnBounds.value !== null && !moved) queueMicrotask(() => moved || fitView());
   });
@@ -169,6 +176,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
   });
   return () => {
     observer.disconnect();
+    controls.disconnect();
     stop();
     stopFitting();
     cancelAnimationFrame(frame);
@@ -178,7 +186,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
 /** Where counts, buttons and the scale are over a map. */
 function controlsOver(canvas: HTMLCanvasElement): Box[] {
   const { left, top } = canvas.getBoundingClientRect();
-  return [...document.querySelectorAll(".facts, .zoom, .scale, .pane-title")].map((control) => {
+  return [...document.querySelectorAll(CONTROLS)].map((control) => {
     const { x, y, width, height } = control.getBoundingClientRect();
     return { x: x - left - 3, y: y - top - 3, width: width + 6, height: height + 6 };
   });

@@ -83,12 +83,19 @@ function ring(on: Surface, scene: Scene, keyframe: number, selected: boolean) {
   if (selected) heading(on, sx, sy, yaw[keyframe], 20, scene.palette.accent);
 }
 
-/** The last keyframe with a pose: a filled arrow that points where the robot looks. */
+/** The last keyframe with a pose; -1 where that is on another floor. */
+export function robotAt({ history, map }: Scene): number {
+  const { x, yaw } = history.keyframes;
+  let last = map.keyframeCount - 1;
+  while (last >= 0 && Number.isNaN(yaw[last])) last--;
+  return last < 0 || Number.isNaN(x[last]) ? -1 : last;
+}
+
+/** A filled arrow that points where the robot looks. */
 export function drawRobot(on: Surface, scene: Scene) {
   const { x, y, yaw } = scene.history.keyframes;
-  let last = scene.map.keyframeCount - 1;
-  while (last >= 0 && Number.isNaN(yaw[last])) last--;
-  if (last < 0 || Number.isNaN(x[last])) return; // it is on another floor
+  const last = robotAt(scene);
+  if (last < 0) return;
   drawArrow(on, screenX(scene.view, x[last]), screenY(scene.view, y[last]), yaw[last], 11, scene.palette.ink, scene.palette.ground);
 }
 

@@ -5,6 +5,7 @@
 
 import { floorOfPlace } from "../model/floors";
 import { isolated, label, shortPlace, objectClass } from "../model/names";
+import { robotAt } from "./keyframes";
 import { isPlaceLit, litObject } from "./lit";
 import { placeColour, withAlpha } from "./palette";
 import type { Scene } from "./scene";
@@ -18,6 +19,8 @@ const SMALL_FONT = `11px ${FONT}`;
 const LIT_FONT = `600 12px ${FONT}`;
 const FAR_FONT = `600 11px ${FONT}`;
 const MOST = 400;
+/** On a map narrower than this a label is a name only, until it is seen from nearer. */
+const NARROW_PX = 520;
 
 interface Wanted {
   x: number;
@@ -43,35 +46,61 @@ export interface Box {
 }
 
 export function drawLabels(on: Surface, scene: Scene) {
-  const taken = reserved(scene);
-  const wanted = [...placeLabels(scene), ...objectLabels(scene), ...edgeLabels(scene)];
+  const [taken, avoided] = [reserved(scene), signs(scene)];
+  const wanted = [...goneLabels(scene), ...placeLabels(scene), ...objectLabels(scene), ...edgeLabels(scene)];
   for (const each of [...wanted.filter(({ first }) => first), ...wanted.filter(({ first }) => !first)].slice(0, MOST)) {
-    draw(on, scene, each, taken);
+    draw(on, scene, each, taken, avoided);
   }
 }
 
-/** Where an answer is drawn that labels must not cover. */
-function reserved({ bridge, lost, difference, view, controls }: Scene): Box[] {
+/** What labels must not cover: the robot, where an answer is drawn, controls. */
+function reserved(scene: Scene): Box[] {
+  const { bridge, lost, view, controls, history } = scene;
+  const robot = robotAt(scene);
   const spots = [
     ...(bridge?.chains.flatMap((chain) => chain.points) ?? []),
     ...(lost === null ? [] : [lost.pose, lost.truth, ...lost.others, ...lost.evidence]),
   ];
-  const gone = difference === null ? [] : goneAt(difference).map(([x, y]) => ({ x: screenX(view, x) - 55, y: screenY(view, y) + 13, width: 110, height: 18 }));
   const marked = spots.flatMap((spot) => (spot === null ? [] : [{ x: screenX(view, spot.x) - 12, y: screenY(view, spot.y) - 24, width: 24, height: 48 }]));
-  return [...marked, ...gone, ...controls];
+  const { x, y } = history.keyframes;
+  return [...marked, ...(robot < 0 ? [] : [about(screenX(view, x[robot]), screenY(view, y[robot]), 11)]), ...controls];
 }
 
-/** The middles, in metres, of places that a difference says are gone. */
-export function goneAt({ before, difference }: NonNullable<Scene["difference"]>): [number, number, number][] {
-  return [...difference.places]
+function about(x: number, y: number, reach: number): Box {
+  return { x: x - reach, y: y - reach, width: 2 * reach, height: 2 * reach };
+}
+
+/** The signs of objects, which labels cover only where they find no other spot. */
+function signs({ layers, view, map, history }: Scene): Box[] {
+  if (!layers.objects || view.k < NEAR) return [];
+  const { x, y, confirmed } = history.changes;
+  return map.objects
+    .map((object) => map.objectRow[object])
+    .filter((row) => layers.once || confirmed[row] === 1)
+    .map((row) => about(screenX(view, x[row]), screenY(view, y[row]), objectRadius(view.k)));
+}
+
+/** The places that a difference says are gone. */
+function goneLabels({ difference, history, palette, view }: Scene): Wanted[] {
+  if (difference === null) return [];
+  const { before } = difference;
+  return [...difference.difference.places]
     .filter(([place, change]) => change === "gone" && before.standsAs[place] === place)
-    .map(([place]) => [before.x[place], before.y[place], place]);
+    .map(([place]) => ({
+      x: screenX(view, before.x[place]),
+      y: screenY(view, before.y[place]),
+      away: 0,
+      text: `${isolated(label(shortPlace(history, place)))} gone`,
+      font: FAR_FONT,
+      colour: palette.removed,
+      first: true,
+    }));
 }
 
 function placeLabels(scene: Scene): Wanted[] {
   const { history, map, view, palette } = scene;
   const order = [...map.places].sort((a, b) => map.size[b] - map.size[a]);
-  const near = view.k >= NEAR;
+  const near = view.k >= NEAR * (scene.width < NARROW_PX ? 2 : 1);
   return order.map((place) => ({
     x: screenX(view, map.x[place]),
     y: screenY(view, map.y[place]),
@@ -133,19 +162,20 @@ const NUDGES: readonly (readonly [number, number])[] = [
   [0, 0], [0, -24], [0, 24], [44, 0], [-44, 0], [44, -24], [-44, 24], [0, -48], [0, 48],
 ];
 
-function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[]) {
+function draw(on: Surface, scene: Scene, wanted: Wanted, taken: Box[], avoided: readonly Box[]) {
   if (!(wanted.x > -20 && wanted.y > -20 && wanted.x < scene.width + 20 && wanted.y < scene.height + 20)) return;
   const main = widthOf(on, wanted.font, wanted.text);
   const second = wanted.second === undefined ? 0 : widthOf(on, SMALL_FONT, wanted.second) + 6;
   const width = main + second + (wanted.chip === undefined ? 4 : 24);
   const height = wanted.chip === undefined ? 15 : 21;
   const spots = candidates(wanted, width, height, scene.width);
-  const free = spots.find(
+  const all = spots.filter(
     (box) =>
       box.x >= 2 && box.y >= 2 && box.x + width <= scene.width - 2 && box.y + height <= scene.height - 2 &&
       !taken.some((other) => overlap(box, other)),
   );
-  if (free === undefined) return;
+  if (all.length === 0) return;
+  const free = all.find((box) => !avoided.some((sign) => overlap(box, sign))) ?? all[0];
   taken.push(free);
   write(on, scene, wanted, free, main);
 }

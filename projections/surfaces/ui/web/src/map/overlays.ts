@@ -1,8 +1,8 @@
 /** What an answer adds to the map: a difference, the bridge of a merge, where a lost robot may be. */
 
-import { isolated, label, shortPlace } from "../model/names";
+import { MANY } from "./dots";
 import { drawArrow, dotRadius } from "./keyframes";
-import { type Box, FONT, goneAt, overlap } from "./labels";
+import { type Box, FONT, overlap } from "./labels";
 import { withAlpha } from "./palette";
 import type { Bridge, Scene } from "./scene";
 import type { Surface } from "./surface";
@@ -21,12 +21,17 @@ export function drawDifference(on: Surface, scene: Scene) {
     for (const each of keyframes) {
       const [sx, sy] = [screenX(view, x[each]), screenY(view, y[each])];
       if (Number.isNaN(sx)) continue;
+      if (keyframes.length >= MANY) {
+        on.rect(sx - 1, sy - 1, 2, 2); // rings would cover the map
+        continue;
+      }
       on.moveTo(sx + radius, sy);
       on.arc(sx, sy, radius, 0, ROUND);
     }
-    on.strokeStyle = colour;
+    on.strokeStyle = on.fillStyle = colour;
     on.lineWidth = width;
-    on.stroke();
+    if (keyframes.length >= MANY) on.fill();
+    else on.stroke();
   };
   circles(difference.movedKeyframes, palette.moved, 1.6);
   circles(difference.newKeyframes, palette.added, 1.4);
@@ -39,15 +44,6 @@ export function drawDifference(on: Surface, scene: Scene) {
     if (history.changes.confirmed[shown] === 0 && !scene.layers.once) continue;
     const colour = { new: palette.added, gone: palette.removed, moved: palette.moved }[change];
     badge(on, screenX(view, history.changes.x[shown]), screenY(view, history.changes.y[shown]), colour, change);
-  }
-}
-
-/** Above the labels: the names of places that are gone. */
-export function drawGone(on: Surface, scene: Scene) {
-  if (scene.difference === null) return;
-  const { view, history, palette } = scene;
-  for (const [x, y, place] of goneAt(scene.difference)) {
-    text(on, scene, screenX(view, x), screenY(view, y) + 22, `${isolated(label(shortPlace(history, place)))} gone`, palette.removed);
   }
 }
 

@@ -3,7 +3,7 @@
 import { drawGrid, drawRegions, drawWalls } from "./ground";
 import { drawKeyframes, drawRobot } from "./keyframes";
 import { drawLabels } from "./labels";
-import { arrow, drawBridge, drawDifference, drawGone, drawLikely, drawLost, drawWay } from "./overlays";
+import { arrow, drawBridge, drawDifference, drawLikely, drawLost, drawWay } from "./overlays";
 import type { Scene } from "./scene";
 import type { Surface } from "./surface";
 import { drawEdges, drawObjects } from "./things";
@@ -20,7 +20,6 @@ export function paint(on: Surface, scene: Scene) {
   drawWay(on, scene);
   drawRobot(on, scene);
   if (scene.layers.labels) drawLabels(on, scene);
-  drawGone(on, scene);
   if (scene.bridge !== null) drawBridge(on, scene, scene.bridge);
   drawLost(on, scene);
   if (scene.drag !== null) arrow(on, scene, scene.drag.x0, scene.drag.y0, scene.drag.x1, scene.drag.y1);

@@ -3,7 +3,7 @@
 import type { History } from "../history/types";
 import type { MapState } from "./map_at";
 
-/** RUN/ID of a keyframe. */
+/** RUN/ID of a keyframe, as requests and links name it. */
 export function keyframeId(history: History, keyframe: number): string {
   const { run, id } = history.keyframes;
   return `${history.runIds[run[keyframe]]}/${id[keyframe]}`;
@@ -21,6 +21,9 @@ export function findKeyframe(history: History, text: string): number {
   }
   return -1;
 }
+
+/** RUN:ID, as commands and answers write a keyframe. */
+export const keyframeTitle = (id: string) => id.replace(/\/(?=[^/]*$)/, ":");
 
 const placeNumbers = new WeakMap<History, Map<string, number>>();
 const objectNumbers = new WeakMap<History, Map<string, number>>();

@@ -5,7 +5,7 @@ import type { FoundObject, NamedThing, Room } from "../api/types";
 import type { History } from "../history/types";
 import type { Thing } from "../state/store";
 import type { MapState } from "./map_at";
-import { counted, findKeyframe, findPlace, keyframeId, shortObject, shortPlace } from "./names";
+import { counted, findKeyframe, findPlace, keyframeId, keyframeTitle, shortObject, shortPlace } from "./names";
 
 export interface Hit {
   thing: Thing;
@@ -56,7 +56,7 @@ function keyframes(history: History, map: MapState, typed: string): Hit[] {
   if (keyframe < 0) return [];
   const offset = history.keyframes.offset[keyframe];
   const id = keyframeId(history, keyframe);
-  return [{ thing: { kind: "keyframe", id }, title: id, more: `event ${offset}`, from: keyframe < map.keyframeCount ? null : offset }];
+  return [{ thing: { kind: "keyframe", id }, title: keyframeTitle(id), more: `event ${offset}`, from: keyframe < map.keyframeCount ? null : offset }];
 }
 
 /** An answer of `find`: its room, how often and when last it was seen. */

@@ -4,7 +4,7 @@ import type { ComponentChildren } from "preact";
 import type { MapChange, Ref, Step } from "../api/types";
 import type { History } from "../history/types";
 import { bringIntoView } from "../map/MapCanvas";
-import { findPlace, isolated, label, shortPlace } from "../model/names";
+import { findPlace, isolated, keyframeTitle, label, shortObject, shortPlace } from "../model/names";
 import { positionOf, select, showEvent } from "../state/actions";
 import type { Asked } from "../state/answers";
 import { showNotice } from "../state/pointer";
@@ -36,9 +36,18 @@ export function ThingLink({ thing, children }: { thing: store.Thing; children?: 
       onMouseEnter={() => (store.hovered.value = thing)}
       onMouseLeave={() => (store.hovered.value = null)}
     >
-      <bdi>{children ?? label(thing.id, 40)}</bdi>
+      <bdi>{children ?? label(shortName(thing), 40)}</bdi>
     </button>
   );
+}
+
+/** What the map and commands call a thing. */
+function shortName({ kind, id }: store.Thing): string {
+  const history = store.history.value;
+  if (kind === "keyframe") return keyframeTitle(id);
+  if (kind === "object") return shortObject(id);
+  const place = kind === "place" && history !== null ? findPlace(history, id) : -1;
+  return history === null || place < 0 ? id : shortPlace(history, place);
 }
 
 /** The moment after an event, to click. */
@@ -121,14 +130,14 @@ export function Linked({ text, refs }: { text: string; refs: readonly Ref[] }) {
     const thing = { kind, id } as store.Thing;
     names.set(id, thing);
     if (name !== undefined) names.set(name, thing);
-    if (kind === "keyframe") names.set(id.replace(/\/(?=[^/]*$)/, ":"), thing);
+    if (kind === "keyframe") names.set(keyframeTitle(id), thing);
   }
   const parts: ComponentChildren[] = [];
   let rest = text;
   while (rest !== "") {
     const next = firstName(rest, names);
     if (next === null) break;
-    parts.push(rest.slice(0, next.at), <ThingLink thing={next.thing}>{label(next.name, 60)}</ThingLink>);
+    parts.push(rest.slice(0, next.at), <ThingLink thing={next.thing}>{label(next.name === next.thing.id ? shortName(next.thing) : next.name, 60)}</ThingLink>);
     rest = rest.slice(next.at + next.name.length);
   }
   return (

@@ -4,7 +4,7 @@ import { batch, signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
 import { address, getJson, postJson } from "../api/client";
 import type { Crop } from "../api/types";
-import { counted, findPlace, isolated, label, shortPlace } from "../model/names";
+import { counted, findPlace, isolated, keyframeTitle, label, shortPlace } from "../model/names";
 import { goTo } from "../state/actions";
 import { useAnswer } from "../state/answers";
 import { sentence } from "../state/loading";
@@ -73,7 +73,7 @@ export function Lost() {
     if (stale() || history === null) return;
     batch(() => {
       picked.value = found;
-      keyframe.value = found.keyframe;
+      keyframe.value = keyframeTitle(found.keyframe);
       fileName.value = answer.value = null;
       left.value = new Set();
       truth.value = found.truth === null ? null : { x: found.truth[0], y: found.truth[1], yaw: found.truth[2], floor: history.keyframes.floor[found.number] };
@@ -144,13 +144,13 @@ export function Lost() {
         onSubmit={(event) => {
           event.preventDefault();
           void turn(async (stale) => {
-            if (keyframe.value !== picked.value?.keyframe) await take({ keyframe: keyframe.value }, stale);
+            if (keyframeTitle(keyframe.value) !== keyframeTitle(picked.value?.keyframe ?? "")) await take({ keyframe: keyframe.value }, stale);
             await askPicked(stale);
           });
         }}
       >
         <p class="dim">Click on the map to ask from there, or name a keyframe.</p>
-        <label for="lost-keyframe">A keyframe whose crops to ask with, as RUN/ID</label>
+        <label for="lost-keyframe">A keyframe whose crops to ask with, as RUN:ID</label>
         <div class="form-row">
           <input id="lost-keyframe" type="text" spellcheck={false} autoComplete="off" value={keyframe.value} onInput={(event) => (keyframe.value = event.currentTarget.value)} />
           <button class="button main" type="submit" disabled={busy || keyframe.value === "" || chosen === 0}>

@@ -5,7 +5,7 @@ import { address } from "../api/client";
 import { isSaved } from "../api/saved";
 import type { Crop, FoundObject, FoundObjects, MapChanges, MapFacts, Room } from "../api/types";
 import type { History } from "../history/types";
-import { counted, findPlace, isolated, keyframeId, label, shortPlace } from "../model/names";
+import { counted, findPlace, isolated, keyframeId, keyframeTitle, label, shortPlace } from "../model/names";
 import { rowsBefore } from "../model/map_at";
 import { openPanel } from "../state/actions";
 import { useAnswer } from "../state/answers";
@@ -268,7 +268,7 @@ function Merges({ history, at }: { history: History; at: number }) {
               {label(shortPlace(history, survivor[row]))} ← {label(shortPlace(history, absorbed[row]))}
             </ThingLink>
             <span class="dim">
-              <bdi>{label(keyframeId(history, keyframe[row]), 24)}</bdi>
+              <bdi>{label(keyframeTitle(keyframeId(history, keyframe[row])), 24)}</bdi>
             </span>
           </li>
         ))}

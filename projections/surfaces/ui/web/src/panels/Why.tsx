@@ -8,7 +8,7 @@ import type { History } from "../history/types";
 import type { MapState } from "../model/map_at";
 import { floorName, floorOfObject, floorOfPlace, floorsOf } from "../model/floors";
 import { placeNow } from "../model/compare";
-import { counted, findKeyframe, findObject, findPlace, isolated, label, objectClass, placeTitle } from "../model/names";
+import { counted, findKeyframe, findObject, findPlace, isolated, keyframeTitle, label, objectClass, placeTitle } from "../model/names";
 import { openPanel, select } from "../state/actions";
 import { useAnswer } from "../state/answers";
 import { bridge } from "../state/overlays";
@@ -18,7 +18,7 @@ import { type MergeStory, BridgeView, bridgeOf } from "./BridgeView";
 import { Overview } from "./Overview";
 import { Way } from "./Way";
 import { Pictures } from "./Pictures";
-import { Answer, CommandLine, Lines, Steps, ThingLink } from "./AnswerParts";
+import { Answer, CommandLine, Lines, Linked, Steps, ThingLink } from "./AnswerParts";
 
 interface WhyAnswer {
   kind: string;
@@ -67,7 +67,7 @@ function Story({ thing, history }: { thing: store.Thing; history: History }) {
       <Answer asked={asked}>
         {(answer) => (
           <>
-            <p class="summary">{answer.summary}</p>
+            <p class="summary"><Linked text={answer.summary} refs={answer.steps?.flatMap(({ refs }) => refs ?? []) ?? []} /></p>
             {answer.merges?.map((merge) => <BridgeView key={merge.number} merge={merge} history={history} />)}
             <Pictures thing={thing} at={at} state={history.state} />
             {answer.kind === "merge" ? <Lines lines={answer.lines} /> : <Steps steps={answer.steps} />}
@@ -84,28 +84,28 @@ function Heading({ thing, history }: { thing: store.Thing; history: History }) {
   let title = thing.id;
   if (thing.kind === "place") {
     const place = findPlace(history, thing.id);
-    title = place >= 0 ? (map.name[place] ?? thing.id) : thing.id;
+    title = place >= 0 ? placeTitle(history, map, place) : thing.id;
   } else if (thing.kind === "object") {
     const object = findObject(history, thing.id);
     const absorbed = history.classes[history.found.class[object]];
     title = object >= 0 ? objectClass(history, map, object) || absorbed || thing.id : thing.id;
-  } else if (thing.kind === "merge") title = `Merge by event ${thing.id}`;
+  } else title = thing.kind === "merge" ? `Merge by event ${thing.id}` : keyframeTitle(thing.id);
   return (
     <header class="thing">
+      <button class="icon" type="button" aria-label="Select nothing" title="Back to all rooms and objects (Esc)" onClick={() => select(null)}>
+        <Icon name="back" />
+      </button>
       <div>
         <span class="kind">{thing.kind}</span>
         <h2>
           <bdi>{label(title, 120)}</bdi>
         </h2>
-        {title !== thing.id && thing.kind !== "merge" && (
+        {title !== thing.id && (thing.kind === "place" || thing.kind === "object") && (
           <code class="id">
             <bdi>{label(thing.id, 120)}</bdi>
           </code>
         )}
       </div>
-      <button class="icon" type="button" aria-label="Select nothing" title="Select nothing (Esc)" onClick={() => select(null)}>
-        <Icon name="close" />
-      </button>
     </header>
   );
 }

@@ -4,7 +4,7 @@ import { signal } from "@preact/signals";
 import type { History } from "../history/types";
 import type { Picked } from "../map/pick";
 import type { MapState } from "../model/map_at";
-import { isolated, keyframeId, label, objectClass, placeTitle } from "../model/names";
+import { isolated, keyframeId, keyframeTitle, label, objectClass, placeTitle } from "../model/names";
 import type { Proposal } from "./proposals";
 
 /** Whether a drag that begins on a thing corrects the map instead of moving the view. */
@@ -33,7 +33,7 @@ export function dropped(history: History, map: MapState, from: Grip, to: Grip | 
   if (one < 0 || other < 0) return null;
   const name = (place: number) => isolated(label(placeTitle(history, map, place), 24));
   if (one !== other) return { says: `Join ${name(one)} with ${name(other)}`, proposal: () => ({ kind: "join", arguments: [history.placeIds[one], history.placeIds[other]] }) };
-  const ends = () => [from, to].map(({ x, y }) => keyframeId(history, nearest(history, map, one, x, y)).replace(/\/(?=[^/]*$)/, ":"));
+  const ends = () => [from, to].map(({ x, y }) => keyframeTitle(keyframeId(history, nearest(history, map, one, x, y))));
   return { says: `Cut ${name(one)} between here and there`, proposal: () => ({ kind: "keep-apart", arguments: ends() }) };
 }
 

@@ -202,10 +202,10 @@ export const regions = computed(() => regionsIn(shown.value, floorsNow.value));
 /** Of a map under other settings the rule of places knows no walls. */
 export const otherRegions = computed(() => regionsIn(otherShown.value, NO_FLOORS));
 
-/** The map at the other moment of a comparison, while its panel is open. */
+/** The map at the other moment of a comparison, while its panel is open and that moment is not later. */
 export const comparedMap = computed<MapState | null>(() =>
-  panel.value === "compare" && compareMode.value === "moments" && compareWith.value !== null && history.value !== null
-    ? mapAt(history.value, Math.min(compareWith.value, history.value.through))
+  panel.value === "compare" && compareMode.value === "moments" && compareWith.value !== null && compareWith.value <= at.value && history.value !== null
+    ? mapAt(history.value, compareWith.value)
     : null,
 );
 /** Whether two maps are shown side by side. */

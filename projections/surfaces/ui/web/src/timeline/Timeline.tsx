@@ -65,8 +65,9 @@ function Transport() {
       </div>
       <MarkLegend />
       <span class="space" />
-      {corrected && <span class="dim known">as known</span>}
       {corrected && (
+        <div class="known">
+        <span class="dim">as known</span>
         <fieldset class="segments" aria-busy={store.wantedKnownAt.value !== store.shownKnownAt.value} title="then: under the corrections recorded before this moment; now: under all of them">
           <legend class="hidden">Corrections in force</legend>
           {(["then", "now"] as const).map((each) => (
@@ -76,6 +77,7 @@ function Transport() {
             </label>
           ))}
         </fieldset>
+        </div>
       )}
       <fieldset class="segments">
         <legend class="hidden">Axis of the timeline</legend>

@@ -36,7 +36,7 @@ export function Digest() {
         <span title="Things that were seen from several spots or at several times; those seen once are often errors of a detector">{objectsText(history, map)}</span>
         {map.noise > 0 && <span class="minor" title="Keyframes with too few others near them">{map.noise.toLocaleString("en")} in no place</span>}
         <button type="button" class="link" aria-expanded={open.value} title="SHA-256 of the whole map: equal maps have equal digests" onClick={() => (open.value = !open.value)}>
-          digest
+          {open.value ? "hide digest" : "show digest"}
         </button>
         {open.value && <code title={digest} data-digest={digest}>{digest.slice(0, 16) || "…"}</code>}
       </p>

@@ -8,15 +8,15 @@ import * as store from "../state/store";
 import { KIND_NAMES, drawMark } from "../timeline/marks";
 
 const LAYERS: [store.LayerName, string, preact.JSX.Element][] = [
-  ["regions", "place, keyframes in it", <rect x="2" y="4" width="16" height="10" rx="4" class="sign-region" />],
+  ["regions", "place", <rect x="2" y="4" width="16" height="10" rx="4" class="sign-region" />],
   ["keyframes", "keyframe / in no place", <><circle cx="6" cy="9" r="3.4" class="sign-dot" /><circle cx="15" cy="9" r="3" class="sign-hollow" /></>],
   ["path", "drive", <><path d="M2 13 Q7 3 12 8" class="sign-line" /><path d="M18 8 11 4.6 12.6 8 11 11.4z" class="sign-fill" /></>],
   ["objects", "object / missing", <><path d="M6 5l4 4-4 4-4-4z" class="sign-fill" /><path d="M15 5l4 4-4 4-4-4z" class="sign-missing" /></>],
   ["once", "object seen once", <path d="M10 5l4 4-4 4-4-4z" class="sign-faint" />],
   ["ellipses", "95 % area", <ellipse cx="10" cy="9" rx="8" ry="4.5" class="sign-hollow" />],
-  ["edges", "drives between", <path d="M1 9H19" class="sign-dashed" />],
+  ["edges", "2× drives between", <path d="M1 9H19" class="sign-dashed" />],
   ["walls", "wall", <path d="M2 14V5H18" class="sign-wall" />],
-  ["labels", "labels", <text x="3" y="13" class="sign-text">ab</text>],
+  ["labels", "name, keyframes", <text x="0" y="13" class="sign-text">p2 7</text>],
 ];
 
 export function Legend() {
@@ -30,7 +30,7 @@ export function Legend() {
       {there.map(([name, says, sign]) => (
         <label key={name} class={shown[name] ? "" : "off"} title={shown[name] ? `Hide: ${says}` : `Show: ${says}`}>
           <input type="checkbox" class="hidden" checked={shown[name]} onChange={() => (store.layers.value = { ...shown, [name]: !shown[name] })} />
-          <svg viewBox="0 0 20 18" width="20" height="18" aria-hidden="true">{sign}</svg>
+          <svg viewBox={name === "labels" ? "0 0 30 18" : "0 0 20 18"} width={name === "labels" ? "30" : "20"} height="18" aria-hidden="true">{sign}</svg>
           {says}
         </label>
       ))}

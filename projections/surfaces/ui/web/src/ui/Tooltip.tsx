@@ -1,7 +1,7 @@
 /** What is under the pointer, in a few lines. */
 
 import { placeNow } from "../model/compare";
-import { counted, isolated, label, placeTitle } from "../model/names";
+import { counted, isolated, keyframeTitle, label, placeTitle } from "../model/names";
 import { markTip, tip } from "../state/pointer";
 import * as store from "../state/store";
 import { when } from "./summary";
@@ -37,10 +37,9 @@ function thingLines({ thing, number, side }: NonNullable<typeof tip.value>): str
   switch (thing.kind) {
     case "place": {
       if (map.standsAs[number] !== number) return [];
-      const name = map.name[number];
       return [
-        isolated(label(name ?? history.placeIds[number], 48)),
-        ...(name === null ? [] : [isolated(label(history.placeIds[number], 48))]),
+        isolated(label(placeTitle(history, map, number), 48)),
+        isolated(label(history.placeIds[number], 48)),
         counted(map.size[number], "keyframe"),
       ];
     }
@@ -59,7 +58,7 @@ function thingLines({ thing, number, side }: NonNullable<typeof tip.value>): str
       if (number >= map.keyframeCount) return [];
       const { x, y, yaw, offset, stamp } = history.keyframes;
       return [
-        isolated(label(thing.id, 48)),
+        isolated(label(keyframeTitle(thing.id), 48)),
         place(map.placeOf[number]),
         `at (${x[number].toFixed(2)}, ${y[number].toFixed(2)}) m, facing ${Math.round((yaw[number] * 180) / Math.PI)}°`,
         `event ${offset[number]}  ${when(stamp[number])}`,
