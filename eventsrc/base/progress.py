@@ -16,9 +16,11 @@ _T = TypeVar("_T")
 
 
 class _Receiver:
-    """The function that receives reports; None drops them."""
+    """The function that receives reports; None drops them. So does work on ``items`` of stages that
+    report how many of them are done."""
 
     receive: Receiver | None = None
+    items = 0
 
 
 def send_progress_to(receive: Receiver | None) -> None:
@@ -28,17 +30,22 @@ def send_progress_to(receive: Receiver | None) -> None:
 
 def report_progress(stage: str, done: int, total: int, unit: str = "events") -> None:
     """Report ``done`` of ``total``. With ``done >= total > 0`` the stage ends."""
-    if _Receiver.receive is not None:
+    if _Receiver.receive is not None and not _Receiver.items:
         _Receiver.receive(stage, done, total, unit)
 
 
 def reported(items: Iterable[_T], stage: str, total: int, unit: str) -> Iterator[_T]:
-    """Yield ``items``, ``total`` in number, and report each as done when the next is requested. The
-    stage ends after the last one, or when the caller closes the iterator."""
+    """Yield ``items``, ``total`` in number, and report each as done when the next is requested, but
+    no stage within the work on one. The stage ends after the last one, or when the caller closes
+    the iterator."""
     try:
         for done, item in enumerate(items):
             report_progress(stage, done, total, unit)
-            yield item
+            _Receiver.items += 1
+            try:
+                yield item
+            finally:
+                _Receiver.items -= 1
     finally:
         report_progress(stage, max(total, 1), max(total, 1), unit)
 

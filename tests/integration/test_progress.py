@@ -191,6 +191,18 @@ def test_a_stage_ends_however_it_is_left() -> None:
     ]
 
 
+def test_a_stage_within_the_work_on_an_item_is_not_reported() -> None:
+    """Many short ones would each end before a bar comes, as the reading of a log for each run."""
+
+    def nested() -> None:
+        for _ in reported(range(2), "mapping each run", 2, "runs"):
+            list(reported(range(9), "reading the log", 9, "events"))
+        report_progress("aligning", 1, 2)
+
+    runs = [("mapping each run", done, 2, "runs") for done in (0, 1, 2)]
+    assert reports_of(nested) == [*runs, ("aligning", 1, 2, "events")]
+
+
 @pytest.fixture
 def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
     """What a terminal gets, with a bar that does not wait."""

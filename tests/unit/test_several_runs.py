@@ -1,12 +1,17 @@
 """Several runs in one frame, by pairs whose transforms are known."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from eventsrc.envelope.model import RunId
+from eventsrc.log import LogReader
+from projections.fold.corrections import NO_CORRECTIONS
+from projections.fold.settings import CameraSettings, Settings
 from projections.localize.align.alignment import Alignment
+from projections.localize.align.framed_things import map_of_runs, maps_of_runs
 from projections.localize.align.matching import Transform
 from projections.localize.align.several import (
     Contradiction,
@@ -16,6 +21,7 @@ from projections.localize.align.several import (
     _inverse,
     placed_runs,
 )
+from tests.support.logs import walk, write_log
 
 FRAMES: list[Transform] = [(0.0, 0.0, 0.0), (4.0, -9.0, 2.5), (-20.0, 3.0, -1.0), (7.0, 7.0, 0.4)]
 RUNS = [RunId(name) for name in "abcd"]
@@ -86,3 +92,24 @@ def test_runs_of_other_buildings_have_frames_of_their_own() -> None:
         "d": ("b", "likely"),
     }
     assert placed(count=2) == ({}, [])
+
+
+def test_each_run_is_mapped_alone_by_one_pass(tmp_path: Path) -> None:
+    """As by a fold of the log without the others."""
+    runs = [RunId(name) for name in ("run-a", "run-b", "run-c")]
+    documents = [walk(25, run_id=run, seed=number) for number, run in enumerate(runs)]
+    path = write_log(
+        tmp_path / "log", [each for keyframe in zip(*documents, strict=True) for each in keyframe]
+    )
+    settings = Settings(camera=CameraSettings(hfov_deg=69.4))
+    with LogReader(path) as reader:
+        end = reader.next_offset
+        found = maps_of_runs(reader, end, NO_CORRECTIONS, settings, runs)
+        for run in runs:
+            others = set(runs) - {run}
+            alone = map_of_runs(reader, end, NO_CORRECTIONS, settings, others)
+            assert [each.keyframe_id for each in found[run].keyframes] == list(range(25))
+            objects = [[str(o) for o in each.objects.values()] for each in (found[run], alone)]
+            assert objects[0] == objects[1] != []
+            seen = [[str(o) for o in each.observations] for each in (found[run], alone)]
+            assert seen[0] == seen[1]

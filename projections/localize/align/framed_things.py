@@ -11,15 +11,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from eventsrc.envelope.model import KeyframeId, Offset, RunId
+from eventsrc.base.progress import report_progress
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import FIRST_OFFSET, KeyframeId, Offset, RunId
 from eventsrc.log import LogReader
 from projections.fold.corrections import Corrections
 from projections.fold.exact import UNIT
+from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
 from projections.fold.sights import camera_of
 from projections.localize.relocalize.camera import Cameras, box_rows, camera_values, sights
 from projections.localize.relocalize.candidates import ExactIndex
-from projections.map.fold import fold_log
+from projections.map.fold import fold_log, fold_parsed, new_map, read_ahead
+from projections.map.parsing import parsed_stretches
 from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
@@ -92,6 +96,33 @@ def map_of_runs(
             forgotten_ranges=ranges,
         ),
     )[1]
+
+
+def maps_of_runs(
+    reader: LogReader,
+    end: Offset,
+    corrections: Corrections,
+    settings: Settings,
+    runs: Collection[RunId],
+) -> dict[RunId, MapView]:
+    """The map of each run alone, as by `map_of_runs` without the others, by one pass over the log:
+    an envelope is folded into the map of its run only."""
+    by_evidence = settings.with_assignments(["fusion=evidence"])
+    maps, views = dict[RunId, SemanticMap](), dict[RunId, MapView]()
+    for run in runs:
+        others = corrections.forgotten_runs.union(set(runs) - {run})
+        own = msgspec.structs.replace(corrections, forgotten_runs=others)
+        maps[run] = new_map(reader, by_evidence, own)
+        views[run] = MapView(by_evidence, corrections=own)
+    parsed = parsed_stretches(reader.read(FIRST_OFFSET, end))
+    for stretch in read_ahead(parsed, *maps.values()):
+        for event in stretch:
+            one = event.parsed.envelope.run_id if isinstance(event.parsed, Accepted) else None
+            for run in maps if one is None else maps.keys() & {one}:
+                views[run].apply_event(event.offset, fold_parsed(event, maps[run]))
+        report_progress("mapping each run", stretch[-1].offset + 1, max(end, 1))
+    report_progress("mapping each run", max(end, 1), max(end, 1))
+    return views
 
 
 def things_of_map(view: MapView) -> FramedThings | None:

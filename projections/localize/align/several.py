@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from eventsrc.base.progress import reported
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 
@@ -94,7 +95,8 @@ def align_runs(things: Mapping[RunId, FramedThings]) -> tuple[list[PlacedRun], l
     """The runs that have a place in the frame of an earlier one, and the pairs that contradict."""
     runs = list(things)
     pairs = []
-    for one, other in combinations(range(len(runs)), 2):
+    every = list(combinations(range(len(runs)), 2))
+    for one, other in reported(every, "aligning pairs of runs", len(every), "pairs"):
         found = align(things[runs[one]], things[runs[other]])
         if found is not None and found.verdict != "unknown":
             pairs.append(RunPair(one, other, found))

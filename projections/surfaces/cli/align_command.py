@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.base.progress import reported
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
@@ -102,16 +103,17 @@ class _Frames(CachedLog):
             reader, end, _, corrections, settings = opened
             view = self._view(opened)
             runs = [run.run_id for run in view.runs]
+            chosen = runs if self.run is None else [self._known(runs, self.run)]
             return [
                 _of_step(run, step)
-                for run in (runs if self.run is None else [self._known(runs, self.run)])
+                for run in reported(chosen, "looking for jumps", len(chosen), "runs")
                 for step in jumps_of_run(reader, end, corrections, settings, view, run)
             ]
 
     def all_runs(self) -> tuple[list[_Proposal], list["Contradiction"]] | None:
         """Every run in the frame of the first that it can be joined with, and the pairs that
         contradict the others; None for a log of less than three runs."""
-        from projections.localize.align.framed_things import map_of_runs, things_of_map
+        from projections.localize.align.framed_things import maps_of_runs, things_of_map
         from projections.localize.align.several import align_runs
 
         with self.opened() as opened:
@@ -119,10 +121,7 @@ class _Frames(CachedLog):
             runs = [run.run_id for run in self._view(opened).runs]
             if len(runs) < _SEVERAL:
                 return None
-            maps = {
-                run: map_of_runs(reader, end, corrections, settings, set(runs) - {run})
-                for run in runs
-            }
+            maps = maps_of_runs(reader, end, corrections, settings, runs)
         made = {run: things_of_map(each) for run, each in maps.items()}
         placed, against = align_runs({run: each for run, each in made.items() if each is not None})
         proposals = [
