@@ -1,15 +1,16 @@
 """Whether runs in frames of their own find each other, and runs of other buildings do not: the
 table of ``scripts/bench_truth --align``.
 
-Each later run of a building, its frame moved at random, against run a, and against run a of the
-other buildings of the same robot; both whole and in thirds. With ``--jumps``: runs whose frame is
-set wrong in the middle, and runs as they are.
+Each later run of a building, its frame moved at random, against run a, and every run against those
+of the other buildings of the same robot; both whole and in thirds. With ``--jumps``: runs whose
+frame is set wrong in the middle, and runs as they are.
 """
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import msgspec
@@ -74,27 +75,25 @@ class _Part:
 
 
 def align_rows(cases: Iterable[Case], seed: int) -> Iterator[AlignRow]:
-    """All parts of later runs against all parts of runs a of the same robot."""
+    """All parts of a building's later runs against all parts of its run a, and all parts of every
+    two runs of two buildings of the same robot; each run is mapped once."""
     chance = np.random.default_rng(seed)
-    firsts: dict[str, list[_Part]] = {}
-    later: dict[str, list[_Part]] = {}
+    runs: dict[str, list[tuple[str, str, list[_Part]]]] = {}
     for case in cases:
+        profile = case.name.split()[0]
         for run in dict.fromkeys(event.envelope.run_id for event in case.events):
             events = [event for event in case.events if event.envelope.run_id == run]
-            if run == case.first_run:
-                firsts[case.name] = list(_parts(case, events, (0.0, 0.0, 0.0)))
-                continue
             x, y, angle = chance.uniform(-1.0, 1.0, 3).tolist()
             frame = x * _REACH_M, y * _REACH_M, angle * math.pi
-            later[f"{case.name} {run}"] = list(_parts(case, events, frame))
-    for name, parts in later.items():
-        building = name.rpartition(" ")[0]
-        for other, of_first in firsts.items():
-            if other.split()[0] == building.split()[0]:
-                where = name if other == building else f"{name} in {other}"
-                for one in of_first:
-                    for part in parts:
-                        yield _row(where, one, part, is_there=other == building)
+            parts = list(_parts(case, events, (0.0, 0.0, 0.0) if run == case.first_run else frame))
+            for other, name, known in runs.get(profile, []):
+                is_there = other == case.name
+                if is_there and not name.endswith(case.first_run):
+                    continue
+                where = f"{case.name} {run}" + ("" if is_there else f" in {name}")
+                for one, part in product(known, parts):
+                    yield _row(where, one, part, is_there=is_there)
+            runs.setdefault(profile, []).append((case.name, f"{case.name} {run}", parts))
 
 
 def _parts(case: Case, events: Sequence[Accepted], frame: Frame) -> Iterator[_Part]:
