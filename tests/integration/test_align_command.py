@@ -97,8 +97,9 @@ def test_all_runs_are_brought_into_the_frame_of_the_first(mapfold: Commands) -> 
 
 @pytest.mark.slow
 def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
+    """By what both parts of the run and another run, in a frame of its own, have seen."""
     bad = "".join(json.dumps(each | {"camera": CAMERA}) + "\n" for each in jumped("a", 200))
-    log = log_of(mapfold, "log", bad, lines("b", HERE))
+    log = log_of(mapfold, "log", bad, lines("b", FRAME))
     said = mapfold("align", log, "--jumps", code=3)
     assert said.out.startswith("sim-7-a: a step of ")
     assert "from there to the end moved by (" in said.out

@@ -22,7 +22,7 @@ from projections.localize.align import matching
 from projections.localize.align.alignment import align, decision_text
 from projections.localize.align.framed_things import FramedThings, things_of_map
 from projections.localize.align.jumps import LargeStep, find_jumps
-from projections.localize.align.matching import Comparison, _best_matching, moved
+from projections.localize.align.matching import Comparison, Tie, _best_matching, moved
 from tests.support.folds import Folded
 from tests.support.logs import simulated
 
@@ -101,6 +101,22 @@ def test_of_floors_that_look_alike_none_is_taken() -> None:
     assert found.verdict == "unknown"
     assert found.is_ambiguous
     assert "but another transform has" in decision_text(found)
+
+
+def test_a_tie_adds_to_what_keeps_it_and_rules_out_the_rest() -> None:
+    frame = (12.0, -7.0, 2.1)
+    there, here = things("b", frame), things("b")
+    free = align(things("a"), there)
+    tie = Tie(there.poses[9], here.poses[9], 0.3, 0.2)
+    tied = align(things("a"), there, tie)
+    assert free is not None
+    assert tied is not None
+    assert tied.transform == pytest.approx(free.transform, abs=0.05)
+    assert tied.score > free.score + 3.0
+    assert tied.se_m < free.se_m
+    elsewhere = tie._replace(to=here.poses[9] + (4.0, 4.0, 1.0))
+    wrong = align(things("a"), there, elsewhere)
+    assert wrong is None or wrong.verdict == "unknown"
 
 
 def test_nothing_in_common_is_said() -> None:

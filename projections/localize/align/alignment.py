@@ -27,6 +27,7 @@ from .matching import (
     Floats,
     Indices,
     MatchedPairs,
+    Tie,
     Transform,
     jacobians,
     moved,
@@ -38,6 +39,8 @@ Verdict = Literal["sure", "likely", "unknown"]
 USUALLY_ENOUGH: Final = 12
 """Common things from which nine of ten are decided."""
 _FIRST_SLACK_M: Final = 0.45
+_ERRORS: Final = 3.0
+"""Standard errors within which a tie is kept."""
 _REFINED, _ELSEWHERE = 5, 10
 _OTHER_M, _OTHER_RAD = 1.0, 0.35
 _MOST: Final = 60
@@ -140,9 +143,11 @@ class Alignment:
         }
 
 
-def align(first: FramedThings, second: FramedThings) -> Alignment | None:
-    """The transform of ``second`` into the frame of ``first``; None if no two pairs agree. Raises
-    MisuseError if their looks are of different embedding spaces."""
+def align(first: FramedThings, second: FramedThings, tie: Tie | None = None) -> Alignment | None:
+    """The transform of ``second`` into the frame of ``first``; None if no two pairs agree. Given a
+    tie, the best one that keeps it, whose score the tie adds to, and that the maps are in one frame
+    already may be the runner-up. Raises MisuseError if their looks are of different embedding
+    spaces."""
     spaces = [(each.space, each.looks.shape[1]) for each in (first, second)]
     if spaces[0] != spaces[1]:
         named = " and ".join(f"{visible(str(name))} ({size})" for name, size in spaces)
@@ -150,21 +155,26 @@ def align(first: FramedThings, second: FramedThings) -> Alignment | None:
             f"the embeddings are of different spaces, {named}: `{advised('reembed')}` adds vectors"
             " of another model to a log, and --space chooses them"
         )
-    both = Comparison(first, second)
-    found = _candidates(both)
-    if not found:
+    both = Comparison(first, second, tie)
+    refined = _refined(both, _candidates(both) + ([] if tie is None else [tie.transform]))
+    best = max(refined, key=lambda each: each.score, default=None)
+    if best is None or len(best) < 2:
         return None
+    if tie is not None:
+        refined.append(Comparison(first, second).refined((0.0, 0.0, 0.0)))
+    return _judged(both, best, refined)
+
+
+def _refined(both: Comparison, found: list[Transform]) -> list[MatchedPairs]:
+    """The matchings near the candidates that promise most, and near some that lie elsewhere."""
     rough = [both.matching(each, _FIRST_SLACK_M).score for each in found]
     order = sorted(range(len(found)), key=lambda i: (-rough[i], i))
     refined = [both.refined(found[i]) for i in order[:_REFINED]]
-    best = max(refined, key=lambda each: each.score)
-    middle = second.middle[None]
+    if not refined:
+        return []
+    best, middle = max(refined, key=lambda each: each.score), both.second.middle[None]
     far = [found[i] for i in order[_REFINED:] if _is_other(found[i], best.transform, middle)]
-    refined += [both.refined(each) for each in far[:_ELSEWHERE]]
-    best = max(refined, key=lambda each: each.score)
-    if len(best) < 2:
-        return None
-    return _judged(both, best, refined)
+    return refined + [both.refined(each) for each in far[:_ELSEWHERE]]
 
 
 def _is_other(one: Transform, other: Transform, middle: NDArray[np.float64]) -> bool:
@@ -201,7 +211,7 @@ def _judged(both: Comparison, best: MatchedPairs, refined: list[MatchedPairs]) -
             )
         ),
         tuple(first.classes[best.firsts].tolist()),
-        best.score,
+        best.score + both.tie_value(best.transform),
         runner_up,
         int(expected.sum()),
         int((expected & matched).sum()),
@@ -250,6 +260,15 @@ def _candidates(both: Comparison) -> list[Transform]:
     if voted is None:
         return []
     x, y, angle, weight, length = voted
+    if both.tie is not None:
+        aside = both.tie.pose[:2] - both.second.middle
+        cos, sin = np.cos(angle), np.sin(angle)
+        to_x = x + cos * aside[0] - sin * aside[1] - both.tie.to[0]
+        to_y = y + sin * aside[0] + cos * aside[1] - both.tie.to[1]
+        keeps = np.hypot(to_x, to_y) < _ERRORS * both.tie.error_m + _FIRST_SLACK_M
+        if not keeps.any():
+            return []
+        x, y, angle, weight, length = (each[keeps] for each in (x, y, angle, weight, length))
     place = np.column_stack((x / _CELL_M, y / _CELL_M, (angle % math.tau) / math.tau * _SECTORS))
     cells, sums = _cells(place, weight)
     order = np.argsort(place[:, 0], kind="stable")

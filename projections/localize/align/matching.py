@@ -91,6 +91,29 @@ def rotation(angle: float) -> Floats:
     return np.array(((cos, -sin), (sin, cos)))
 
 
+class Tie(NamedTuple):
+    """Where a pose of the second map lies in the first one's frame, beside the things: near ``to``,
+    poses (3,) in m and radians, with a standard error in m and one in radians."""
+
+    pose: Floats
+    to: Floats
+    error_m: float
+    error_rad: float
+
+    @property
+    def transform(self) -> Transform:
+        """That which brings the pose there."""
+        angle = math.remainder(float(self.to[2] - self.pose[2]), math.tau)
+        x, y = (self.to[:2] - rotation(angle) @ self.pose[:2]).tolist()
+        return x, y, angle
+
+    def apart(self, transform: Transform) -> tuple[float, float]:
+        """How far from there a transform brings the pose, and by which angle it is off."""
+        ((x, y),) = moved(self.pose[None, :2], transform).tolist()
+        off = math.remainder(float(self.to[2] - self.pose[2]) - transform[2], math.tau)
+        return math.hypot(x - self.to[0], y - self.to[1]), off
+
+
 class _Looks(NamedTuple):
     """The looks of n things that are compared, and from which ``sides`` they are; ``rows`` (n, k)
     are those of each, of which it has ``counts`` (n,), the rest -1."""
@@ -118,8 +141,8 @@ class _Looks(NamedTuple):
 class Comparison:
     """Two maps' things, with the likeness of all pairs of their looks."""
 
-    def __init__(self, first: FramedThings, second: FramedThings) -> None:
-        self.first, self.second = first, second
+    def __init__(self, first: FramedThings, second: FramedThings, tie: Tie | None = None) -> None:
+        self.first, self.second, self.tie = first, second, tie
         self._tree, self._looked_at = cKDTree(first.xy), cKDTree(first.looked_at)
         self._table, self._other_run = LookRatios(EvidenceConstants()), np.ones((1, 1), np.bool_)
         self._looks = _Looks.of(first), _Looks.of(second)
@@ -217,6 +240,18 @@ class Comparison:
         last = self.matching(transform)
         return last if best is None or last.score >= best.score else best
 
+    def tie_value(self, transform: Transform) -> float:
+        """The log-likelihood ratio of the tie, against a pose anywhere on the ground that the first
+        robot drove and at any angle; 0 without a tie."""
+        if self.tie is None:
+            return 0.0
+        wide, high = np.ptp(self.first.poses[:, :2], axis=0) + 2.0 * _REACH_M
+        _, _, error_m, error_rad = self.tie
+        aside_m, turned = self.tie.apart(transform)
+        chi2 = (aside_m / error_m) ** 2 + (turned / error_rad) ** 2
+        chance = math.tau**1.5 * error_m**2 * error_rad / (float(wide * high) * math.tau)
+        return -0.5 * chi2 - math.log(chance)
+
     def is_expected(self, transform: Transform) -> NDArray[np.bool_]:
         """Which things of the second map the first robot should have seen under a transform: it
         looked at where they stand, and they were seen twice or more."""
@@ -250,7 +285,17 @@ class Comparison:
         weights /= (1.0 + chi2 / _CAUCHY)[:, None, None]
         slopes = jacobians(turned)
         information = np.einsum("nki,nkl,nlj->ij", slopes, weights, slopes) + 1e-9 * np.eye(3)
-        return information, np.einsum("nki,nkl,nl->i", slopes, weights, apart)
+        gradient: Floats = np.einsum("nki,nkl,nl->i", slopes, weights, apart)
+        if self.tie is not None:
+            pose, to, error_m, error_rad = self.tie
+            turned = pose[None, :2] @ rotation(transform[2]).T
+            slope = np.vstack((jacobians(turned)[0], (0.0, 0.0, 1.0)))
+            off = np.append(to[:2] - turned[0] - transform[:2], 0.0)
+            off[2] = math.remainder(float(to[2] - pose[2]) - transform[2], math.tau)
+            weight = np.diag((error_m**-2, error_m**-2, error_rad**-2))
+            information += slope.T @ weight @ slope
+            gradient += slope.T @ weight @ off
+        return information, gradient
 
     def _spread(
         self, transform: Transform, firsts: Indices, seconds: Indices, slack_m: float
