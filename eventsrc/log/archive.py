@@ -30,19 +30,15 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
+from .archive_place import note_archive_place, place_locked
 from .durable_files import write_all
 from .lock import is_held
 from .reader import LogReader
 from .redact import read_redactions
 from .seal import NO_PREVIOUS, REPLACES, file_sha256
 from .sealed_end import segments_of
-from .sealed_segment import (
-    ArchivePlace,
-    SealedFile,
-    archive_place,
-    check_sealed,
-    note_archive_place,
-)
+from .sealed_segment import SealedFile, check_sealed
+from .segment import Unreadable
 from .verify_events import Kind
 from .writer import LogWriter
 
@@ -51,8 +47,7 @@ IDENTITY: Final = "archive.json"
 MANIFEST: Final = "manifest/"
 KEPT: Final = "kept/"
 SEGMENTS: Final = "segments/"
-READERS: Final = 16
-"""Threads that read small objects: each waits for the network."""
+READERS: Final = 16  # threads: each waits for the network
 
 
 class NothingSealed(LogError):
@@ -284,7 +279,8 @@ class _Archiver:
         self._log, self._archive, self._store = log, archive, archive.store
         self._entries = {each.base: each for each in archive.entries()}
         with LogReader(log) as reader:
-            self._redacted = {each.base for _, each in read_redactions(reader)}
+            self._unread: list[Unreadable] = []
+            self._redacted = {e.base for _, e in read_redactions(reader, self._unread.append)}
         self._at: int = FIRST_OFFSET
         self._expected = frozenset({NO_PREVIOUS})
         self._added = self._bytes = self._replaced = 0
@@ -301,10 +297,14 @@ class _Archiver:
         report_progress("archiving", total, total, "segments")
         if self._redacted:
             self._delete_redacted()
-        place = archive_place(self._log)
-        is_other = place is None or (place.url != self._store.url and not place.objects)
-        if is_other and os.access(self._log, os.W_OK):
-            note_archive_place(self._log, ArchivePlace(self._store.url))
+        if self._unread:
+            raise LogDamaged(
+                f"{self._log}: redactions cannot be read: {self._unread[0].reason}; what they"
+                f" erased may be in {self._store.url} still"
+            )
+        if os.access(self._log, os.W_OK):
+            with place_locked(self._log):
+                note_archive_place(self._log, self._store.url)
         events = max((each.following for each in self._entries.values()), default=0)
         return Archived(
             self._archive.log_id,

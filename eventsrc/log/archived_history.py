@@ -34,9 +34,9 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
 from .archive import KEPT, Archive
+from .archive_place import archive_place, stand_in
 from .log_identity import STANDS_FOR, Span, cache_folder, make_cache_folder, write_cache_file
 from .sealed_end import sealed_end
-from .sealed_segment import archive_place, stand_in
 
 _NAME: Final = re.compile(r"[0-9a-f]{16}-(?:\d{20}-)?(\d{20})(?:\.\d+)?\.\w+")
 _PACKED: Final = ".packed"

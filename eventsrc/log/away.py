@@ -28,6 +28,13 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
 from .archive import READERS, SEGMENTS, Archive, ManifestEntry
+from .archive_place import (
+    archive_place,
+    delete_stand_ins,
+    note_archive_place,
+    place_locked,
+    stand_in,
+)
 from .archived_history import restore_kept
 from .durable_files import (
     delete_durably,
@@ -36,17 +43,11 @@ from .durable_files import (
     sync_file,
     unlink_quietly,
 )
-from .lock import WriterLock
+from .lock import WriterLock, file_locked
 from .log_identity import cache_folder, write_cache_file
 from .seal import file_sha256
 from .sealed_end import SealedEnd, sealed_end, segments_of, write_sealed_end
-from .sealed_segment import (
-    ArchivePlace,
-    SealedFile,
-    archive_place,
-    note_archive_place,
-    stand_in,
-)
+from .sealed_segment import SealedFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,8 @@ def restore_log(
         raise ArchiveError(f"{archive.store.url} has no segment yet")
     wanted = [each for each in entries if until is None or each.base < max(until, 1)]
     here = [each for each in wanted if each.following > start] or wanted[-1:]
+    if log.is_dir():
+        delete_stand_ins(log)  # a restore was killed
     if _has_away(log, archive):
         fetched = _bring_back(log, archive, here)
         end = sealed_end(log)
@@ -110,10 +113,10 @@ def _has_away(log: Path, archive: Archive) -> bool:
 
 def _bring_back(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> list[ManifestEntry]:
     away = {each.base for each in names.list_growing(log) if each.away}
-    fetched = _fetch_segments(log, archive, [each for each in wanted if each.base in away])
-    for each in fetched:
-        delete_durably(_away_path(log, each))
-    return fetched
+    try:
+        return _fetch_segments(log, archive, [each for each in wanted if each.base in away])
+    finally:
+        delete_stand_ins(log)
 
 
 def _away_path(log: Path, entry: ManifestEntry) -> Path:
@@ -123,27 +126,42 @@ def _away_path(log: Path, entry: ManifestEntry) -> Path:
 def _make_away(log: Path, archive: Archive, entries: Sequence[ManifestEntry]) -> None:
     """Make files that stand for archived segments which are not here. Where they are is noted
     first."""
-    place = archive_place(log)
-    noted = {} if place is None or place.url != archive.store.url else dict(place.objects)
-    objects = noted | {_away_path(log, each).name: each.object for each in entries}
-    if place is None or (place.url, place.objects) != (archive.store.url, objects):
-        note_archive_place(log, ArchivePlace(archive.store.url, objects))
+    with place_locked(log):
+        away = {_away_path(log, each).name: each.object for each in entries}
+        note_archive_place(log, archive.store.url, away)
 
     def make(entry: ManifestEntry) -> None:
-        ends = {
-            at: archive.store.part(entry.object, at, end)
-            for at, end in (
-                (0, min(names.HEAD_BYTES, entry.index_at)),
-                (entry.index_at, entry.size),
-            )
-        }
-        stand_in(_away_path(log, entry), entry.size, ends)
+        stand_in_for(archive, entry, _away_path(log, entry))
 
     missing = [each for each in entries if not _away_path(log, each).exists()]
     with ThreadPoolExecutor(READERS) as pool:
         for number, _ in enumerate(pool.map(make, missing)):
             report_progress("reading indexes", number, len(missing), "segments")
     report_progress("reading indexes", max(len(missing), 1), max(len(missing), 1), "segments")
+
+
+def stand_in_for(archive: Archive, entry: ManifestEntry, path: Path) -> None:
+    """Write a file that stands for an archived segment. Raises ArchiveError also where the manifest
+    has a wrong ``index_at``."""
+    read = archive.store.part
+    head = read(entry.object, 0, min(names.HEAD_BYTES, entry.index_at, entry.size))
+    stand_in(
+        path,
+        entry.size,
+        {0: head, entry.index_at: read(entry.object, entry.index_at, entry.size)},
+    )
+    try:
+        file = SealedFile(path, Offset(entry.base))
+        file.close()
+        if file.index_at == entry.index_at:
+            return
+    except (LogDamaged, NotALog):
+        pass
+    path.unlink()
+    raise ArchiveError(
+        f"{archive.store.url}/{entry.name} is wrong: the index of that segment does not begin at"
+        f" byte {entry.index_at:,}"
+    )
 
 
 _ENTRIES: Final = ".manifest.json"
@@ -155,6 +173,13 @@ def archived_log(url: str, home: Path) -> Path:
     archive = Archive(ObjectStore(url))
     named = hashlib.sha256(archive.store.url.encode()).hexdigest()[:16]  # no part of it is a path
     log = home / "archives" / named
+    make_directory_durably(log.parent)
+    with file_locked(log.with_suffix(".lock")):
+        _take_over(log, archive)
+    return log
+
+
+def _take_over(log: Path, archive: Archive) -> None:
     end = sealed_end(log)
     if end is not None and end.log_id != archive.log_id:
         _forget(log)
@@ -172,7 +197,6 @@ def archived_log(url: str, home: Path) -> Path:
     last = entries[-1]
     write_sealed_end(log, SealedEnd(archive.log_id, Offset(last.base), Offset(last.following)))
     write_cache_file(log / _ENTRIES, partial(_write, msgspec.json.encode(entries)))
-    return log
 
 
 def _known_entries(path: Path) -> list[ManifestEntry]:
@@ -206,6 +230,7 @@ def retain_log(
     after the archived one, read just now, was equal. Raises LogError, ArchiveError; what is left is
     whole then."""
     segments_of(log)
+    delete_stand_ins(log)
     place = archive_place(log)
     if place is None:
         raise LogError(
@@ -248,17 +273,15 @@ def _last_logged_ns(segment: names.SegmentPath) -> int:
 
 def _let_go(log: Path, archive: Archive, segment: names.SegmentPath, entry: ManifestEntry) -> None:
     """Replace a segment by a file that stands for it."""
-    place = archive_place(log) or ArchivePlace(archive.store.url)
     path = _away_path(log, entry)
-    note_archive_place(
-        log, ArchivePlace(archive.store.url, {**place.objects, path.name: entry.object})
-    )
-    file = SealedFile(segment.path, segment.base)
-    try:
-        stand_in(path, entry.size, file.ends())
-    finally:
-        file.close()
-    delete_durably(segment.path)
+    with place_locked(log):
+        note_archive_place(log, archive.store.url, {path.name: entry.object})
+        file = SealedFile(segment.path, segment.base)
+        try:
+            stand_in(path, entry.size, file.ends())
+        finally:
+            file.close()
+        delete_durably(segment.path)
 
 
 def _check_target(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> None:

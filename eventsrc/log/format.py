@@ -9,7 +9,7 @@
     ….misnamed                             a segment that it is giving its right name
     lock                               held by the one writer
     .ledger.json                       the gap ledger, folded from the events: a cache
-    .archive.json                      where the log is archived: see `away`
+    .archive.json, .archive.lock       where the log is archived: see `archive_place`
     .sealed.json                       how far the log is sealed: see `sealed_end`
 
 A segment is named by its base, the offset of its first event. While a sealed file replaces its
@@ -207,6 +207,7 @@ LOCK = "lock"
 LEDGER = ".ledger.json"
 SEALED_END = ".sealed.json"
 ARCHIVE = ".archive.json"
+ARCHIVE_LOCK = ".archive.lock"
 
 _NAME = re.compile(r"(\d{20})(\.mcap|\.mcap\.active|\.mcap\.away)")
 _MISNAMED = re.compile(_NAME.pattern + r"\.misnamed(-\d+)?")

@@ -14,6 +14,7 @@ import os
 import socket
 import stat
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -97,6 +98,18 @@ def _lock_folder(fd: int) -> None:
     except OSError as error:  # NFS cannot lock folders; the file is locked
         if error.errno not in (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.EOPNOTSUPP):
             raise
+
+
+@contextlib.contextmanager
+def file_locked(path: Path) -> Iterator[None]:
+    """Wait for a lock on a file, which is made if need be; it is held for moments, or while an
+    archive is asked. Raises OSError."""
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
 
 
 def is_held(log: Path) -> bool:

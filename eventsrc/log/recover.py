@@ -20,6 +20,7 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
 from .active_segment import ActiveSegment
+from .archive_place import refuse_away
 from .durable_files import GROUP_COMMIT, delete_durably, keep_copy, sync_directory, unlink_quietly
 from .lock import WriterLock
 from .mcap_records import MESSAGE_HEAD
@@ -35,7 +36,7 @@ from .rewrite_segments import (
 from .scan import scan_active, scan_sealed
 from .seal import NO_PREVIOUS, REPLACES, SegmentPlan, file_sha256
 from .sealed_end import SealedEnd, sealed_end, sealed_end_of, segments_left, write_sealed_end
-from .sealed_segment import check_sealed, refuse_away
+from .sealed_segment import check_sealed
 from .segment import Scan
 
 DEFAULT_MAX_LOSSES: Final = 100_000

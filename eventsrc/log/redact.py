@@ -41,18 +41,15 @@ from eventsrc.envelope.system_events import REDACTED_KEY, REDACTION_KEY
 
 from . import format as names
 from . import mcap_records as _mcap
+from .archive_place import refuse_away
 from .channels import key_channel, schema_of
-from .durable_files import (
-    replace_durably,
-    sync_directory,
-    sync_file,
-    write_all,
-)
+from .durable_files import replace_durably, sync_directory, sync_file, write_all
 from .event import Event, event_hash
 from .lock import WriterLock
-from .reader import LogReader
+from .reader import LogReader, OnGap
 from .seal import REPLACES, SegmentPlan, file_sha256, write_sealed
-from .sealed_segment import SealedFile, refuse_away
+from .sealed_segment import SealedFile
+from .segment import Unreadable
 
 MOST_CHANGES: Final = 50_000
 """Bound of the changed events in one event on ``mapfold/redaction``."""
@@ -128,6 +125,8 @@ class Pending:
             self._segments = [str(name) for name in document["segments"]]
             self._first, self._payloads = int(document["first"]), list(document["payloads"])
             self.is_recorded = bool(document["recorded"])
+            self.due = [str(word) for word in document.get("due", ())]
+            """The options that name the databases to be made again, without passwords."""
         except (ValueError, KeyError, TypeError) as error:
             raise LogDamaged(f"{path} cannot be read: {error}") from None
         if not all(map(_SEGMENT.fullmatch, self._segments)):
@@ -155,7 +154,8 @@ class Pending:
     def note_recorded(self) -> None:
         """Write down that the log is as it should be, and copies elsewhere are to be cleared."""
         if not self.is_recorded:
-            _write_journal(self._log, {"segments": [], "first": 0, "payloads": [], "recorded": 1})
+            done = {"segments": [], "first": 0, "payloads": [], "recorded": 1, "due": self.due}
+            _write_journal(self._log, done)
             self.is_recorded = True
 
     def finish(self) -> None:
@@ -251,12 +251,14 @@ class Redactor:
         kept = work.kept.hexdigest()
         return SegmentChange(segment.base, file.next_offset, before, kept, work.changed)
 
-    def commit(self, redactions: Sequence[Redaction], first: Offset) -> None:
+    def commit(
+        self, redactions: Sequence[Redaction], first: Offset, due: Sequence[str] = ()
+    ) -> None:
         """Write the journal of what was staged: from here on the redaction goes on. ``first`` is
-        the offset that the first of its events gets."""
+        the offset that the first of its events gets; ``due`` as `Pending.due`."""
         payloads = [each.model_dump_json(exclude_none=True) for each in redactions]
-        document = {"segments": self._staged, "first": first, "payloads": payloads, "recorded": 0}
-        _write_journal(self._log, document)
+        begun = {"segments": self._staged, "first": first, "payloads": payloads, "recorded": 0}
+        _write_journal(self._log, {**begun, "due": due})
 
 
 def _write_journal(log: Path, document: dict[str, object]) -> None:
@@ -337,14 +339,20 @@ class _Segment:
         )
 
 
-def read_redactions(reader: LogReader) -> list[tuple[Offset, Redaction]]:
-    """The events on ``mapfold/redaction``, but for those that cannot be read."""
+def read_redactions(
+    reader: LogReader, on_gap: OnGap | None = None
+) -> list[tuple[Offset, Redaction]]:
+    """The events on ``mapfold/redaction``. Raises LogDamaged where one cannot be read, or calls
+    ``on_gap``."""
     found = []
-    for event in reader.read(keys={REDACTION_KEY}, on_gap=lambda _: None):
+    for event in reader.read(keys={REDACTION_KEY}, on_gap=on_gap):
         try:
             found.append((event.offset, Redaction.model_validate_json(event.payload)))
         except ValidationError:
-            continue  # `check` reports the tombstones that nothing lists
+            why = f"the event at offset {event.offset} does not say what was redacted"
+            if on_gap is None:
+                raise LogDamaged(f"{reader.path}: {why}") from None
+            on_gap(Unreadable(event.offset, event.offset, why))
     return found
 
 
@@ -355,9 +363,9 @@ def changed_before(reader: LogReader) -> set[Offset]:
 
 def unfinished(log: Path) -> str | None:
     """What to do about a redaction that is not finished; None if there is none."""
-    if Pending.of(log) is None:
+    if (pending := Pending.of(log)) is None:
         return None
-    again = advised("log", "redact", log, "--resume")
+    again = advised("log", "redact", log, "--resume", *pending.due)
     return f"{log}: a redaction is not finished; copies of what it erases may remain: run `{again}`"
 
 

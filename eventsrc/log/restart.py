@@ -26,12 +26,13 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
 from . import mcap_records as _mcap
+from .archive_place import delete_stand_ins, refuse_away
 from .durable_files import sync_directory, sync_file, unlink_quietly, write_all
 from .log_identity import common_log_id
 from .scan import scan_active
 from .seal import NO_PREVIOUS, SegmentPlan, file_sha256, seal
 from .sealed_end import SealedEnd, note_sealed, sealed_end_of
-from .sealed_segment import SealedFile, refuse_away
+from .sealed_segment import SealedFile
 from .segment import ActiveFile, Scan
 
 
@@ -86,6 +87,7 @@ def restart(log: Path) -> Restart:
         raise LogDamaged(
             f"{path}: a recovery was interrupted; run `{advised('log', 'recover', log)}`"
         )
+    delete_stand_ins(log)
     segments = names.list_segments(log)
     common_log_id(segments)
     for segment in [s for s in segments if s.sealed][-1:]:

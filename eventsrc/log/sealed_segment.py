@@ -8,38 +8,33 @@ A segment that is *away* is in an archive only. A sparse file, `names.AWAY`, sta
 as the segment, with its head, seal and summary in their places. So everything but events is read as
 from the segment itself. A chunk is fetched by its range when it is first read, checked by its CRC
 like any other, and written into the file, from which it may go again when these take too much.
-``LOG/.archive.json`` says where: the URL of the archive, and the object of each segment away.
+`eventsrc.log.archive_place` says where.
 """
 
 import contextlib
 import hashlib
 import os
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
-from eventsrc.base.errors import ArchiveError, LogDamaged, LogError
+from eventsrc.base.errors import ArchiveError, LogDamaged
 from eventsrc.base.machine import crc32
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.text import advised
 from eventsrc.envelope.model import Offset
 
 from . import mcap_records as _mcap
+from .archive_place import ArchivePlace, archive_place, stand_in
 from .channels import NO_SCHEMA, is_verbatim
-from .durable_files import replace_durably, sync_file, unlink_quietly, write_all
 from .format import (
     ARCHIVE,
     AWAY,
     HEAD_BYTES,
     SEALED,
-    SEALING,
-    SegmentPath,
     end_in,
     is_metadata_of,
     list_segments,
@@ -174,65 +169,6 @@ class SealedFile(SegmentFile):
                 indexes, pairwise(edges), strict=True
             )
         ]
-
-
-class ArchivePlace(msgspec.Struct, frozen=True):
-    """Where a log is archived: a URL, and by the name of its file the object of each segment that
-    is away."""
-
-    url: str
-    objects: Mapping[str, str] = msgspec.field(default_factory=dict)
-
-
-def archive_place(log: Path) -> ArchivePlace | None:
-    """Where a log is archived; None if it has never been. Raises LogDamaged, OSError."""
-    try:
-        return msgspec.json.decode((log / ARCHIVE).read_bytes(), type=ArchivePlace)
-    except FileNotFoundError:
-        return None
-    except msgspec.MsgspecError as error:
-        raise LogDamaged(
-            f"{log / ARCHIVE} is not what mapfold writes ({error}); delete it and run"
-            f" `{advised('log', 'archive', log, 'URL')}`"
-        ) from None
-
-
-def refuse_away(log: Path, segments: Sequence[SegmentPath]) -> None:
-    """Raise LogError, with what to do, if one of ``segments`` is away. Raises OSError."""
-    away = [each for each in segments if each.away]
-    if away:
-        place = archive_place(log)
-        url = "URL" if place is None else place.url
-        raise LogError(
-            f"{away[0].path}: this segment is in the archive only;"
-            f" `{advised('log', 'restore', url, log)}` brings it back"
-        )
-
-
-def note_archive_place(log: Path, place: ArchivePlace) -> None:
-    """Write where a log is archived, durably. Raises OSError."""
-    data = msgspec.json.format(msgspec.json.encode(place, order="sorted"), indent=1)
-    stand_in(log / ARCHIVE, len(data), {0: data})
-
-
-def stand_in(path: Path, size: int, parts: Mapping[int, bytes]) -> None:
-    """Write a file of ``size`` bytes durably that has only these ``parts``, by position: for a
-    segment away its head and what is behind its chunks. Raises OSError."""
-    beside = path.with_name(f"{path.name}.{os.getpid()}{SEALING}")
-    unlink_quietly(beside)
-    fd = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
-    try:
-        os.ftruncate(fd, size)
-        for at, data in parts.items():
-            os.lseek(fd, at, os.SEEK_SET)
-            write_all(fd, data)
-        sync_file(fd)
-        replace_durably(beside, path)
-    except BaseException:
-        unlink_quietly(beside)
-        raise
-    finally:
-        os.close(fd)
 
 
 FETCHED_BYTES: Final = 1024 * 1024 * 1024

@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from eventsrc.base.errors import ArchiveError, LogDamaged, LogError, NoSuchObject, NotALog
@@ -23,7 +24,7 @@ from eventsrc.envelope.system_events import REDACTED_KEY, REDACTION_KEY
 
 from . import format as names
 from .archive import SEGMENTS, Archive, ManifestEntry, chain_faults
-from .away import fetched_whole
+from .away import fetched_whole, stand_in_for
 from .event import event_hash
 from .lock import is_held
 from .log_identity import CarriedId, own_log_id
@@ -57,7 +58,7 @@ class Proof(NamedTuple):
 def check(reader: LogReader) -> Proof:
     """Prove the redactions of a log: payloads are those that are listed, and of each segment
     nothing else has changed since its last redaction."""
-    known = read_redactions(reader)
+    known = read_redactions(reader, lambda _: None)
     by_id: dict[str, Redacted] = {}
     now: dict[Offset, str] = {}
     last: dict[Offset, tuple[str, str]] = {}
@@ -378,6 +379,8 @@ def _archived_faults(archive: Archive, entry: ManifestEntry) -> Iterator[tuple[K
     try:
         archive.check(entry)
         head = archive.head_of(entry)
+        with TemporaryDirectory(prefix="mapfold-") as folder:
+            stand_in_for(archive, entry, Path(folder) / "segment")
     except NoSuchObject as error:
         yield "gap", str(error)
     except (ArchiveError, LogDamaged, NotALog) as error:

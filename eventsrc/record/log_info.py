@@ -19,11 +19,12 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY
 from eventsrc.log import LogReader
 from eventsrc.log import mcap_records as _mcap
+from eventsrc.log.archive_place import archive_place
 from eventsrc.log.channels import carries_envelopes
 from eventsrc.log.format import BEGUN, IMPORTED, SegmentPath
 from eventsrc.log.mcap_records import Channel
 from eventsrc.log.reader import OpenSegment
-from eventsrc.log.sealed_segment import AwayFile, SealedFile, archive_place
+from eventsrc.log.sealed_segment import AwayFile, SealedFile
 from eventsrc.log.segment import ActiveFile, formats_of
 
 from .gap_history import ledger_of, loss_of

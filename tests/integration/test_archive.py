@@ -3,10 +3,12 @@ S3, also where the store answers wrongly: then nothing is taken for archived."""
 
 import contextlib
 import hashlib
+import json
 import os
 import runpy
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from eventsrc.base.object_store import ObjectStore
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter, verify_log
 from eventsrc.log.archive import Archive, Archived, archive_log
+from eventsrc.log.archive_place import archive_place, note_archive_place, place_locked
 from eventsrc.log.away import archived_log, restore_log, retain_log
 from eventsrc.log.redact import Redactor
 from eventsrc.log.verify import verify_archive
@@ -474,3 +477,70 @@ def test_an_archiver_killed_while_it_replaces_leaves_nothing_redacted(
     archived(log, url)
     assert not before & ObjectStore(url).sizes("segments/").keys()
     assert verify_archive(ObjectStore(url)).unnamed == ()
+
+
+def test_segments_that_go_at_once_are_all_noted(log: Path) -> None:
+    def note(first: int) -> None:
+        for number in range(first, first + 8):
+            with place_locked(log):
+                note_archive_place(log, "file:///a", {str(number): "x"})
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(note, range(0, 32, 8)))
+    place = archive_place(log)
+    assert place is not None
+    assert set(place.objects) == {str(number) for number in range(32)}
+    with place_locked(log):
+        note_archive_place(log, "file:///other")
+    assert archive_place(log) == place  # segments are away there
+
+
+@pytest.mark.parametrize("tidied_by", ["restore", "retain", "redact", "recorder"])
+def test_a_restore_killed_before_its_last_step_leaves_no_stand_in(
+    tidied_by: str, log: Path, url: str, tmp_path: Path
+) -> None:
+    archived(log, url)
+    retain_log(log, keep_bytes=0)
+    with LogReader(log) as reader:
+        list(reader.read())  # fetches chunks into what stands for them
+    gone = patch("eventsrc.log.archive_place.delete_durably", side_effect=KeyboardInterrupt)
+    with gone, pytest.raises(KeyboardInterrupt):
+        restore_log(Archive(ObjectStore(url)), log)
+    assert len(list(log.glob("*.away"))) == SEGMENTS - 1
+    assert len(list(log.glob("*.mcap"))) == SEGMENTS
+    if tidied_by == "restore":
+        restore_log(Archive(ObjectStore(url)), log)
+    elif tidied_by == "retain":
+        retain_log(log, keep_bytes=10**9)
+    elif tidied_by == "recorder":
+        verify_or_write(log)
+    else:
+        Commands.in_folder(tmp_path)("log", "redact", log, "--run", "run-a", "--reason", "a test")
+    assert list(log.glob("*.away")) == []
+    assert verify_log(log).findings == ()
+
+
+def test_a_false_place_of_an_index_is_found(log: Path, url: str, tmp_path: Path) -> None:
+    archived(log, url)
+    entry = sorted((tmp_path / "an archive" / "manifest").iterdir())[1]
+    right = json.loads(entry.read_text())
+    for wrong in (0, right["index_at"] - 1, right["index_at"] + 1, right["size"] + 9):
+        entry.write_text(json.dumps(right | {"index_at": wrong}))
+        (found,) = verify_archive(ObjectStore(url)).findings
+        assert found.kind == "crc"
+        with pytest.raises(ArchiveError):
+            archived_log(url, tmp_path / f"home{wrong}")
+
+
+def test_commands_that_begin_to_read_an_archive_at_once(
+    log: Path, url: str, tmp_path: Path
+) -> None:
+    mapfold = Commands.in_folder(tmp_path)
+    mapfold("log", "archive", log, url)
+    archived_log(url, tmp_path / "home")
+    mapfold("log", "redact", log, "--run", "run-a", "--reason", "a test")
+    archived(log, url)
+    with ThreadPoolExecutor(6) as pool:
+        (away,) = set(pool.map(lambda _: archived_log(url, tmp_path / "home"), range(12)))
+    with LogReader(away) as reader, LogReader(log) as here:
+        assert list(reader.read()) == list(here.read())

@@ -10,6 +10,7 @@ import signal
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -363,7 +364,13 @@ def test_databases_give_the_bytes_up(run: Commands, tmp_path: Path, one_database
     tables; the server's log of changes (pg_wal) is not reached."""
     rebuild(tmp_path / "log", one_database, Settings())
     urls = ("--db", one_database.graph_url, "--vector-db", one_database.vector_url)
-    said = run("log", "redact", "log", "--class", "person", *WHO, *urls)
+    killed = patch(
+        "projections.surfaces.cli.redact_command._rebuild", side_effect=KeyboardInterrupt
+    )
+    with killed, pytest.raises(KeyboardInterrupt):
+        redact(tmp_path / "log", class_=["person"], reason="x", db=urls[1], vector_db=urls[3])
+    assert "rows of what it erased" in run("log", "redact", "log", "--resume", code=1).err
+    said = run("log", "redact", "log", "--resume", *urls)
     assert "pg_wal" in said.err
     with connect(one_database.vector_url, autocommit=True) as connection:
         rows = connection.execute("SELECT class_name FROM detection_embeddings").fetchall()
@@ -444,3 +451,30 @@ def test_messages_of_ros_that_may_show_it_go_with_their_recording(tmp_path: Path
     run("log", "redact", "log", "--run", "guest", *WHO)
     assert holds(log, [f"{topic} of guest".encode() for topic in forms]) == []
     assert verify_log(log).findings == ()
+
+
+def test_databases_that_are_due_are_not_forgotten(run: Commands, tmp_path: Path) -> None:
+    """Neither by --resume, nor by the next redaction or recorder."""
+    db = ("--db", "postgresql://me:hunter2@127.0.0.1:1/house")
+    failed = run("log", "redact", "log", "--class", "person", *WHO, *db, code=1).err
+    assert "127.0.0.1" in failed
+    for words in (("--resume",), ("--class", "cup", *WHO)):
+        with LogWriter(tmp_path / "log"):  # a recorder between
+            pass
+        said = run("log", "redact", "log", *words, code=1).err
+        assert "--resume --db postgresql://me@127.0.0.1:1/house" in said
+    assert holds(tmp_path, [b"hunter2"]) == []
+    assert "not finished" in run("log", "verify", "log", code=3).out
+
+
+def test_a_redaction_that_cannot_be_read_is_not_taken_for_none(
+    run: Commands, tmp_path: Path
+) -> None:
+    log, url = tmp_path / "log", f"file://{tmp_path}/archive"
+    run("log", "archive", "log", url)
+    run("log", "redact", "log", "--class", "person", *WHO)
+    with LogWriter(log) as writer:
+        writer.append(REDACTION_KEY, b"{}")
+    assert "redactions cannot be read" in run("log", "archive", "log", url, code=1).err
+    with Redactor(log) as redactor, pytest.raises(LogDamaged, match="does not say what was"):
+        redactor.stage(lambda _: None, b"salt")

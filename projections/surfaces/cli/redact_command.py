@@ -11,8 +11,8 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.errors import MapfoldError, MisuseError
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.log import LogReader, LogWriter, cache_folder, cache_sizes
 from eventsrc.log.durable_files import sync_directory
 from eventsrc.log.redact import Pending, Redactor, end_of, redactions_of, staging_folder
@@ -94,7 +94,7 @@ def redact(
         for line in _left(log, db) if went_on else ():
             say(line)
         return
-    erased = _erase(log, selection, reason, issued_by or user_at_host())
+    erased = _erase(log, selection, reason, issued_by or user_at_host(), _words(databases))
     if erased is None:
         say(f"{log}: nothing of that is in the log")
         return
@@ -130,7 +130,9 @@ def _erasure(reader: LogReader, selection: Selection) -> Erasure:
     return Erasure.of(reader, selection, uuid.uuid4().hex, labels)
 
 
-def _erase(log: Path, selection: Selection, reason: str, issued_by: str) -> Erasure | None:
+def _erase(
+    log: Path, selection: Selection, reason: str, issued_by: str, due: list[str]
+) -> Erasure | None:
     """Stage and commit; None if the selection has nothing in the log."""
     with Redactor(log) as redactor:
         with LogReader(log) as reader:
@@ -148,7 +150,7 @@ def _erase(log: Path, selection: Selection, reason: str, issued_by: str) -> Eras
             "digest_before": _digest(log),
             "digest_after": _digest(staging_folder(log)),
         }
-        redactor.commit(redactions_of(changes, about), end_of(log))
+        redactor.commit(redactions_of(changes, about), end_of(log), due)
     return erasure
 
 
@@ -184,8 +186,31 @@ def _go_on(log: Path, databases: Databases | None) -> bool:
     sync_directory(cache_folder(log).parent)
     if databases is not None:
         _rebuild(log, databases)
+    if pending.due and _words(databases) != pending.due:
+        again = advised(
+            "log", "redact", log, "--resume", *pending.due, without=["--db", "--vector-db"]
+        )
+        raise MapfoldError(
+            f"{log}: a redaction is not finished: databases that it named have rows of what it"
+            f" erased: run `{again}`, or, if they are gone for good, delete {staging_folder(log)}"
+        )
     pending.finish()
     return True
+
+
+def _words(databases: Databases | None) -> list[str]:
+    """The options that name databases, without passwords."""
+    if databases is None:
+        return []
+    from projections.postgres.connection import url_without_secrets  # here: few need the drivers
+
+    named = {"--db": databases.db, "--vector-db": databases.vector_db}
+    given = {name: url for name, url in named.items() if url is not None}
+    return [
+        word
+        for name, url in given.items()
+        for word in (name, url_without_secrets(url) if url else "")
+    ]
 
 
 def _rebuild(log: Path, databases: Databases) -> None:
