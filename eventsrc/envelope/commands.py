@@ -235,6 +235,22 @@ class CorrectPoses(_Command):
         return self
 
 
+class JoinFrames(_Command):
+    """All keyframes whose envelopes name the map frame ``frame`` are moved into the frame ``into``,
+    None for the map's own."""
+
+    kind: Literal["join-frames"] = "join-frames"
+    frame: Text
+    into: Text | None = None
+    transform: RigidTransform
+
+    @model_validator(mode="after")
+    def _check_two(self) -> "JoinFrames":
+        if self.frame == self.into:
+            raise ValueError("frame and into must be two frames")
+        return self
+
+
 class Relabel(_Command):
     """Names of classes: a detection that was recorded with the first text of a pair as its class
     has the second one in the map."""
@@ -294,6 +310,7 @@ Command: TypeAlias = (
     | ForgetRun
     | ForgetKeyframes
     | CorrectPoses
+    | JoinFrames
     | Relabel
     | UseSettings
     | Reembed

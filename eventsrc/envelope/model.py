@@ -256,6 +256,7 @@ class Envelope(_Known, frozen=True):
         | None
     ) = None
     scan: StatedScan | None = None
+    frame: _KnownText | None = None
 
     @property
     def stamp_ns(self) -> int:

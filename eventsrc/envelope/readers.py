@@ -81,6 +81,7 @@ Size = Annotated[
     ),
 ]
 Height = Annotated[model.Position | None, _unless_foreign(_is_number)]
+Frame = Annotated[model.Text | None, _unless_foreign(lambda given: isinstance(given, str))]
 
 
 class DetectionModel(_Model, title="Detection"):
@@ -151,7 +152,8 @@ class EnvelopeModel(_Model, title="Envelope"):
     Without ``camera`` it is the one of the map's settings. ``floor`` names the floor that the robot
     is on; without it the height ``map_z``, metres, tells which one it is. ``pose_covariance`` is
     the error of the pose: nine numbers, the covariance of map_x, map_y and map_yaw row by row; it
-    counts only beside a pose, and so does ``scan``.
+    counts only beside a pose, and so does ``scan``. ``frame`` names the map frame that the pose is
+    in, if robots have frames of their own.
     """
 
     run_id: Annotated[model.RunId, model.TEXT]
@@ -165,6 +167,7 @@ class EnvelopeModel(_Model, title="Envelope"):
     map_z: model.Position | None = None
     pose_covariance: model.PoseCovariance | None = None
     scan: Scan = None
+    frame: Frame = None
     detections: Annotated[
         tuple[DetectionModel, ...], Field(max_length=model.MAX_DETECTIONS), FailFast()
     ]
@@ -223,8 +226,9 @@ def _is_plain(envelope: model.Envelope) -> bool:
         return False
     if not (envelope.map_x is None) is (envelope.map_y is None) is (envelope.map_yaw is None):
         return False
-    if isinstance(envelope.floor, str) and not envelope.floor.isprintable():
-        return False
+    for name in (envelope.floor, envelope.frame):
+        if isinstance(name, str) and not name.isprintable():
+            return False
     covariance = envelope.pose_covariance
     if covariance is not None and model.covariance_fault(covariance) is not None:
         return False

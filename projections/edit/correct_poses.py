@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted
+from eventsrc.base.text import counted, visible
 from eventsrc.envelope import commands
 from eventsrc.envelope.commands import MAX_COMMAND_BYTES
-from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId
+from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId, RunId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
+from projections.map.frames import frames_of
 
 from .conflicts import check_run_in_map
 from .current import MapToEdit
@@ -154,6 +155,67 @@ def by_transform(
     current: MapToEdit, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
 ) -> commands.CorrectPoses:
     """One rigid transform of the keyframes of a run."""
+    transform = _transform(dx, dy, dyaw)
+    _keyframes(current, run_id, span)
+    return build(
+        commands.CorrectPoses,
+        stamp,
+        run_id=run_id,
+        transform=transform,
+        first=span.first,
+        last=span.last,
+    )
+
+
+def join_frames(
+    current: MapToEdit,
+    stamp: Stamp,
+    frame: str,
+    into: str | None,
+    dx: float,
+    dy: float,
+    dyaw: float,
+) -> commands.JoinFrames:
+    """One rigid transform of all keyframes in the map frame ``frame`` into the frame ``into``, None
+    for the map's own. Raises MisuseError for a frame that is not held apart."""
+    there = frames_of(current.view)
+    apart = [each.frame for each in there if each.joined is None]
+    names = f"held apart are {', '.join(map(visible, apart))}" if apart else "none is held apart"
+    for given in (frame, into):
+        if given is not None and given not in apart:
+            joined = any(each.frame == given for each in there)
+            raise MisuseError(
+                f"frame {visible(given)}: {'joined already' if joined else 'no keyframe names it'},"
+                f" or the map's own; {names}"
+            )
+    transform = _transform(dx, dy, dyaw, may_stay=True)
+    return build(commands.JoinFrames, stamp, frame=frame, into=into, transform=transform)
+
+
+def by_alignment(
+    current: MapToEdit,
+    stamp: Stamp,
+    run_id: str,
+    target: str | None,
+    span: Span,
+    dx: float,
+    dy: float,
+    dyaw: float,
+) -> commands.CorrectPoses | commands.JoinFrames:
+    """The move of a run into the frame of the run ``target``, or of another log: where it brings a
+    frame that is held apart to another one, of all that is in that frame."""
+    there = frames_of(current.view)
+    frame_of = {run: each.frame for each in there if each.joined is None for run in each.runs}
+    one, into = frame_of.get(RunId(run_id)), frame_of.get(RunId(target or ""))
+    is_run = any(run.run_id == target for run in current.view.runs)
+    if one is None or one == into or not is_run or span != Span(None, None):
+        return by_transform(current, stamp, run_id, span, dx, dy, dyaw)
+    return join_frames(current, stamp, one, into, dx, dy, dyaw)
+
+
+def _transform(
+    dx: float, dy: float, dyaw: float, *, may_stay: bool = False
+) -> commands.RigidTransform:
     for name, value, most in (
         ("--dx", dx, MAX_POSITION_M),
         ("--dy", dy, MAX_POSITION_M),
@@ -161,17 +223,9 @@ def by_transform(
     ):
         if not math.isfinite(value) or abs(value) > most:
             raise MisuseError(f"{name} {value}: not between ±{most:,.0f}")
-    if not (dx or dy or dyaw):
+    if not (dx or dy or dyaw or may_stay):
         raise MisuseError("--dx, --dy and --dyaw are all 0: nothing would move")
-    _keyframes(current, run_id, span)
-    return build(
-        commands.CorrectPoses,
-        stamp,
-        run_id=run_id,
-        transform=commands.RigidTransform.of(dx, dy, dyaw),
-        first=span.first,
-        last=span.last,
-    )
+    return commands.RigidTransform.of(dx, dy, dyaw)
 
 
 def _keyframes(current: MapToEdit, run_id: str, span: Span) -> list[RunKeyframe]:

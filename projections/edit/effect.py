@@ -263,6 +263,9 @@ def what(command: Command) -> str:
             return f"{command.run_id}:{command.first}..{command.last}"
         case kinds.CorrectPoses():
             return f"{command.run_id}: {_poses(command)}"
+        case kinds.JoinFrames():
+            into = "the map's own" if command.into is None else command.into
+            return f"{command.frame} into {into}: {_move(command.transform)}"
         case kinds.Relabel():
             (label, name), *others = command.labels
             return f"{label} is {name}" + (f" and {len(others):,} more" if others else "")
@@ -288,12 +291,15 @@ def _name(anchor: Any) -> str:
 def _poses(command: kinds.CorrectPoses) -> str:
     if command.transform is None:
         return counted(len(command.poses), "pose")
-    t = command.transform
     span = ""
     if command.first is not None or command.last is not None:
         first = "" if command.first is None else command.first
         span = f" of {first}..{'' if command.last is None else command.last}"
-    return f"dx={t.dx:g} dy={t.dy:g} dyaw={t.dyaw:g}{span}"
+    return f"{_move(command.transform)}{span}"
+
+
+def _move(by: kinds.RigidTransform) -> str:
+    return f"dx={by.dx:g} dy={by.dy:g} dyaw={by.dyaw:g}"
 
 
 def edits_text(found: Found, times: Mapping[Offset, int]) -> str:

@@ -120,7 +120,9 @@ def _check_does(change: Change, command: Command, effect: Effect) -> None:
                     f"{command.det_ids[1]!r}: both would be of one object still; name the "
                     "det_ids that founded two objects"
                 )
-        case kinds.Join() | kinds.SameObject() | kinds.CorrectPoses() if effect.none:
+        case kinds.Join() | kinds.SameObject() | kinds.CorrectPoses() | kinds.JoinFrames() if (
+            effect.none
+        ):
             raise EditRefused(f"{command.kind} would change nothing in the map; it is not recorded")
         case _:
             pass

@@ -8,9 +8,11 @@ had always been known, but only from the offset where it was recorded.
 2.  ``join`` is transitive: of anchors joined in a chain all are one, and what is kept apart from
     one is kept apart from them all. A ``keep-apart`` or ``join`` that contradicts later ones does
     not count. So too for ``different-objects`` and ``same-object`` of det_ids.
-3.  Pose corrections of a keyframe apply in the order of the commands.
-4.  Of two names of one place or of one recorded label, and of two ``use-settings``, the later one
-    counts.
+3.  Pose corrections of a keyframe apply in the order of the commands; then its frame is joined to
+    another, and that to a further one. A ``join-frames`` that would close a circle with later ones
+    does not count.
+4.  Of two names of one place or of one recorded label, of two ``use-settings``, and of two
+    ``join-frames`` of one frame, the later one counts.
 
 `Corrections` has a fingerprint, which with that of the settings is part of a map's identity.
 """
@@ -30,13 +32,14 @@ from eventsrc.envelope.commands import (
     CorrectPoses,
     NamePlace,
     Reembed,
+    RigidTransform,
     UseSettings,
 )
 from eventsrc.envelope.ingest import Accepted
 from eventsrc.envelope.model import DetId, Envelope, KeyframeId, Offset, RunId
 
 from .pair_groups import ApartPairs, without_contradictions
-from .pose_corrections import Pose, PoseCorrection, PoseCorrections
+from .pose_corrections import Pose, PoseCorrection, PoseCorrections, moved_by
 from .settings import Settings
 
 
@@ -55,6 +58,15 @@ class PlaceName(NamedTuple):
     offset: Offset
 
 
+class FrameJoin(NamedTuple):
+    """Poses in ``frame`` are moved into ``into``, None for the map's own, as of ``offset``."""
+
+    frame: str
+    into: str | None
+    transform: RigidTransform
+    offset: Offset
+
+
 class RecordedCommand(NamedTuple):
     """A command and the offset of its event."""
 
@@ -64,11 +76,8 @@ class RecordedCommand(NamedTuple):
 
 class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     """The compiled corrections of a fold; `compile_corrections` makes them. Pairs are in ascending
-    order.
-
-    ``settings`` are those of the log, None if it names none. ``in_force`` are the commands that
-    were not undone or replaced, in the order of the log.
-    """
+    order. ``settings`` are those of the log, None if it names none. ``in_force`` are the commands
+    that were not undone or replaced, in the order of the log."""
 
     in_force: tuple[RecordedCommand, ...] = ()
     forgotten_runs: frozenset[RunId] = frozenset()
@@ -83,7 +92,8 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
     settings: Settings | None = None
     reembedded: tuple[Reembed, ...] = ()
     labels: dict[str, str] = {}
-    """Names of classes by recorded label."""
+    """Names of classes by recorded label; below, joins of frames by the frame that is moved."""
+    frames: dict[str, FrameJoin] = {}
 
     def fingerprint(self) -> str:
         """16 hex digits that are equal for equal corrections; empty if there are none that change
@@ -147,6 +157,7 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
             and self.different == other.different
             and self.same == other.same
             and self.labels == other.labels
+            and self.frames == other.frames
         )
 
     def is_forgotten(self, run_id: RunId, keyframe_id: KeyframeId) -> bool:
@@ -174,9 +185,17 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
         return found
 
     def pose(self, envelope: Envelope) -> Pose | None:
-        """The envelope's corrected pose, metres and radians; None if it has none."""
+        """The envelope's pose in its own frame, corrected as one of its run; None without one."""
         pose, own = logged_pose(envelope), self.poses.get(envelope.run_id)
         return pose if own is None else own.corrected(envelope.keyframe_id, pose)
+
+    def frame_joins(self, frame: str | None) -> list[FrameJoin]:
+        """The joins that move poses in a frame, in the order in which they do."""
+        joins = list[FrameJoin]()
+        while frame is not None and (join := self.frames.get(frame)) is not None:
+            joins.append(join)
+            frame = join.into
+        return joins
 
     def pose_command(self, envelope: Envelope, is_good: Callable[[Pose], bool]) -> RecordedCommand:
         """The command that invalidates the envelope's pose: the last one that turns a good pose
@@ -188,6 +207,11 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
                 pose = PoseCorrection.of(command).corrected(envelope.keyframe_id, pose)
                 was_good, good = good, pose is None or is_good(pose)
                 found = None if good else recorded if was_good else found
+        by_offset = {recorded.offset: recorded for recorded in self.in_force}
+        for join in self.frame_joins(envelope.frame):
+            pose = None if pose is None else moved_by(join.transform, pose)
+            was_good, good = good, pose is None or is_good(pose)
+            found = None if good else by_offset[join.offset] if was_good else found
         if found is None:
             raise ValueError("the corrected pose is good")
         return found
@@ -212,7 +236,12 @@ class Corrections(msgspec.Struct, frozen=True, eq=False, dict=True):
             [(n.anchor, n.name) for n in self.names if newest[n.anchor] is n],
         ]
         renamed = sorted((label, name) for label, name in self.labels.items() if label != name)
-        return [*rows, renamed] if renamed else rows  # as it was before there were labels
+        if renamed:  # a fingerprint without labels and frames is as it was before there were any
+            rows.append(renamed)
+        if self.frames:
+            joins = [(f, j.into, *dict(j.transform).values()) for f, j in self.frames.items()]
+            rows.append({"frames": sorted(joins)})
+        return rows
 
 
 NO_CORRECTIONS = Corrections()
@@ -267,6 +296,7 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
     document: Mapping[str, object] | None = None
     reembedded: list[Reembed] = []
     labels: dict[str, str] = {}
+    frames: dict[str, FrameJoin] = {}
     for offset, command in in_force:
         match command.kind:  # the classes of pydantic are slow to match
             case "name-place":
@@ -292,6 +322,10 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
                 document = command.settings
             case "reembed":
                 reembedded.append(command)
+            case "join-frames":
+                frames.pop(command.frame, None)  # so that it is the last
+                one, into, by = command.frame, command.into, command.transform
+                frames[one] = FrameJoin(one, into, by, offset)
             case "join" | "undo":
                 pass
     joined, apart = without_contradictions(places)
@@ -310,7 +344,19 @@ def compile_corrections(commands: Iterable[RecordedCommand]) -> Corrections:
         settings=None if document is None else Settings.from_document(document),
         reembedded=tuple(reembedded),
         labels=labels,
+        frames=_without_circles(frames),
     )
+
+
+def _without_circles(frames: dict[str, FrameJoin]) -> dict[str, FrameJoin]:
+    kept: dict[str, FrameJoin] = {}
+    for frame, join in reversed(frames.items()):
+        into = join.into
+        while into in kept:
+            into = kept[into].into
+        if into != frame:
+            kept[frame] = join
+    return kept
 
 
 def _json_of(row: object) -> Iterator[bytes]:

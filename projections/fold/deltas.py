@@ -5,21 +5,20 @@ Sinks, the view and time travel are built from deltas and never look into a redu
 one twice does no harm. ``offset`` is that of the event that caused it, perhaps no keyframe.
 
 Ordinals number the things of one kind 0, 1, 2 … in the order in which the fold met or founded them.
-They are never reused, and a database's ids are computed from them. They are ints at run time; mypy
-keeps those of one kind apart from the others.
+They are never reused; a database's ids are computed from them. Mypy keeps those of kinds apart.
 
 Positions are integer micrometres in the map frame (``_um``), so that sums and comparisons are exact
 (`projections.fold.exact`). Timestamps are the robot's, float seconds.
 
-The deltas of one event come in this order: RunSeen, KeyframeAdded, ObservationAdded …, then places
-(PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed), Objects
-(ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified, ObjectEstimated,
-ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). An ObjectRelocated stands right
-after the ObjectsMerged that makes the Object found elsewhere part of the one that moved. A delta
-names only things that deltas before it have introduced. A MapGiven is alone or precedes places.
+The deltas of one event come in this order: RunSeen, FrameJoined, KeyframeAdded, ObservationAdded …,
+then places (PlaceFormed, PlacesMerged, MergeRefused, KeyframePlaced, PlaceChanged, PlaceNamed),
+Objects (ObjectFound / ObjectSeen, ObjectsMerged / ObjectRelocated, ObjectClassified,
+ObjectEstimated, ObjectMissing), located-in (ObjectMoved), adjacency (PlacesLinked). A MapGiven is
+alone or precedes places. A delta names only things that deltas before it have introduced; an
+ObjectRelocated stands right after the ObjectsMerged that makes what is found elsewhere part of it.
 
-A fold makes some ten deltas a keyframe: a msgspec struct takes a third of the time of a frozen
-dataclass, and with ``gc=False`` the garbage collector does not traverse a history of them.
+A msgspec struct takes a third of the time of a frozen dataclass; with ``gc=False`` the garbage
+collector does not traverse them.
 """
 
 from typing import Literal, NewType, TypeAlias
@@ -47,7 +46,7 @@ FusibleObservation: TypeAlias = tuple[ObservationOrdinal, DetId, str, NDArray[np
 
 
 class Pose(msgspec.Struct, frozen=True, gc=False):
-    """The robot's pose in the map frame: micrometres, and radians as they came."""
+    """The robot's pose in the map frame: µm, and radians as they came."""
 
     x_um: int
     y_um: int
@@ -75,7 +74,8 @@ class RunSeen(msgspec.Struct, frozen=True, gc=False):
 
 class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     """A new keyframe. ``pose``, ``floor``, the name of the one that the pose is on, and ``camera``,
-    the one that took the picture, are None where the envelope has none."""
+    the one that took the picture, are None where the envelope has none. ``frame`` is what the
+    envelope names, if that is not the map's own frame."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -86,6 +86,20 @@ class KeyframeAdded(msgspec.Struct, frozen=True, gc=False):
     pose: Pose | None
     floor: str | None = None
     camera: StatedCamera | None = None
+    frame: str | None = None
+
+
+class FrameJoined(msgspec.Struct, frozen=True, gc=False):
+    """Poses in a map frame are moved into another, None for the map's own, by a turn of ``dyaw``
+    radians, then a shift in metres, as the command at offset ``command`` says."""
+
+    offset: Offset
+    frame: str
+    into: str | None
+    dx: float
+    dy: float
+    dyaw: float
+    command: Offset
 
 
 class Body(msgspec.Struct, frozen=True, gc=False):
@@ -139,10 +153,8 @@ class EventSkipped(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
-    """A new place, founded by the keyframe ``founder``, its first core point.
-
-    ``place_id`` is ``{run_id}_p{counter}`` with a counter from 0 per founding run.
-    """
+    """A new place, founded by the keyframe ``founder``, its first core point; its id is
+    ``{run_id}_p{counter}`` with a counter from 0 per founding run."""
 
     offset: Offset
     place: PlaceOrdinal
@@ -151,10 +163,8 @@ class PlaceFormed(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlaceLink(msgspec.Struct, frozen=True, gc=False):
-    """Two core points within ε of each other that joined two places; keyframe ordinals, µm.
-
-    By rooms: the founders of the cells that are the shortest drive apart, and its length.
-    """
+    """Two core points within ε of each other that joined two places; keyframe ordinals, µm. By
+    rooms: the founders of the cells that are the shortest drive apart, and its length."""
 
     core: KeyframeOrdinal
     neighbour: KeyframeOrdinal
@@ -193,7 +203,6 @@ class PlacesMerged(msgspec.Struct, frozen=True, gc=False):
 
 class MergeRefused(msgspec.Struct, frozen=True, gc=False):
     """Two places touched and stay two, because a correction keeps them apart.
-
     ``link`` is the pair of core points, or of a ``join``'s anchors, that would have joined them,
     ``bridge`` the keyframe whose arrival did it, ``apart`` the anchors that are kept apart, of
     ``a``, founded first, and of ``b``. A pair of places has only one.
@@ -217,7 +226,7 @@ class PlaceNamed(msgspec.Struct, frozen=True, gc=False):
 
 
 class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
-    """A keyframe (new, or noise until now) belongs to a place."""
+    """A keyframe, new or noise until now, belongs to a place."""
 
     offset: Offset
     keyframe: KeyframeOrdinal
@@ -225,10 +234,8 @@ class KeyframePlaced(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlaceChanged(msgspec.Struct, frozen=True, gc=False):
-    """A place's members changed: their number and the sums of their positions, in µm.
-
-    The centroid in metres is ``sum / (keyframe_count * 1_000_000)``, correctly rounded.
-    """
+    """A place's members changed: their number and the sums of their positions, in µm. The centroid
+    in metres is ``sum / (keyframe_count * 1_000_000)``, correctly rounded."""
 
     offset: Offset
     place: PlaceOrdinal
@@ -248,8 +255,7 @@ class ObjectFound(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
-    """An observation was assigned to an Object (the founding one too); the Object's new values.
-
+    """An observation, also the founding one, was assigned to an Object; its new values.
     ``similarity_q40`` is the cosine with the Object's mean embedding before this observation, as an
     exact multiple of 2⁻⁴⁰ (2⁴⁰ for the founding one); by evidence that with the most similar look
     kept, None where there was no embedding to compare. The mean position in metres is
@@ -269,7 +275,6 @@ class ObjectSeen(msgspec.Struct, frozen=True, gc=False):
 
 class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
     """Two Objects became one; the survivor's new values.
-
     All observations of ``absorbed`` belong to ``survivor`` from now on. No ObjectSeen is emitted
     for them: code that keeps observations must move them all. ``evidence`` is None where a
     ``same-object`` command did it.
@@ -287,11 +292,9 @@ class ObjectsMerged(msgspec.Struct, frozen=True, gc=False):
 
 
 class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
-    """Why fusion by evidence made two Objects one.
-
-    ``look`` and ``geometry`` are log-likelihood ratios in thousandths of a nat: same thing against
-    two. ``distance_um`` is of the estimates; ``pictures_with_both`` of ``pictures`` showed both.
-    """
+    """Why fusion by evidence made two Objects one: log-likelihood ratios ``look`` and ``geometry``
+    in thousandths of a nat, same thing against two. ``distance_um`` is of the estimates;
+    ``pictures_with_both`` of ``pictures`` showed both."""
 
     look: int
     geometry: int
@@ -301,9 +304,8 @@ class MergeEvidence(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectEstimated(msgspec.Struct, frozen=True, gc=False):
-    """An Object's position, estimated from the bearings of its observations; new values:
-    µm, µm², and the number of spots, 0.35 m apart, that it was seen from. Only by evidence.
-    """
+    """An Object's position, estimated from the bearings of its observations; new values: µm, µm²,
+    and the number of spots, 0.35 m apart, that it was seen from. Only by evidence."""
 
     offset: Offset
     object: ObjectOrdinal
@@ -324,11 +326,9 @@ class ObjectClassified(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
-    """An Object was not seen where it should have been; new values.
-
-    ``misses`` counts the keyframes of the run that should show it and do not. ``missing`` is
-    whether that makes it missing; it is False again once it is seen there.
-    """
+    """An Object was not seen where it should have been; new values. ``misses`` counts the keyframes
+    of the run that should show it and do not; ``missing`` is whether that makes it missing, False
+    again once it is seen there."""
 
     offset: Offset
     object: ObjectOrdinal
@@ -338,8 +338,7 @@ class ObjectMissing(msgspec.Struct, frozen=True, gc=False):
 
 
 class ObjectRelocated(msgspec.Struct, frozen=True, gc=False):
-    """An Object was found elsewhere; its estimate, ``from_x_um`` … before and ``to_x_um`` … now,
-    leaves out earlier observations."""
+    """An Object was found elsewhere; its estimate, before and now, leaves out what came earlier."""
 
     offset: Offset
     object: ObjectOrdinal
@@ -359,8 +358,8 @@ class ObjectMoved(msgspec.Struct, frozen=True, gc=False):
 
 
 class PlacesLinked(msgspec.Struct, frozen=True, gc=False):
-    """The number of shared transitions of two places changed; ``a`` was founded before ``b``.
-    0 removes the edge (one of the two was absorbed, or relabelling moved the transitions)."""
+    """The number of shared transitions of two places changed; ``a`` was founded before ``b``, and 0
+    removes the edge: one of the two was absorbed, or relabelling moved the transitions."""
 
     offset: Offset
     a: PlaceOrdinal
@@ -378,6 +377,7 @@ class MapGiven(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 Delta: TypeAlias = (
     RunSeen
+    | FrameJoined
     | KeyframeAdded
     | ObservationAdded
     | EventSkipped

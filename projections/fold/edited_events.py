@@ -23,7 +23,7 @@ from eventsrc.envelope.model import MAX_POSITION_M, Detection, DetId, Envelope, 
 from .corrections import Corrections, logged_pose
 from .exact import Units, cos_sin, unit_vectors
 from .map_errors import ImpossibleCommand
-from .pose_corrections import Pose
+from .pose_corrections import Pose, moved_by
 from .settings import Settings
 from .sights import small_angle
 
@@ -41,7 +41,7 @@ class EventEdits:
 
     def __init__(self, corrections: Corrections) -> None:
         c = self._corrections = corrections
-        changing = c.forgotten_runs, c.forgotten_ranges, c.dropped, c.poses, c.labels
+        changing = c.forgotten_runs, c.forgotten_ranges, c.dropped, c.poses, c.labels, c.frames
         self.any = any(map(bool, changing))
         """Whether any event can be changed."""
         self.expects = any(poses.are_many for poses in c.poses.values())
@@ -83,10 +83,16 @@ class EventEdits:
                 tuple(accepted.det_ids[i] for i in kept),
                 tuple(accepted.vectors[i] for i in kept),
             )
-        if envelope.run_id in corrections.poses:
+        joins = corrections.frame_joins(envelope.frame)
+        if envelope.run_id in corrections.poses or joins:
             expected = self._expected
             pose = expected[offset] if offset in expected else corrections.pose(envelope)
+            for join in joins:
+                pose = None if pose is None else moved_by(join.transform, pose)
             accepted = _with_pose(corrections, offset, accepted, pose)
+        if joins:
+            joined = replace(accepted.envelope, frame=joins[-1].into)
+            accepted = Accepted(joined, accepted.det_ids, accepted.vectors)
         if corrections.labels:
             accepted = relabelled(accepted, corrections.labels)
         return EditedEvent(accepted, units, gone)
@@ -114,7 +120,7 @@ def _with_pose(
         command_id = visible(by.command.command_id)
         raise ImpossibleCommand(
             offset,
-            f"correct-poses {command_id} at offset {by.offset} moves keyframe "
+            f"{by.command.kind} {command_id} at offset {by.offset} moves keyframe "
             f"{envelope.keyframe_id} of run {envelope.run_id!r} to x={x!r}, y={y!r}, yaw={yaw!r}, "
             f"beyond ±{MAX_POSITION_M:,.0f} m; take it back: "
             f"{command_line('edit', 'LOG', 'undo', command_id, '--reason', 'WHY')}",

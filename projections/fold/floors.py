@@ -11,6 +11,10 @@ by a multiple of `STEP_UM`, which is ten times what a map spans. So nothing on t
 within reach of each other, whatever the rule, and the deltas are moved back. The floor that the
 first pose of a log is on is not moved: a map of one floor is as it would be without floors.
 
+Robots may have map frames of their own. The *map's* frame is that of the first pose, and of all
+envelopes that name none; poses in another one that no command joins to it are held apart, as on
+floors of their own.
+
 A command that makes things on two floors one is obeyed for those on the floor whose detection, or
 keyframe, came first.
 
@@ -19,7 +23,7 @@ before a map keep their places: a fold never revises them. For two poses the map
 later one is folded counts.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -30,9 +34,11 @@ from eventsrc.envelope.model import Envelope, Offset
 from eventsrc.envelope.occupancy_map import OccupancyMap
 
 from . import State, part, prefixed
+from .corrections import FrameJoin
 from .deltas import (
     Delta,
     EventSkipped,
+    FrameJoined,
     MapGiven,
     ObjectEstimated,
     ObjectRelocated,
@@ -80,23 +86,40 @@ def shift_of_sum(sum_x_um: int, sum_y_um: int, count: int) -> tuple[int, int]:
 
 
 class Floors:
-    """The reducer. ``ordinals`` numbers the floors by their first pose, None for the one without a
-    name; ``names`` are in that order."""
+    """The reducer. ``ordinals`` numbers the floors by their first pose, each a frame that is held
+    apart, None for the map's, and the name of a floor in it, None for none; ``names`` are in that
+    order. ``frame`` is the map's own."""
 
     def __init__(self, floor_height_m: float) -> None:
         self._height_um = metres_to_um(floor_height_m)
-        self.ordinals: dict[str | None, int] = {}
+        self.ordinals: dict[tuple[str | None, str | None], int] = {}
         self.names: list[str | None] = []
+        self.frame: str | None = None
+        self._has_frame = False
+        self._joined: set[str] = set()
         # The floor of each group of things joined by command, by kind and number of the group.
         self._homes: dict[tuple[str, int], int] = {}
 
-    def enter(self, envelope: Envelope) -> tuple[str | None, int]:
-        """The floor of an envelope with a pose, and its number."""
-        name = floor_name(envelope, self._height_um)
-        if name not in self.ordinals:
-            self.ordinals[name] = len(self.names)
-            self.names.append(name)
-        return name, self.ordinals[name]
+    def enter(self, envelope: Envelope, stated: str | None) -> tuple[str | None, int]:
+        """The floor of an envelope with a pose, and its number; ``stated`` is the frame that it
+        named before any join."""
+        is_joined = envelope.frame is None and stated is not None  # to the map's, whatever that is
+        if not self._has_frame and not is_joined:
+            self.frame, self._has_frame = envelope.frame, True
+        apart = None if envelope.frame == self.frame else envelope.frame
+        floor = apart, floor_name(envelope, self._height_um)
+        if floor not in self.ordinals:
+            self.ordinals[floor] = len(self.names)
+            self.names.append(_shown(*floor))
+        number = self.ordinals[floor]
+        return self.names[number], number
+
+    def join(self, offset: Offset, joins: Iterable[FrameJoin]) -> Iterator[Delta]:
+        """The deltas of the joins that no event before met."""
+        for frame, into, by, command in joins:
+            if frame not in self._joined:
+                self._joined.add(frame)
+                yield FrameJoined(offset, frame, into, by.dx, by.dy, by.dyaw, command)
 
     def number_at(self, x_um: int, y_um: int) -> int:
         """The number of the floor of a laid out position."""
@@ -135,13 +158,26 @@ class Floors:
     def dump(self) -> State:
         """The whole state, to be kept."""
         homes = [[kind, group, floor] for (kind, group), floor in sorted(self._homes.items())]
-        return {"names": self.names, "homes": homes}
+        floors, joined = [list(each) for each in self.ordinals], sorted(self._joined)
+        frame = [self.frame] if self._has_frame else []
+        return {"floors": floors, "homes": homes, "frame": frame, "joined": joined}
 
     def load(self, state: State) -> None:
         """Restore the state of `dump`; an empty one is of a map of one floor."""
-        self.names = list(state.get("names", [None]))
-        self.ordinals = {name: ordinal for ordinal, name in enumerate(self.names)}
+        floors = [(apart, name) for apart, name in state.get("floors", [(None, None)])]
+        self.ordinals = {floor: ordinal for ordinal, floor in enumerate(floors)}
+        self.names = [_shown(*floor) for floor in floors]
+        for self.frame in state.get("frame", ()):
+            self._has_frame = True
+        self._joined = set(state.get("joined", ()))
         self._homes = {(kind, group): floor for kind, group, floor in state.get("homes", ())}
+
+
+def _shown(apart: str | None, name: str | None) -> str | None:
+    """What a floor is called; one of a frame that is held apart has that in its name."""
+    if apart is None:
+        return name
+    return f"frame {apart}" if name is None else f"{name} in frame {apart}"
 
 
 def _put_back(delta: Delta) -> Delta:

@@ -68,6 +68,8 @@ def content_digest(accepted: Accepted) -> bytes:
         content += (("pose_covariance", *envelope.pose_covariance),)
     if envelope.scan is not None:
         content += (("scan", *astuple(envelope.scan)),)
+    if envelope.frame is not None:
+        content += (("frame", envelope.frame),)
     if any(d.position_z is not None or d.size is not None for d in envelope.detections):
         content += (("bodies", *((d.position_z, d.size) for d in envelope.detections)),)
     # Format version 2 has no references, so equal values give equal bytes.

@@ -27,6 +27,12 @@ _MANY: Final = 64
 """From so many transforms on, many keyframes are corrected at once."""
 
 
+def moved_by(transform: RigidTransform, pose: Pose) -> Pose:
+    """The pose after a transform."""
+    t, (x, y, yaw) = transform, pose
+    return (t.cos * x - t.sin * y + t.dx, t.sin * x + t.cos * y + t.dy, yaw + t.dyaw)
+
+
 class PoseCorrection(NamedTuple):
     """One command's correction of a run's poses: ``poses`` by keyframe, or ``transform`` of the
     keyframes from ``first`` to ``last``, None for no bound."""
@@ -60,8 +66,7 @@ class PoseCorrection(NamedTuple):
             return pose
         if self.last is not None and keyframe_id > self.last:
             return pose
-        t, (x, y, yaw) = self.transform, pose
-        return (t.cos * x - t.sin * y + t.dx, t.sin * x + t.cos * y + t.dy, yaw + t.dyaw)
+        return moved_by(self.transform, pose)
 
 
 class PoseCorrections(tuple[PoseCorrection, ...]):

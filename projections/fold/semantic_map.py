@@ -136,6 +136,7 @@ class SemanticMap:
         ``units`` is ``unit_vectors(accepted.vectors)``, made beforehand. Raises FoldError where a
         correction cannot be applied; the map is as before the event then."""
         dropped: tuple[DetId, ...] = ()
+        frame = accepted.envelope.frame
         is_corrected = self._is_corrected
         if is_corrected and self.event_edits.any:
             edited = self.event_edits.edited(offset, accepted, units)
@@ -159,23 +160,17 @@ class SemanticMap:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
         pose = pose_of(envelope)
-        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope)
+        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope, frame)
         if is_corrected and self._anchors:
             anchor = Keyframe(envelope.run_id, envelope.keyframe_id)
             self._add_anchor(keyframe, anchor, None if pose is None else ground)
-        deltas.append(
-            KeyframeAdded(
-                offset,
-                keyframe,
-                run,
-                envelope.run_id,
-                envelope.keyframe_id,
-                envelope.timestamp,
-                pose,
-                floor,
-                envelope.camera,
-            )
-        )
+        if pose is None or frame == self.floors.frame:
+            frame = None
+        elif joins := self.corrections.frame_joins(frame):
+            deltas += self.floors.join(offset, joins)
+        run_id, keyframe_id, at = envelope.run_id, envelope.keyframe_id, envelope.timestamp
+        known = (offset, keyframe, run, run_id, keyframe_id, at, pose, floor, envelope.camera)
+        deltas.append(KeyframeAdded(*known, frame))
         if units is None:
             units = unit_vectors(accepted.vectors)
         if dropped:

@@ -60,7 +60,7 @@ def place_commands(
     that they refused, after the events below ``end``."""
     place, moment = record.formed.place, _last_moment(record, end)
     members: dict[RunId, set[KeyframeId]] = {}
-    if history.corrections.poses:
+    if history.corrections.poses or history.corrections.frames:
         for keyframe in history.keyframes:
             if history.place_at(keyframe.keyframe, moment) == place:
                 members.setdefault(keyframe.run_id, set()).add(keyframe.keyframe_id)
@@ -107,6 +107,14 @@ def _place_texts(
             moved = _moved(command, members.get(command.run_id, ()))
             if moved:
                 yield f"{counted(moved, 'keyframe')} of it moved"
+        case commands.JoinFrames():
+            moved = sum(
+                history.keyframes[history.keyframe_ordinals[run, each]].frame == command.frame
+                for run, ids in members.items()
+                for each in ids
+            )
+            if moved:
+                yield f"{counted(moved, 'keyframe')} of it moved with their frame"
 
 
 def _apart_text(

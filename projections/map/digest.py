@@ -41,9 +41,11 @@ def _computed(view: MapView) -> str:
         remaining = lines(view)
         while chunk := "".join(islice(remaining, _LINES_AT_ONCE)):
             digest.update(chunk.encode("ascii"))
-    if view.floors:
+    if view.floors or view.frames:
         floors = (_line((k.ordinal, k.floor)) for k in view.keyframes if k.floor is not None)
         digest.update(f"floors\n{''.join(floors)}".encode())
+        frames = [_line((k.ordinal, k.frame)) for k in view.keyframes if k.frame is not None]
+        digest.update(f"frames\n{''.join(frames)}".encode() if frames else b"")
     if view.settings.fusion == "evidence":
         digest.update(b"evidence\n")
         for line in _evidence(view):

@@ -78,6 +78,9 @@ def change_lines(view: MapView, deltas: Iterable[d.Delta]) -> Iterator[str]:
 
     for delta in deltas:
         match delta:
+            case d.FrameJoined():
+                into = "the map's frame" if delta.into is None else f"frame {visible(delta.into)}"
+                yield f"frame {visible(delta.frame)} joined into {into} by a command"
             case d.PlaceFormed():
                 yield f"place {delta.place_id} founded"
             case d.PlacesMerged():

@@ -78,7 +78,7 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
 
     ``joined`` is the place it joined, as of then; ``survivors`` are the view's. ``floor`` is the
     name of the floor that the pose is on and ``camera`` the one that took the picture, where the
-    log states them.
+    log states them, and so is ``frame``, if that is not the map's own.
     """
 
     ordinal: deltas.KeyframeOrdinal
@@ -93,6 +93,7 @@ class KeyframeRecord(msgspec.Struct, eq=False, gc=False):
     joined: deltas.PlaceOrdinal | None = None
     floor: str | None = None
     camera: StatedCamera | None = None
+    frame: str | None = None
 
     @property
     def place(self) -> deltas.PlaceOrdinal | None:

@@ -14,6 +14,7 @@ from projections.fold.exact import UM_PER_M
 from projections.fold.place_types import PlaceType
 from projections.fold.settings import Settings, assignment_texts
 
+from .frames import frames_line, frames_of
 from .naming import ShortIds, things_of
 from .phrases import command_document, seen_times
 from .place_regions import place_regions
@@ -42,6 +43,7 @@ def state_document(
             for a, b, transitions in view.edges()
         ],
         **({"floors": list(view.floors)} if view.floors else {}),
+        **({"frames": [each.document() for each in frames]} if (frames := frames_of(view)) else {}),
         **_map(view),
         **_corrections(view, known_at),
     }
@@ -196,6 +198,8 @@ def state_text(
     if view.settings.fusion == "evidence":
         lines.append(f"objects  {_standing(view)}")
     lines += [_walls(floor, given, view) for floor, given in view.maps_in_force().items()]
+    if frames := frames_of(view):
+        lines.append(f"frames   {frames_line(frames)}")
     if in_force := view.corrections.in_force:
         known = view.next_offset if known_at is None else known_at
         lines.append(f"commands {len(in_force):,} in force, of those before {known:,}")

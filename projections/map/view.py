@@ -37,9 +37,9 @@ class MapView:
     not absorbed, by ordinal, ascending; ``all_places`` also has the absorbed ones, whose survivors
     ``survivors`` gives. Likewise ``objects``, ``all_objects`` and ``object_survivors``.
     ``adjacency`` maps (a, b), a founded before b, to shared transitions above 0; `edges` sorts it.
-    ``floors`` numbers the floors that have a name by their first keyframe. ``maps`` are the last
-    occupancy maps by the floor that they name, each with the offset of its event. ``next_offset``
-    is the number of events in the view; ``corrections`` are those they were folded under.
+    ``floors`` numbers those that have a name by their first keyframe; ``frames`` are those joined.
+    ``maps`` are the last occupancy maps by the floor that they name, each with the offset of its
+    event. ``next_offset`` is the number of events in the view, folded under ``corrections``.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class MapView:
         self.survivors = PlaceSurvivors()
         self.adjacency: dict[tuple[PlaceOrdinal, PlaceOrdinal], int] = {}
         self.floors: dict[str, int] = {}
+        self.frames: dict[str, deltas.FrameJoined] = {}
         self.contents = records.PlaceContents()
         self.maps: dict[str | None, deltas.MapGiven] = {}
         self.skipped: dict[SkipKind, int] = {"duplicate": 0, "conflict": 0, "det_id_reused": 0}
@@ -91,15 +92,14 @@ class MapView:
         self.next_offset = Offset(offset + 1)
 
     def advance(self, next_offset: Offset) -> None:
-        """Set ``next_offset``: all events below it are in the view."""
+        """Set ``next_offset``."""
         self.next_offset = next_offset
 
     def known_digest(self) -> str | None:
-        """The digest of this map, where it was kept; see `projections.map.digest`."""
-        return None
+        """The digest of this map, where it was kept."""
 
     def keep_digest(self, digest: str) -> None:
-        """Keep the digest, if the view has a cache for it; this one has none."""
+        """Keep the digest, if the view has a cache for it."""
 
     def place_id(self, place: PlaceOrdinal | None) -> str | None:
         """The id of a place, absorbed ones too; None for None."""
@@ -175,7 +175,9 @@ class MapView:
         known = delta.keyframe, delta.offset, delta.run, delta.run_id, delta.keyframe_id
         seen = delta.timestamp, delta.pose, self.survivors
         record = records.KeyframeRecord
-        self.keyframes.append(record(*known, *seen, floor=delta.floor, camera=delta.camera))
+        self.keyframes.append(
+            record(*known, *seen, (), None, delta.floor, delta.camera, delta.frame)
+        )
         if delta.floor is not None:
             self.floors.setdefault(delta.floor, len(self.floors))
 
@@ -323,6 +325,7 @@ class MapView:
     # once it is no longer used, until Python looks for cycles.
     _APPLIERS: ClassVar[dict[type, Callable[["MapView", Any], None]]] = {
         deltas.RunSeen: _run_seen,
+        deltas.FrameJoined: lambda view, of: view.frames.update({of.frame: of}),
         deltas.KeyframeAdded: _keyframe_added,
         deltas.ObservationAdded: _observation_added,
         deltas.EventSkipped: _event_skipped,
@@ -345,8 +348,7 @@ class MapView:
     }
 
     def counts(self) -> dict[str, int]:
-        """Counts by name; the eight in capitals are of the graph's edges by label. Those that are
-        rare, and pictures of a camera that nothing states, come at the end, if they count."""
+        """Counts by name, in capitals those of the graph's edges; rare ones come at the end."""
         posed, fused, foreign = self._sums()
         unstated = self.without_camera() if self.settings.wants_camera else 0
         placed = sum(p.keyframe_count for p in self.places.values())
@@ -381,13 +383,11 @@ class MapView:
 
     def embedded(self) -> NDArray[np.int64]:
         """The observations with a vector of the map's space, ascending; none without embeddings."""
-        found = (o.ordinal for o in self.observations if o.embedding is not None)
-        return np.fromiter(found, np.int64)
+        return np.array([o.ordinal for o in self.observations if o.embedding is not None], np.int64)
 
     def vectors(self, observations: NDArray[np.int64]) -> NDArray[np.int32]:
         """The unit vectors of some of `embedded`, in units of 2⁻²⁰, shape (n, dim)."""
-        rows = [self.observations[ordinal].embedding for ordinal in observations.tolist()]
-        return np.array(rows, np.int32)
+        return np.array([self.observations[n].embedding for n in observations.tolist()], np.int32)
 
     def _sums(self) -> tuple[int, int, int]:
         """Numbers of posed keyframes, of fused observations, and of those of foreign spaces."""

@@ -218,6 +218,9 @@ def _keyframe_rows(view: MapView, keyframes: Iterable[int]) -> Iterator[VertexRo
     for i in keyframes:
         k = view.keyframes[i]
         more = f'"timestamp": {k.timestamp!r}, "offset": {k.offset}{_camera(k.camera)}'
+        if k.frame is not None:
+            joined = "true" if k.frame in view.frames else "false"
+            more += f', "frame": {text(k.frame)}, "frame_joined": {joined}'
         properties = f"{{{_keyframe_key(k)}, {more}}}"
         yield base + i, properties
 

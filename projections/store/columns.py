@@ -42,6 +42,7 @@ _NOTHING: Final[Mapping[Kind, int]] = {"number?": NONE, "int?": NO_INT}
 
 DELTAS: Final[Mapping[str, type[msgspec.Struct]]] = {
     "run": deltas.RunSeen,
+    "joined": deltas.FrameJoined,
     "keyframe": deltas.KeyframeAdded,
     "observation": deltas.ObservationAdded,
     "skipped": deltas.EventSkipped,

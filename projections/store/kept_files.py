@@ -39,7 +39,7 @@ from projections.fold import State
 from .columns import TABLES, Array, Stripe, ends_of
 from .tables import DamagedPart
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 _COMMENT: Final = "mapfold history {} {} {} {}"
 _COMMENT_PATTERN: Final = re.compile(rb"mapfold history (\d+) (\d+) (\d+) (\d+)\Z")
 _MOST_COMMENT: Final = 200

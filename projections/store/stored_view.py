@@ -74,6 +74,9 @@ class StoredView(MapView):
         for kind, count in _skipped(moment).items():
             self.skipped[cast("d.SkipKind", kind)] = count
         self.floors = {name: number for number, name in enumerate(_floors(moment))}
+        if joined := moment.count("joined"):
+            of_frames: list[d.FrameJoined] = moment.tables.deltas("joined", 0, joined)
+            self.frames = {each.frame: each for each in of_frames}
         for given in history.maps[: moment.count("map")] if moment.count("map") else ():
             self.maps[given.map.floor] = given
         self.has_bodies = bool(moment.column("observation", "body").any())
@@ -207,6 +210,7 @@ def _keyframes(
             None if place == NONE else place,
             k.floor,
             k.camera,
+            k.frame,
         )
         for k, span, place in zip(added, pairwise(starts), places, strict=True)
     ]

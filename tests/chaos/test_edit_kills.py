@@ -29,3 +29,4 @@ def _kill(folder: Path, fresh: Targets, rounds: int, seed: int) -> None:
     assert tally.good, tally
     assert tally.rounds == rounds
     assert tally.acknowledged > 0, "the recorders lived long enough to take commands"
+    assert tally.joined > 0, "the frame of the second robot was joined to the map's"

@@ -7,7 +7,7 @@ import pytest
 
 from tests.property.test_align import HERE, in_frame, jumped
 from tests.support.commands import Commands
-from tests.support.logs import simulated
+from tests.support.logs import simulated, walk, write_log
 from tests.support.thorough import stride
 
 FRAME = (12.0, -7.0, 2.1)
@@ -111,6 +111,50 @@ def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
     assert "no frame jumped" in mapfold("align", log, "--jumps").out
     said = mapfold("align", log, "--jumps", "--to", "sim-7-a", code=2)
     assert "--jumps takes neither --to nor --picture" in said.err
+
+
+def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
+    here = walk(12) + [each | {"frame": "b"} for each in walk(12, run_id="run-b")]
+    log = write_log(mapfold.folder / "log", here)
+    assert mapfold("merges", log, "--frames", "--at", "12").out == (
+        "all keyframes are in one frame\n"
+    )
+    (apart,) = mapfold("merges", log, "--frames", "--json").json
+    assert (apart["frame"], apart["held_apart"], apart["runs"]) == ("b", True, ["run-b"])
+    state = mapfold("state", log, "--json").json
+    assert state["frames"] == [apart]
+    assert state["floors"] == ["frame b"]
+    assert f"b ({apart['keyframes']} keyframes) held apart" in mapfold("state", log).out
+    said = mapfold("edit", log, "join-frames", "c", "--reason", "x", code=2)
+    assert "frame c: no keyframe names it, or the map's own; held apart are b" in said.err
+    joining = ["edit", log, "join-frames", "b", "--dx", "0.5", "--reason", "one house"]
+    mapfold(*joining)
+    assert "join-frames b into the map's own: dx=0.5 dy=0 dyaw=0" in mapfold("edits", log).out
+    (joined,) = mapfold("merges", log, "--frames", "--json").json
+    assert joined == apart | {"held_apart": False, "into": None, "command": 24} | {
+        "dx": 0.5, "dy": 0.0, "dyaw_rad": 0.0, "offset": joined["offset"]
+    }  # fmt: skip
+    assert "joined to the map" in mapfold("merges", log, "--frames").out
+    assert "frames" not in mapfold("state", log, "--at", "12", "--json").json
+    assert mapfold("state", log, "--at", "24", "--json").json["frames"] == [apart]
+    assert mapfold("state", log, "--at", "24", "--known-at", "end", "--json").json["frames"] == [
+        joined
+    ]
+    assert "frame b: joined already" in mapfold(*joining, code=2).err
+    said = mapfold("merges", log, "--frames", "--objects", code=2)
+    assert "are tables of their own; give one alone" in said.err
+
+
+@pytest.mark.slow
+def test_a_frame_that_is_held_apart_is_joined_with_all_its_runs(mapfold: Commands) -> None:
+    third = lines("b", FRAME).replace("sim-7-b", "third")
+    away = (lines("b", FRAME) + third).replace('"run_id"', '"frame": "b", "run_id"')
+    log = log_of(mapfold, "log", lines("a", HERE), away)
+    assert mapfold("merges", log, "--frames", "--json").json[0]["runs"] == ["sim-7-b", "third"]
+    said = mapfold("align", log, "--write")
+    assert "third: moved with its frame, which is joined already" in said.err
+    assert mapfold("edits", log).out.count("join-frames b into the map's own") == 1
+    assert mapfold("align", log).out.count("already in one frame") == 2
 
 
 def test_a_log_without_runs_says_so(mapfold: Commands) -> None:

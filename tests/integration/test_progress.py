@@ -75,6 +75,7 @@ EDITS = {
     "forget-run": ["run-a"],
     "forget-keyframes": ["run-a", "2..4"],
     "correct-poses": ["run-a", "--dx", "1"],
+    "join-frames": ["b"],
     "relabel": ["cup=mug"],
     "use-settings": ["--set", "eps_m=1"],
     "undo": ["0"],

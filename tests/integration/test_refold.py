@@ -27,6 +27,7 @@ from tests.support.logs import (
     command,
     forget_keyframes,
     forget_run,
+    join_frames,
     keep_apart,
     name_place,
     undo,
@@ -101,6 +102,34 @@ def test_commands_come_to_the_rows_of_a_fresh_replay(
     append_command(log, forget_run("run-d"))
     tail(log, targets, SETTINGS, once=True)
     assert all_rows(targets) == before
+
+
+def test_frames_are_joined_to_the_rows_of_a_fresh_replay(
+    tmp_path: Path, one_database: Targets, third_database: Targets
+) -> None:
+    """Held apart before, as on a floor of its own; and later runs in the frame are joined too."""
+    log, away = tmp_path / "log", {"frame": "b"}
+    there = [each | away for each in walk(30, seed=3, run_id="run-c")]
+    write_log(log, [each | {"frame": "a"} for each in walk(30)] + there)
+    tail(log, one_database, SETTINGS, once=True)
+    before = all_rows(one_database)
+    assert before == fresh_rows(log, third_database)
+    assert [each for _, each in parsed(before[0])["Floor"]] == [{"floor": "frame b"}]
+    given = join_frames("b", "a", dx=0.25, dyaw=0.1)
+    append_command(log, given)
+    write_log(log, [each | away for each in walk(10, seed=5, run_id="run-d")])
+    assert tail(log, one_database, SETTINGS, once=True).refolds == 1
+    rows = all_rows(one_database)
+    assert rows == fresh_rows(log, third_database)
+    keyframes = [each for _, each in parsed(rows[0])["Keyframe"]]
+    joined = [each["frame_joined"] for each in keyframes if "frame" in each]  # of those with a pose
+    assert all(joined)
+    assert 30 < len(joined) <= 40
+    assert rows[0]["Floor"] == []
+    append_command(log, undo(given))
+    append_command(log, forget_run("run-d"))
+    tail(log, one_database, SETTINGS, once=True)
+    assert all_rows(one_database) == before
 
 
 def test_a_batch_may_end_between_a_command_and_its_undo(

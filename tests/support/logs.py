@@ -147,6 +147,14 @@ def name_place(keyframe_id: int, name: str, run_id: str = "run-a") -> Command:
     return command(commands.NamePlace, place=anchor(keyframe_id, run_id), name=name)
 
 
+def join_frames(
+    frame: str, into: str | None, *, dx: float = 0.0, dy: float = 0.0, dyaw: float = 0.0
+) -> Command:
+    """Joins a map frame to another."""
+    transform = commands.RigidTransform.of(dx, dy, dyaw)
+    return command(commands.JoinFrames, frame=frame, into=into, transform=transform)
+
+
 def keep_apart(first: int, second: int, run_id: str = "run-a") -> Command:
     """Keeps the places of two keyframes of a run apart."""
     return command(commands.KeepApart, places=(anchor(first, run_id), anchor(second, run_id)))

@@ -131,6 +131,8 @@ def expected_graph(view: MapView) -> dict[str, list[tuple[Any, ...]]]:
                 name: getattr(k.camera, name)
                 for name in ("hfov_deg", "width_px", "height_px", "yaw_rad")
             }
+        if k.frame is not None:
+            taken |= {"frame": k.frame, "frame_joined": k.frame in view.frames}
         rows["Keyframe"].append((gid("Keyframe", n), {**name, **taken}))
         run_end = gid("Run", k.run + 1)
         rows["HAS_KEYFRAME"].append((gid("HAS_KEYFRAME", n), run_end, gid("Keyframe", n), {}))

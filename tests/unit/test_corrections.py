@@ -18,6 +18,7 @@ from eventsrc.envelope.commands import (
     ForgetRun,
     InvalidCommand,
     Join,
+    JoinFrames,
     KeepApart,
     NamePlace,
     RigidTransform,
@@ -67,6 +68,7 @@ EVERY: list[Command] = [
         poses=(moved_to(1.0),),
     ),
     CorrectPoses(**head(7), run_id=RunId("r"), transform=RigidTransform.of(0.3, 0.0, 0.1)),
+    JoinFrames(**head(8), frame="b", into="a", transform=RigidTransform.of(0.3, 0.0, 0.1)),
     UseSettings(**head(8), settings={"eps_m": 1.0}),
     Undo(**head(9), undone="c1"),
 ]

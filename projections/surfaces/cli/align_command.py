@@ -12,9 +12,10 @@ from eventsrc.base.progress import reported
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
-from projections.edit.correct_poses import Span, by_transform
+from projections.edit.correct_poses import Span, by_alignment
 from projections.edit.make import Stamp
 from projections.edit.record import Made, record_command, recorded_document
+from projections.map.frames import frames_of
 from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
@@ -152,6 +153,12 @@ class _Frames(CachedLog):
         ]
         return proposals, against
 
+    def held_apart(self) -> dict[RunId, str]:
+        """The frame of each run in one that is held apart."""
+        with self.opened() as opened:
+            there = frames_of(self._view(opened))
+        return {run: each.frame for each in there if each.joined is None for run in each.runs}
+
     def _view(self, opened: OpenLog) -> MapView:
         reader, end, _, corrections, settings = opened
         return map_after(
@@ -265,8 +272,14 @@ def align(
     if write:
         usable = [each for each in left if each.verdict in wanted]
         left = [each for each in left if each.verdict not in wanted]
+        held, joined = frames.held_apart(), set[str | None]()
         for proposal, run in ((each, run) for each in usable for run in each.runs):
+            if held.get(run) in joined:
+                say(f"{visible(run)}: moved with its frame, which is joined already")
+                continue
             made = _record(frames, zenoh, run, proposal, who)
+            if made.command.kind == "join-frames":
+                joined.add(held[run])
             recorded.append(recorded_document(made))
             if not json_:
                 display(recorded_text(made))
@@ -325,9 +338,10 @@ def _of_step(run: RunId, step: "LargeStep") -> _Proposal:
 
 def _record(frames: _Frames, zenoh: ZenohClient, run: RunId, proposal: _Proposal, who: str) -> Made:
     dx, dy, dyaw = proposal.transform or (0.0, 0.0, 0.0)
+    to: str | None = proposal.document.get("to")
     return record_command(
         frames.log,
-        lambda current, stamp: by_transform(current, stamp, run, proposal.span, dx, dy, dyaw),
+        lambda current, stamp: by_alignment(current, stamp, run, to, proposal.span, dx, dy, dyaw),
         Stamp(uuid.uuid4().hex, who, proposal.reason),
         frames.settings,
         zenoh.session,

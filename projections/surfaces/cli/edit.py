@@ -16,7 +16,13 @@ from eventsrc.envelope.trajectory import read_trajectory
 from eventsrc.log import LogReader
 from eventsrc.record.importers.map_yaml import read_labels
 from projections.edit import make
-from projections.edit.correct_poses import DEFAULT_SLACK_S, Span, by_trajectory, by_transform
+from projections.edit.correct_poses import (
+    DEFAULT_SLACK_S,
+    Span,
+    by_trajectory,
+    by_transform,
+    join_frames,
+)
 from projections.edit.current import MapToEdit
 from projections.edit.effect import edits_document, edits_text, effects_of
 from projections.edit.make import Stamp
@@ -211,6 +217,25 @@ def _correct_poses(
             current, stamp, run, trajectory, span, slack, ignore_missing=ignore_missing, note=say
         )
     )
+
+
+@edit.command("join-frames")
+def _join_frames(
+    *,
+    frame: Annotated[str, typer.Argument(metavar="FRAME", help="The map frame to move.")],
+    into: Annotated[
+        str | None, option("FRAME", "The frame to move it into [default: the map's own].", "--into")
+    ] = None,
+    dx: Annotated[float, option("METRES", "Shift in x.", "--dx")] = 0.0,
+    dy: Annotated[float, option("METRES", "Shift in y.", "--dy")] = 0.0,
+    dyaw: Annotated[float, option("RADIANS", "Turn about the frame's origin.", "--dyaw")] = 0.0,
+    options: EditOptions,
+) -> None:
+    """Join all keyframes in a map frame that is held apart to the map, by one rigid transform.
+
+    `mapfold merges LOG --frames` lists the frames; `mapfold align` finds the transform.
+    """
+    options.record(lambda current, stamp: join_frames(current, stamp, frame, into, dx, dy, dyaw))
 
 
 def _keyframe_id(number: int | None) -> KeyframeId | None:

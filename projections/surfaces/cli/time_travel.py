@@ -31,6 +31,7 @@ from projections.history.rendering import (
     refusals_text,
     search_text,
 )
+from projections.map.frames import frames_of, frames_text
 from projections.store.history_records import Merge
 
 from . import folded_log
@@ -86,6 +87,12 @@ def merges(
     objects: Annotated[
         bool, typer.Option("--objects", help="Show instead the objects that became one, and why.")
     ] = False,
+    frames: Annotated[
+        bool,
+        typer.Option(
+            "--frames", help="Show instead the map frames: joined by which command, or held apart."
+        ),
+    ] = False,
     known_at: folded_log.KnownAtOption = None,
     json_: JsonOption = False,
     past: PastLog,
@@ -95,8 +102,10 @@ def merges(
     With its time, the place that survived, the places that were absorbed, and what moved to the
     survivor.
     """
-    if refused + objects + (show is not None or draw is not None) > 1:
-        raise MisuseError("--refused and --objects are tables of their own; give one alone")
+    if refused + objects + frames + (show is not None or draw is not None) > 1:
+        raise MisuseError(
+            "--refused, --objects and --frames are tables of their own; give one alone"
+        )
     if draw is None and out is not None:
         raise MisuseError(f"--out {out} is for the picture of --draw N; give --draw too")
     picture = out or Path("merge.png")
@@ -108,6 +117,10 @@ def merges(
             return
         if objects:
             _show_object_merges(known, end, json_=json_)
+            return
+        if frames:
+            met = frames_of(known.at(end))
+            emit([each.document() for each in met]) if json_ else display(frames_text(met))
             return
         found = known.merges(end)
         if draw is not None:

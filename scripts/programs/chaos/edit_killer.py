@@ -6,6 +6,8 @@
 and a server. A commander sends each command again under its id until a recorder says that it is in
 the log. Counted: commands that were acknowledged and are not in the log (lost), that are in it more
 than once (twice), and checks after which the databases differ from a fresh replay (wrong).
+
+Two robots publish, each in a map frame of its own; the first command joins these.
 """
 
 import argparse
@@ -27,13 +29,24 @@ from eventsrc.record.recorder.edits import send_command
 from eventsrc.record.transport.session import Router, ZenohOptions, open_session
 from projections.fold.map_errors import DatabaseError
 from projections.fold.settings import Settings
-from projections.map.parsing import read_commands
+from projections.map.digest import map_digest
+from projections.map.parsing import read_commands, read_corrections
 from projections.postgres import rebuild
 from projections.postgres.connection import Targets
 from projections.postgres.status import projection_status
+from projections.store.history_recorder import map_after
 from tests.support.envelopes import payload
 from tests.support.fixtures_zenoh import LOOPBACK, MAPFOLD, Program
-from tests.support.logs import KEY, forget_keyframes, keep_apart, name_place, undo, walk, write_log
+from tests.support.logs import (
+    KEY,
+    forget_keyframes,
+    join_frames,
+    keep_apart,
+    name_place,
+    undo,
+    walk,
+    write_log,
+)
 from tests.support.rows import all_rows
 from tests.support.servers import kill_postgres, server_to_kill
 
@@ -51,6 +64,7 @@ class Tally:
     rounds: int = 0
     checks: int = 0
     acknowledged: int = 0
+    joined: int = 0
     lost: int = 0
     twice: int = 0
     wrong: int = 0
@@ -64,12 +78,20 @@ class Tally:
 class Commander(threading.Thread):
     """Sends commands, each until it is acknowledged; ``acknowledged`` are their ids."""
 
-    def __init__(self, endpoint: str, log_id: str, rng: random.Random, history: list[Command]):
+    def __init__(
+        self,
+        endpoint: str,
+        log_id: str,
+        rng: random.Random,
+        history: list[Command],
+        has_joined: bool,
+    ) -> None:
         super().__init__()
         self._endpoint, self._log_id, self._rng = endpoint, log_id, rng
         self.history = history
         self.acknowledged: list[str] = []
         self.stop = threading.Event()
+        self._has_joined = has_joined
 
     def run(self) -> None:
         with open_session(ZenohOptions(connect=(self._endpoint,)), mode="client") as session:
@@ -82,11 +104,15 @@ class Commander(threading.Thread):
                         self.stop.wait(0.05)  # no recorder now; the answer may be lost too
                         continue
                     self.acknowledged.append(given.command_id)
-                    self.history.append(given)
+                    if given.kind != "join-frames":  # so that it is never undone
+                        self.history.append(given)
                     break
 
     def _next(self) -> Command:
         rng = self._rng
+        if not self._has_joined:
+            self._has_joined = True
+            return join_frames("b", "a", dx=0.5, dyaw=0.1)
         first, second = rng.sample(range(60), 2)
         kind = rng.random()
         if kind < 0.4:
@@ -99,19 +125,19 @@ class Commander(threading.Thread):
 
 
 class Robot(threading.Thread):
-    """Publishes keyframes; those that no recorder hears are not in the log, which is all right."""
+    """Publishes keyframes in a map frame; those that no recorder hears are not in the log."""
 
-    def __init__(self, endpoint: str, first: int) -> None:
+    def __init__(self, endpoint: str, run_id: str, frame: str, first: int) -> None:
         super().__init__()
-        self._endpoint, self.next = endpoint, first
+        self._endpoint, self._run_id, self._frame, self.next = endpoint, run_id, frame, first
         self.stop = threading.Event()
 
     def run(self) -> None:
         with open_session(ZenohOptions(connect=(self._endpoint,)), mode="client") as session:
             publisher = session.publisher(KEY)
             while not self.stop.wait(1 / KEYFRAMES_A_SECOND):
-                (document,) = walk(1, seed=self.next, first=self.next)
-                publisher.put(payload(document))
+                (document,) = walk(1, seed=self.next, first=self.next, run_id=self._run_id)
+                publisher.put(payload(document | {"frame": self._frame}))
                 self.next += 1
 
 
@@ -121,7 +147,7 @@ class Ordeal:
     def __init__(self, folder: Path, rng: random.Random, fresh: Targets) -> None:
         self._log, self._rng, self._fresh = folder / "log", rng, fresh
         self._keyframes = 60
-        write_log(self._log, walk(self._keyframes))
+        write_log(self._log, [each | {"frame": "a"} for each in walk(self._keyframes)])
         with LogReader(self._log) as reader:
             self._log_id = reader.log_id
         self._history: list[Command] = []
@@ -144,20 +170,26 @@ class Ordeal:
     def run(self, rounds: int) -> None:
         """Kill something ``rounds`` times; check every `ROUNDS_A_CHECK` times and at the end."""
         while self.tally.rounds < rounds:
-            commander = Commander(self._endpoint, self._log_id, self._rng, self._history)
-            robot = Robot(self._endpoint, self._keyframes)
-            commander.start()
-            robot.start()
+            has_joined = bool(self._acknowledged)
+            commander = Commander(
+                self._endpoint, self._log_id, self._rng, self._history, has_joined
+            )
+            robots = [
+                Robot(self._endpoint, f"run-{frame}", frame, self._keyframes) for frame in "ab"
+            ]
+            threads = [commander, *robots]
+            for thread in threads:
+                thread.start()
             try:
                 for _ in range(min(ROUNDS_A_CHECK, rounds - self.tally.rounds)):
                     commander.stop.wait(self._rng.uniform(0.0, LONGEST_PAUSE_S))
                     self._kill(self._rng.choice(["tail", "tail", "recorder", "server"]))
                     self.tally.rounds += 1
             finally:
-                for thread in (commander, robot):
+                for thread in threads:
                     thread.stop.set()
                     thread.join(PATIENCE_S)
-            self._keyframes = robot.next
+            self._keyframes = max(robot.next for robot in robots)
             self._acknowledged += commander.acknowledged
             self._check()
 
@@ -183,13 +215,19 @@ class Ordeal:
         self._wait_for_tail()
         with LogReader(self._log) as reader:
             stands = Counter(c.command.command_id for c in read_commands(reader))
-        rebuild(self._log, self._fresh, Settings())
+            known = read_corrections(reader)
+            view = map_after(reader, Settings(), reader.next_offset, corrections=known, note=print)
+            kept = map_digest(view)
+        again = rebuild(self._log, self._fresh, Settings())
         tally = self.tally
         tally.checks += 1
         tally.acknowledged = len(self._acknowledged)
         tally.lost = len(set(self._acknowledged) - stands.keys())
         tally.twice = sum(count > 1 for count in stands.values())
-        tally.wrong += all_rows(self._targets) != all_rows(self._fresh)
+        rows = all_rows(self._targets)
+        tally.wrong += rows != all_rows(self._fresh)
+        tally.wrong += kept != again.digest
+        tally.joined = sum('"frame_joined": true' in row[-1] for row in rows[0]["Keyframe"])
         self._programs["recorder"] = self._start("recorder")
 
     def _wait_for_tail(self) -> None:
