@@ -88,7 +88,7 @@ def test_scores_of_nothing_are_nothing() -> None:
 
 
 def _scores(p50: float, plain: float) -> Scores:
-    return Scores(10, 5, p50, 3.0, plain, 4.0, 5.0, 0.5, 0.4, 0.9, 0.8, *([0.1] * 6), 2.0)
+    return Scores(10, 5, p50, 3.0, plain, 4.0, 5.0, 0.5, 0.4, 0.9, 0.8, *([0.1] * 9), 2.0)
 
 
 def test_the_worst_beside_the_plain_baseline_stands_last_below_the_means() -> None:

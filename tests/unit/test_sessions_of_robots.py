@@ -44,7 +44,13 @@ def test_a_session_is_the_track_of_its_name() -> None:
 
 def test_without_a_pose_there_is_nothing_to_say() -> None:
     tracked = Sessions().tracked("robot", STILL, Answer((), None, 0.0))
-    assert tracked == {"pose": None, "confidence": 0.0, "questions": 1}
+    assert tracked == {
+        "pose": None,
+        "confidence": 0.0,
+        "known": 0.0,
+        "known_spread": None,
+        "questions": 1,
+    }
 
 
 def test_the_longest_silent_is_forgotten_when_there_are_too_many() -> None:

@@ -224,6 +224,7 @@ sites each, one of them the right one for about half of the questions."""
 FITTED_SITES: Final = 6
 _LEAST: Final = 1e-6
 """Least distance of clipped probabilities from 0 and 1, so that no single map decides."""
+_MOST_LOGIT: Final = math.log((1.0 - _LEAST) / _LEAST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,12 +275,17 @@ def which_site(answers: Mapping[str, Answer]) -> WhichSite:
 
 def _evidence(answer: Answer) -> float:
     of_confidence = CONFIDENCE_WEIGHT * _logit(answer.confidence)
-    return INTERCEPT + KNOWN_WEIGHT * _logit(answer.known) + of_confidence
+    known = _logit(answer.known) if answer.looks is None else _within(answer.looks.logit)
+    return INTERCEPT + KNOWN_WEIGHT * known + of_confidence
 
 
 def _logit(probability: float) -> float:
     within = min(1.0 - _LEAST, max(_LEAST, probability))
     return math.log(within / (1.0 - within))
+
+
+def _within(logit: float) -> float:
+    return min(_MOST_LOGIT, max(-_MOST_LOGIT, logit))
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from projections.fold.deltas import ObservationOrdinal
 from projections.fold.exact import to_float32
 from projections.fold.sights import camera_of
 from projections.localize.relocalize import Answer, ExactIndex, Match, QuestionCrop, rank
+from projections.localize.relocalize.constants import USUAL_DAY
 from projections.map.records import KeyframeRecord, ObjectRecord, ObservationRecord
 from projections.map.view import MapView
 
@@ -107,7 +108,9 @@ class OwnQuestions:
         def answered(taken_out: bool) -> OwnAnswer:
             found = self._index.search(asked, without=visit | shown if taken_out else visit)
             rows = tuple(_another_day(row, keyframe.run_id, lowered) for row in found.matches)
-            answer = rank(asked, replace(found, matches=rows), top=1, camera=camera)
+            used = replace(found.constants, session=USUAL_DAY)
+            found = replace(found, matches=rows, constants=used)
+            answer = rank(asked, found, top=1, camera=camera)
             pose = None if answer.pose is None else (answer.pose.x, answer.pose.y)
             floor = None if answer.pose is None else answer.pose.floor
             return OwnAnswer(

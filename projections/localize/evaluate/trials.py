@@ -20,6 +20,7 @@ from projections.fold.map_errors import QuestionError
 from projections.fold.settings import CameraConstants
 from projections.localize import relocalize
 from projections.localize.relocalize import Answer, ExactIndex, MapCandidates, Match, Method, rank
+from projections.localize.relocalize.certainty import Session
 from projections.map.view import MapView
 
 from .parallel import call_all
@@ -270,6 +271,30 @@ class TrialRunner:
     def _room_of(self, place_id: str) -> str | None:
         rooms = self._rooms[place_id]
         return max(sorted(rooms), key=rooms.__getitem__) if rooms else None
+
+
+SESSION, BEFORE = 20, 10
+"""Questions of a session, and how many of them come before the first that is scored."""
+
+
+def known_of_sessions(trials: Iterable[Trial]) -> list[tuple[float, bool]]:
+    """`known` by the questions before it in its session, and the truth; each run's questions, in
+    order, are sessions of 20, of which the last ten are scored."""
+    by_run: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_run.setdefault(trial.question.key[0], []).append(trial)
+    found = []
+    for asked in by_run.values():
+        for number, trial in enumerate(asked):
+            if number % SESSION == 0:
+                session = Session()
+            looks = trial.answer.looks
+            if number % SESSION >= BEFORE:
+                known = trial.answer.known if looks is None else session.known(looks)[0]
+                found.append((known, trial.known))
+            if looks is not None:
+                session.add(looks)
+    return found
 
 
 def is_elsewhere(floor: str | None, true_floor: str | None) -> bool | None:

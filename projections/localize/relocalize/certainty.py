@@ -16,6 +16,10 @@ Nothing measured on other maps holds for one that a robot has just begun: the fe
 are the most similar to any crop, and every pose is near the few spots they were seen from. The
 candidates show that, so `thinness` costs a question nothing.
 
+How much likeness another day costs, a map of one run cannot know. Its `SessionPrior` is a mean and
+a spread of that, as an addition to the logit; of several runs `mapfold calibrate` reads it. What
+the questions of one session say of it is in `Session`.
+
 In the fit of `confidence`, an answer to crops of things that the map lacks counts as wrong. Where
 only classes are known, there is no likeness by which to decide whether the things are those of the
 map: `known` is one half. The posterior's weight near the answer assumes that they are, and is too
@@ -36,7 +40,7 @@ from projections.fold.settings import LocalizerConstants
 
 from .camera import Floats
 from .candidates import NEIGHBOURS, Match
-from .constants import MapConstants, RankingModel
+from .constants import MapConstants, RankingModel, SessionPrior
 from .landmarks import Landmarks
 from .question import QuestionCrop
 
@@ -47,21 +51,44 @@ KNOWN_WEIGHTS: Final[tuple[float, ...]] = (-15.095, 19.053, 4.775, 10.356, -1.61
 _NEAREST: Final = 4
 _LEAST: Final = 0.4
 """Least likeness in the means over the crops: a lower one counts as this."""
+_LEAST_KNOWN: Final = 1e-12
 _NO_LOOK: Final = 0.5
 """`known` of a question whose crops have no embedding: their classes are in the map."""
 
 
-def known_probability(
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """What the likenesses of a question say: the logit of `known` as of a day that costs what
+    things of the weights' fit lost, and the prior of what this one costs beside."""
+
+    logit: float
+    prior: SessionPrior
+
+    @property
+    def known(self) -> float:
+        """The probability that the map has one of the things shown, of a question alone."""
+        return probability(self.logit + self.prior.mean)
+
+
+def known_probability(looks: Looks | None, matches: Sequence[Sequence[Match]]) -> float:
+    """The probability that the map has one of the things shown; 0 where nothing is similar to any
+    crop."""
+    if looks is None:
+        return _NO_LOOK if any(matches) else 0.0
+    return looks.known
+
+
+def looks_of(
     crops: Sequence[QuestionCrop], matches: Sequence[Sequence[Match]], constants: MapConstants
-) -> float:
-    """The probability that the map has one of the things shown; ``matches`` run parallel to
-    ``crops``, each row most similar first. 0 where nothing is similar to any crop."""
+) -> Looks | None:
+    """What the likenesses say; ``matches`` run parallel to ``crops``, each row most similar first.
+    None if no crop has an embedding and matches."""
     features = known_features(crops, matches, constants)
     if features is None:
-        return _NO_LOOK if any(matches) else 0.0
+        return None
     localizer = constants.localizer
-    logit = logit_of(KNOWN_WEIGHTS, features)
-    return probability(logit, localizer.known_scale, localizer.known_shift)
+    logit = localizer.known_scale * logit_of(KNOWN_WEIGHTS, features) + localizer.known_shift
+    return Looks(logit, constants.session)
 
 
 def known_features(
@@ -103,6 +130,94 @@ def probability(logit: float, scale: float = 1.0, shift: float = 0.0) -> float:
     """The logistic function of a logit, corrected by a map's own scale and shift; the same bits on
     every machine."""
     return 1.0 / (1.0 + exp(-max(-40.0, min(40.0, scale * logit + shift))))
+
+
+_SHARES: Final = np.array((0.02, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95))
+_STRANGE: Final = 0.35
+"""Shares of a session's questions that are known, and the prior of the least: the robot is in
+another building, or in a part that was never mapped."""
+_COSTS: Final = np.linspace(-4.0, 4.0, 17)
+"""How much lower than expected the logits of known questions are in a session."""
+_KNOWN_LOGIT, _KNOWN_SPREAD = 2.4, 1.6
+_OTHER_LOGIT, _OTHER_SPREAD = -4.0, 2.6
+_LOOK_ALIKES: Final = 0.06
+"""Logits of known and of unknown questions, and the share of unknown ones that look like known
+ones."""
+_COUNT: Final = 0.3
+"""How much of an independent question each is: successive ones show the same things."""
+
+
+class Session:
+    """What the questions of one session say of what its day costs.
+
+    Their logits are a mixture: known ones are normally distributed about 2.4 less the cost of the
+    session, and flat above; the others are far below, but for a few look-alikes. The weights of a
+    grid of costs and of shares of known questions are multiplied by the likelihood of each
+    question. As long as there is none, a question is answered as alone.
+    """
+
+    def __init__(self) -> None:
+        self._prior: Floats | None = None
+        self._weights: Floats = np.zeros(0)
+
+    def known(self, looks: Looks) -> tuple[float, float]:
+        """`known` of a question by those before it, and its standard deviation, as the cost of the
+        session is uncertain."""
+        weights, prior = (self._weights, self._prior)
+        if prior is None:
+            weights = prior = _session_prior(looks.prior.spread)
+        logit = looks.logit + looks.prior.mean
+        ratios = _known_ratios(logit)
+        usual = _mean_ratio(ratios, prior)
+        known = probability(logit + math.log(_mean_ratio(ratios, weights) / usual))
+        by_cost = np.exp(weights - weights.max()).sum(1)
+        each = [
+            probability(logit + math.log(_mean_ratio(row[None], own[None]) / usual))
+            for row, own in zip(ratios, weights, strict=True)
+        ]
+        off = np.array(each) - known
+        return known, math.sqrt(float(by_cost @ (off * off) / by_cost.sum()))
+
+    def add(self, looks: Looks) -> None:
+        """Take in a question."""
+        if self._prior is None:
+            self._weights = self._prior = _session_prior(looks.prior.spread)
+        same, other = _densities(looks.logit + looks.prior.mean)
+        likelihood = _SHARES * same[:, None] + (1.0 - _SHARES) * other[:, None]
+        self._weights = self._weights + _COUNT * np.log(likelihood)
+
+
+def _session_prior(spread: float) -> Floats:
+    """Log weights by cost and share."""
+    costs = -0.5 * (_COSTS / spread) ** 2
+    others = (1.0 - _STRANGE) / (len(_SHARES) - 1)
+    shares = np.array([_STRANGE] + [others] * (len(_SHARES) - 1))
+    prior: Floats = costs[:, None] + np.log(shares)
+    return prior
+
+
+def _densities(logit: float) -> tuple[Floats, Floats]:
+    """The densities of the logit of a known question and of another one, by cost."""
+    usual = _KNOWN_LOGIT - _COSTS
+    same = np.exp(-0.5 * ((np.minimum(logit, usual) - usual) / _KNOWN_SPREAD) ** 2) / _KNOWN_SPREAD
+    above = max(logit, _OTHER_LOGIT) - _OTHER_LOGIT
+    other = math.exp(-0.5 * (above / _OTHER_SPREAD) ** 2) / _OTHER_SPREAD
+    return same, (1.0 - _LOOK_ALIKES) * other + _LOOK_ALIKES * same
+
+
+def _known_ratios(logit: float) -> Floats:
+    """Probabilities of being known, by cost and share."""
+    same, other = _densities(logit)
+    known = _SHARES * same[:, None]
+    found: Floats = known / (known + (1.0 - _SHARES) * other[:, None])
+    return found
+
+
+def _mean_ratio(known: Floats, weights: Floats) -> float:
+    """The odds of the mean probability under log weights."""
+    shares = np.exp(weights - weights.max())
+    mean = min(max(float((shares * known).sum() / shares.sum()), _LEAST_KNOWN), 1.0 - _LEAST_KNOWN)
+    return mean / (1.0 - mean)
 
 
 LEAST_SPOTS: Final = 5

@@ -56,13 +56,40 @@ class Cosines(NamedTuple):
     deviation: float = 0.0
 
 
+class SessionPrior(NamedTuple):
+    """What another day costs beyond that of the weights of `known`, as an addition to its logit:
+    mean and standard deviation."""
+
+    mean: float
+    spread: float
+
+    @classmethod
+    def of(cls, evidence: EvidenceConstants) -> "SessionPrior":
+        """The prior of a map: wide unless the shift between its runs was read."""
+        lost = evidence.session_shift - EvidenceConstants().session_shift
+        if not lost:
+            return ANY_DAY
+        return cls(_OF_USUAL_DAY + _LOGIT_OF_LIKENESS * lost, _READ_DAY_SPREAD)
+
+
+_LOGIT_OF_LIKENESS: Final = 24.0
+"""What likeness adds to the logit of `known` (`certainty.KNOWN_WEIGHTS`)."""
+_OF_USUAL_DAY, _READ_DAY_SPREAD = 0.3, 0.75
+ANY_DAY: Final = SessionPrior(1.2, 1.2)
+"""Where nothing is known of what a day costs; chosen on generated buildings where half of the days
+cost twice as much as those of the weights."""
+USUAL_DAY: Final = SessionPrior(0.0, _READ_DAY_SPREAD)
+"""Of a map's own questions, whose likenesses are lowered by what a day costs."""
+
+
 @dataclass(frozen=True, slots=True)
 class MapConstants:
     """The constants in force in a map, and how alike different things are in it.
 
     ``evidence`` and ``localizer`` are those of the settings, priors where the map was never
     calibrated; ``camera`` is that of mapped envelopes. ``different`` is the mean cosine of
-    different things in one picture and ``different_spread`` their standard deviation.
+    different things in one picture and ``different_spread`` their standard deviation; ``session``
+    is what another day may cost.
     """
 
     evidence: EvidenceConstants = field(default_factory=EvidenceConstants)
@@ -70,6 +97,7 @@ class MapConstants:
     localizer: LocalizerConstants = field(default_factory=LocalizerConstants)
     different: float = _GUESS
     different_spread: float = 0.06
+    session: SessionPrior = ANY_DAY
 
     @classmethod
     def of(cls, settings: Settings, cosines: Cosines) -> Self:
@@ -88,6 +116,7 @@ class MapConstants:
             settings.localizer,
             round(different, _DIGITS),
             max(round(math.sqrt(square / (cosines.number + _SPREAD_WEIGHT)), _DIGITS), 1e-3),
+            SessionPrior.of(evidence),
         )
 
 

@@ -22,7 +22,7 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.fold.settings import CameraConstants
 
 from .candidates import MapCandidates, Match
-from .certainty import UNKNOWN_BELOW, known_probability, thinness
+from .certainty import UNKNOWN_BELOW, Looks, Session, known_probability, looks_of, thinness
 from .constants import MODEL, RankingModel
 from .layout import Hypotheses, Layout
 from .likelihood import Scene
@@ -108,7 +108,7 @@ class Answer:
     ``hypotheses`` are the poses from which the answer was chosen; None where there is no pose, and
     with the plain method. ``thin`` names what the map has too little of (`certainty.thinness`),
     None where it has enough. ``unlooked`` is the number of crops whose embeddings say nothing,
-    since the map has none.
+    since the map has none. ``looks`` is what ``known`` was computed from, None without embeddings.
     """
 
     places: tuple[RankedPlace, ...]
@@ -118,6 +118,13 @@ class Answer:
     hypotheses: Hypotheses | None = field(default=None, compare=False, repr=False)
     thin: str | None = None
     unlooked: int = 0
+    looks: Looks | None = None
+
+    @property
+    def known_spread(self) -> float | None:
+        """The standard deviation of ``known``, as nobody knows what likeness the day of a question
+        costs; None without embeddings."""
+        return None if self.looks is None else Session().known(self.looks)[1]
 
     @property
     def unknown(self) -> bool:
@@ -131,6 +138,7 @@ class Answer:
             "pose": None if self.pose is None else self.pose.document(),
             "confidence": self.confidence,
             "known": self.known,
+            "known_spread": self.known_spread,
             "unknown": self.unknown,
             "thin": self.thin,
         }
@@ -157,7 +165,8 @@ def rank(
         unlooked = sum(a.vector is not b.vector for a, b in zip(given, kept, strict=True))
     views, candidates = _in_order(asked, candidates)
     crops = [crop for view in views for crop in view.crops]
-    known = known_probability(crops, candidates.matches, candidates.constants)
+    looks = looks_of(crops, candidates.matches, candidates.constants)
+    known = known_probability(looks, candidates.matches)
     thin = thinness(crops, candidates.matches)
     if method == "plain":
         answer = _rank_plain(candidates, crops, top)
@@ -168,7 +177,7 @@ def rank(
         scene = Scene(candidates.constants, camera, model, floors.walls(candidates.walls))
         posterior = locate(views, candidates.matches, scene)
         answer = _answer(candidates, crops, posterior, top, floors)
-    return replace(answer, known=known, thin=thin, unlooked=unlooked)
+    return replace(answer, known=known, thin=thin, unlooked=unlooked, looks=looks)
 
 
 def _camera_of_most(candidates: MapCandidates) -> CameraConstants:

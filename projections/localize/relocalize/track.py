@@ -11,7 +11,8 @@ explain what is seen, nearly all once they do not and another place does. So a k
 found again after a few questions, and a single wrong answer moves little.
 
 Things that the map does not have (``known`` below 0.5) make it less likely that the robot is where
-the particles are, by known / (1 - known), at least an eighth.
+the particles are, by known / (1 - known), at least an eighth. `known` is that of the session: what
+its day costs is learnt from its questions (`certainty.Session`).
 
 Questions from places near each other share their errors, and a look-alike deceives several in a
 row: a likelihood is taken to a power that is the smaller, the less the robot has moved since the
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Floats
+from .certainty import Looks, Session
 from .layout import STEP_M, Hypotheses
 from .question import Movement, Question
 from .ranking import PoseHypothesis
@@ -79,17 +81,27 @@ class Tracked:
     """The estimate after a number of ``questions``; no pose as long as none of them had one.
 
     ``confidence`` is the probability that the pose is right within 1.5 m. The pose's ``spread_m``
-    is the root mean square distance of the particles from it.
+    is the root mean square distance of the particles from it. ``known`` is the probability that the
+    map has something that the last question shows, by those before it; ``known_spread`` its
+    standard deviation, None without embeddings.
     """
 
     pose: PoseHypothesis | None
     confidence: float
     questions: int
+    known: float
+    known_spread: float | None
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
         pose = None if self.pose is None else self.pose.document()
-        return {"pose": pose, "confidence": self.confidence, "questions": self.questions}
+        return {
+            "pose": pose,
+            "confidence": self.confidence,
+            "known": self.known,
+            "known_spread": self.known_spread,
+            "questions": self.questions,
+        }
 
 
 class Track:
@@ -107,6 +119,7 @@ class Track:
         self._questions = 0
         self._floors: list[str | None] = []
         self._moved = math.inf
+        self._session = Session()
         self.particles: Floats = np.zeros((0, 3))
         self.lost = 1.0
 
@@ -116,12 +129,18 @@ class Track:
         hypotheses: Hypotheses | None,
         confidence: float,
         known: float = _NEUTRAL,
+        looks: Looks | None = None,
     ) -> Tracked:
         """Take in one question: the robot's movement since the last one, and the answer's poses.
 
-        ``known`` is the probability that the map has the things shown; 0.5 is no evidence.
+        ``known`` is the probability that the map has the things shown, of the question alone; 0.5
+        is no evidence. With ``looks`` it is computed again, by the session's questions.
         """
         self._questions += 1
+        spread = None
+        if looks is not None:
+            known, spread = self._session.known(looks)
+            self._session.add(looks)
         random = np.random.Generator(np.random.PCG64([self._seed, self._questions]))
         if len(self.particles):
             self._move(moved, random)
@@ -134,9 +153,10 @@ class Track:
         else:
             self.lost /= self.lost + among
         if not len(self.particles):
-            return Tracked(None, 0.0, self._questions)
+            return Tracked(None, 0.0, self._questions, known, spread)
         self._moved = 0.0
-        return self._estimate()
+        pose, confidence = self._estimate()
+        return Tracked(pose, confidence, self._questions, known, spread)
 
     def _move(self, moved: Movement, random: np.random.Generator) -> None:
         """Move the particles, each with its own random slip."""
@@ -194,8 +214,8 @@ class Track:
             self._floors.append(floor)
         return self._floors.index(floor)
 
-    def _estimate(self) -> Tracked:
-        """The estimate: the pose with most particles within 1 m, moved to their mean."""
+    def _estimate(self) -> tuple[PoseHypothesis, float]:
+        """The pose with most particles within 1 m, moved to their mean, and its confidence."""
         at = self.particles[:: max(1, len(self.particles) // _TRIED)]
         dx = at[:, 0][:, None] - self.particles[None, :, 0]
         dy = at[:, 1][:, None] - self.particles[None, :, 1]
@@ -215,7 +235,7 @@ class Track:
             self._floors[floor],
         )
         confidence = (1.0 - self.lost) * float((away < _WITHIN_M).mean())
-        return Tracked(pose, confidence, self._questions)
+        return pose, confidence
 
 
 def _known_ratio(known: float) -> float:

@@ -25,6 +25,7 @@ from projections.fold.exact import quantise, to_float32
 from projections.fold.settings import CameraSettings
 from projections.fold.sights import camera_of
 
+from .certainty import probability
 from .question import MAX_CROPS, Movement, Question, QuestionCrop, QuestionView
 from .ranking import Answer
 
@@ -35,6 +36,7 @@ MOST_KEYFRAMES: Final = 20
 _LEAST_VIEWS: Final = 2
 _LEAST_CONFIDENCE: Final = 0.6
 _LEAST_KNOWN: Final = 0.8
+"""Without the allowance for another day: a wrong initial pose costs more than none."""
 _LEAST_WEIGHT: Final = 0.93
 _INDEPENDENT: Final = 5
 _NEAR_M: Final = 0.8
@@ -88,7 +90,10 @@ def _sure_pose(answer: Answer, crops: int) -> SurePose | None:
     pose, hypotheses = answer.pose, answer.hypotheses
     if pose is None or pose.yaw is None or hypotheses is None or answer.thin is not None:
         return None
-    if answer.confidence < _LEAST_CONFIDENCE or answer.known < _LEAST_KNOWN:
+    if answer.confidence < _LEAST_CONFIDENCE:
+        return None
+    known = answer.known if answer.looks is None else probability(answer.looks.logit)
+    if known < _LEAST_KNOWN:
         return None
     off = hypotheses.poses - (pose.x, pose.y, pose.yaw)
     off[:, 2] = np.remainder(off[:, 2] + math.pi, math.tau) - math.pi

@@ -188,7 +188,8 @@ def _first_line(answer: Answer) -> str:
 
 def _known_text(answer: Answer) -> str:
     """The probability that the things shown are in the map, as text."""
-    return f"known {answer.known:.2f}"
+    spread = answer.known_spread
+    return f"known {answer.known:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
 
 
 def _place_text(place: RankedPlace) -> str:
@@ -273,6 +274,10 @@ def _tracked(
     question, moved = read_question(document), read_moved(document)
     answer = rank(question, search(question.crops), top=top, camera=camera)
     tracked = track.step(
-        movement_of(moved, question), answer.hypotheses, answer.confidence, answer.known
+        movement_of(moved, question),
+        answer.hypotheses,
+        answer.confidence,
+        answer.known,
+        answer.looks,
     )
     return answer.document() | {"track": tracked.document()}

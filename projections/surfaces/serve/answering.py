@@ -140,7 +140,9 @@ class Sessions:
             _, track = self._kept.pop(name, (0.0, None))
             if track is None:
                 track = Track(name)
-            found = track.step(moved, answer.hypotheses, answer.confidence, answer.known)
+            found = track.step(
+                moved, answer.hypotheses, answer.confidence, answer.known, answer.looks
+            )
             self._kept[name] = (self._now(), track)  # not before: a step that failed is discarded
             if len(self._kept) > self._most:
                 del self._kept[next(iter(self._kept))]

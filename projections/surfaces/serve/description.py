@@ -132,6 +132,7 @@ _ANSWER: Final = {
     "pose": _POSE,
     "confidence": 0.62,
     "known": 0.97,
+    "known_spread": 0.04,
     "unknown": False,
     "thin": None,
 }

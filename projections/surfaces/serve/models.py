@@ -58,11 +58,19 @@ class PoseShape(TypedDict):
     floor: NotRequired[str]
 
 
+KnownSpread = Annotated[
+    float | None,
+    Field(description="Standard deviation of known; null without embeddings."),
+]
+
+
 class TrackShape(TypedDict):
     """The robot's pose by all questions of a session."""
 
     pose: PoseShape | None
     confidence: Probability
+    known: Probability
+    known_spread: KnownSpread
     questions: Annotated[int, Field(ge=1, description="Questions of the session so far.")]
 
 
@@ -77,6 +85,7 @@ class AnswerShape(TypedDict):
     known: Annotated[
         float, Field(ge=0, le=1, description="Probability that the map has one of the things.")
     ]
+    known_spread: KnownSpread
     unknown: Annotated[bool, Field(description="Whether the map likely has none (known < 0.5).")]
     thin: Annotated[
         str | None, Field(description="What the map has too little of; null where it has enough.")

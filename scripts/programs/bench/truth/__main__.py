@@ -7,7 +7,7 @@ scripts/bench_truth [--half develop|validate] [--quick] [--world W…] [--profil
     [--worlds DIR] [--cache DIR] [--json FILE]
 scripts/bench_truth --lost [--quick] …
 scripts/bench_truth --localise [--every N] [--map page|evidence] [--brief] [--no-camera]
-    [--jobs N] …
+    [--session-shift F] [--jobs N] …
 
 With --no-embeddings the detectors are bare ones; in the table of Objects page is then as if all
 looked alike: the class and the radius decide.
@@ -188,6 +188,7 @@ def _localise(
         seed=options.seed,
         cache=options.cache,
         embeddings=options.embeddings,
+        session_shift=options.session_shift,
     )
     rows: list[LocaliseRow] = []
     cases = [(p, w, stranger_of(generator, options.half, w)) for p, w in chosen]
@@ -220,6 +221,7 @@ def _localised(
             seed=options.seed,
             cache=options.cache,
             embeddings=options.embeddings,
+            session_shift=options.session_shift,
         )
         for each in (world, other)
     )
@@ -267,6 +269,13 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--localise", action="store_true", help="where the robot is, instead")
     parser.add_argument(
         "--no-camera", action="store_true", help="with --localise: maps estimate the field of view"
+    )
+    parser.add_argument(
+        "--session-shift",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="with --localise: runs differ F times as much in looks",
     )
     parser.add_argument("--every", type=int, default=1, metavar="N", help="ask every N-th question")
     parser.add_argument("--map", nargs="+", choices=MAPS, default=MAPS, help="rules of the maps")

@@ -26,7 +26,13 @@ from projections.localize.evaluate.scores import (
     expected_calibration_error,
     percentile,
 )
-from projections.localize.evaluate.trials import RIGHT_WITHIN_M, Trial, TrialRunner
+from projections.localize.evaluate.trials import (
+    RIGHT_WITHIN_M,
+    Trial,
+    TrialRunner,
+    known_of_sessions,
+)
+from projections.localize.relocalize import UNKNOWN_BELOW
 from projections.map.view import MapView
 
 from .calibrating import calibrated_settings
@@ -44,7 +50,8 @@ class Scores:
     """Of one kind of question. Errors in metres, over known questions; None where there are none.
 
     ``place_p50_m`` is that of the plain method, which answers with a place's centroid. A floor is
-    the calibration error to expect of true probabilities.
+    the calibration error to expect of true probabilities. ``session_…`` are of `known` after ten
+    questions of a session or more.
     """
 
     questions: int
@@ -64,6 +71,9 @@ class Scores:
     known_floor: float
     confidence_ece: float
     confidence_floor: float
+    session_known_called_unknown: float | None
+    session_unknown_called_known: float | None
+    session_ece: float | None
     cpu_ms: float
 
     @property
@@ -172,6 +182,7 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
     unknown = [trial for trial in trials if not trial.known]
     sure = [trial.answer.confidence for trial in trials]
     in_map = [trial.answer.known for trial in trials]
+    session = known_of_sessions(trials)
     return Scores(
         len(trials),
         len(known),
@@ -190,6 +201,9 @@ def score(trials: Sequence[Trial], cpu_ms: float = 0.0) -> Scores:
         calibration_floor(in_map),
         expected_calibration_error(sure, [t.correct for t in trials]),
         calibration_floor(sure),
+        _share(p < UNKNOWN_BELOW for p, is_known in session if is_known),
+        _share(p >= UNKNOWN_BELOW for p, is_known in session if not is_known),
+        expected_calibration_error(*zip(*session, strict=True)) if session else None,
         cpu_ms,
     )
 

@@ -24,6 +24,9 @@ _COLUMNS = (
     ("floor", 6, "known_floor", 3),
     ("ECE co", 6, "confidence_ece", 3),
     ("floor", 6, "confidence_floor", 3),
+    ("10 k>u", 6, "session_known_called_unknown", 2),
+    ("10 u>k", 6, "session_unknown_called_known", 2),
+    ("10 ECE", 6, "session_ece", 3),
     ("cpu ms", 6, "cpu_ms", 1),
 )
 """Heads, widths, fields of `Scores`, digits."""

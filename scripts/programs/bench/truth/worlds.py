@@ -128,10 +128,12 @@ def make_case(
     seed: int = SEED,
     cache: Path = CACHE,
     embeddings: bool = True,
+    session_shift: float = 1.0,
 ) -> Case:
     """The runs of a profile in a world, generated unless the cache has them; without
-    ``embeddings`` as a bare detector sees them."""
-    kept = case_folder(generator, profile, world, moved, limit, seed, cache)
+    ``embeddings`` as a bare detector sees them. ``session_shift`` multiplies what embeddings have
+    of their run."""
+    kept = case_folder(generator, profile, world, moved, limit, seed, cache, session_shift)
     return read_case(kept, profile, world, embeddings=embeddings)
 
 
@@ -143,15 +145,31 @@ def case_folder(
     limit: int,
     seed: int,
     cache: Path,
+    session_shift: float = 1.0,
 ) -> Path:
     """The folder of the generator's files, generated unless the cache has them."""
     source = Path(str(generator.__file__))
     layout = source.parent / "layouts" / f"{world}.json"
     version = zlib.crc32(layout.read_bytes(), zlib.crc32(source.read_bytes()))
-    kept = cache / f"{version:08x}-seed{seed}-moved{moved:g}-limit{limit}" / profile / world
+    name = f"{version:08x}-seed{seed}-moved{moved:g}-limit{limit}"
+    name += "" if session_shift == 1.0 else f"-session{session_shift:g}"
+    kept = cache / name / profile / world
     if not (kept / "looks-again.json").exists():
-        _generate(source, generator, profile, world, moved, limit, seed, kept)
+        _generate(source, generator, profile, world, moved, limit, seed, session_shift, kept)
     return kept
+
+
+_GENERATOR = """
+import sys
+from pathlib import Path
+sys.path.insert(0, str(Path(sys.argv[1]).parent))
+import make_worlds
+for family in make_worlds.FAMILIES.values():
+    for part in ("session", "day"):
+        family[part] *= float(sys.argv[2])
+del sys.argv[1:3]
+make_worlds.main()
+"""
 
 
 def _generate(
@@ -162,12 +180,14 @@ def _generate(
     moved: float,
     limit: int,
     seed: int,
+    session_shift: float,
     kept: Path,
 ) -> None:
     """Into a temporary folder first, so that what is in the cache is complete."""
     kept.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=kept.parent) as temporary:
-        command = [sys.executable, str(source), temporary, "--world", world, "--profile", profile]
+        command = [sys.executable, "-c", _GENERATOR, str(source), str(session_shift), temporary]
+        command += ["--world", world, "--profile", profile]
         command += ["--moved", str(moved), "--limit", str(limit), "--seed", str(seed)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
