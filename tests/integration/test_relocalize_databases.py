@@ -310,7 +310,11 @@ class TestCommand:
             asked = {"crops": document["detections"], **moved}
             answer = rank(crops := read_question(asked).crops, index.search(crops))
             found = track.step(
-                (0.25 * number, 0.0, 0.5), answer.hypotheses, answer.confidence, answer.known
+                (0.25 * number, 0.0, 0.5),
+                answer.hypotheses,
+                answer.confidence,
+                answer.known,
+                answer.looks,
             )
             lines.append(json.dumps(asked))
             expected.append(answer.document() | {"track": found.document()})

@@ -58,7 +58,9 @@ def test_a_session_is_tracked(connected: Callable[[], Session], walked_map: Targ
         moved = (0.25 * number, 0.0, 0.125)
         asked = tracked_question(number, moved, "robot-7")
         answer = relocalize(walked_map, parse_question(asked))
-        tracked = track.step(moved, answer.hypotheses, answer.confidence, answer.known)
+        tracked = track.step(
+            moved, answer.hypotheses, answer.confidence, answer.known, answer.looks
+        )
         expected = answer.document() | {"track": tracked.document()}
         assert ask(session, "mapfold/relocalize", asked) == (True, expected)
     assert expected["track"]["questions"] == 4

@@ -24,6 +24,9 @@ from projections.localize.relocalize import Answer
 from projections.localize.relocalize.certainty import probability
 from projections.surfaces.cli.calibrate import localiser_document, localiser_text
 
+MANY = 100_000
+"""Observations of a map that is not thin."""
+
 
 def _answer(
     known: bool, said: float, sure: float, error: float | None = 0.5, crops: int = 1
@@ -43,12 +46,12 @@ def _spread_logits(count: int) -> list[float]:
 
 
 def test_without_questions_nothing_is_corrected() -> None:
-    assert correction([]) == LocalizerConstants()
+    assert correction([], 0) == LocalizerConstants()
     assert fit_line([], [], Line(0.7, 0.2), 1.0) == pytest.approx(Line(0.7, 0.2))
 
 
 def test_a_map_like_those_of_the_weights_is_hardly_corrected() -> None:
-    constants = correction(_own(_spread_logits(3000), KNOWN_USUAL))
+    constants = correction(_own(_spread_logits(3000), KNOWN_USUAL), MANY)
     assert constants.known_scale == pytest.approx(1.0, abs=0.1)
     assert constants.known_shift == pytest.approx(0.0, abs=0.2)
     assert constants.known_count == constants.confidence_count == 3000
@@ -59,7 +62,7 @@ def test_the_correction_makes_the_probabilities_those_of_the_other_maps(off: Lin
     """A map that says z where others would say scale · z + shift."""
     usual = KNOWN_USUAL
     seen = Line(usual.scale * off.scale, usual.scale * off.shift + usual.shift)
-    constants = correction(_own(_spread_logits(4000), seen))
+    constants = correction(_own(_spread_logits(4000), seen), MANY)
     assert constants.known_scale == pytest.approx(off.scale, rel=0.12)
     assert constants.known_shift == pytest.approx(off.shift, abs=0.25)
 
@@ -67,20 +70,28 @@ def test_the_correction_makes_the_probabilities_those_of_the_other_maps(off: Lin
 def test_few_questions_leave_it_near_what_is_usual() -> None:
     """All are known, whatever is said: the more of them, the further the shift goes."""
     shifts = [
-        correction([_answer(True, 0.5, 0.5)] * count).known_shift for count in (0, 1, 8, 64, 512)
+        correction([_answer(True, 0.5, 0.5)] * count, MANY).known_shift
+        for count in (0, 1, 8, 64, 512)
     ]
     assert shifts[0] == 0.0
     assert shifts == sorted(set(shifts))
     assert shifts[1] < 0.3
     assert shifts[4] > 1.5
-    sure = correction([_answer(True, 0.5, 0.5)] * 64).confidence_shift
+    sure = correction([_answer(True, 0.5, 0.5)] * 64, MANY).confidence_shift
     assert 0.0 < sure < 0.5 * shifts[3]
+
+
+def test_a_thin_map_is_corrected_less_by_degrees() -> None:
+    answers = [_answer(True, 0.5, 0.5)] * 64
+    shifts = [correction(answers, count).known_shift for count in (0, 10, 65, 200, MANY)]
+    assert 0.0 < shifts[0] < 0.1
+    assert shifts == sorted(set(shifts))
 
 
 @pytest.mark.seconds
 def test_nonsense_is_bounded() -> None:
     wrong = [_answer(z < 0, probability(z), 0.5, None) for z in _spread_logits(14_000)]
-    constants = correction(wrong)
+    constants = correction(wrong, MANY)
     assert constants.known_scale == 0.25
     assert -4.0 <= constants.known_shift <= 4.0
     assert constants.confidence_shift == -4.0
@@ -107,7 +118,7 @@ def test_the_line_is_the_most_probable_one(pairs: list[tuple[float, bool]]) -> N
 def test_last_bits_of_probabilities_are_not_in_the_constants() -> None:
     """Neither those of each probability, nor the order of the answers."""
     said = _own(_spread_logits(400), Line(1.3, -0.4))
-    expected = correction(said)
+    expected = correction(said, MANY)
     assert expected != LocalizerConstants(known_count=400, confidence_count=400)
     for towards in (0.0, 1.0):
         moved = [
@@ -121,8 +132,8 @@ def test_last_bits_of_probabilities_are_not_in_the_constants() -> None:
             )
             for each in said
         ]
-        assert correction(moved) == expected
-        assert correction(moved[::-1]) == expected
+        assert correction(moved, MANY) == expected
+        assert correction(moved[::-1], MANY) == expected
 
 
 @given(st.lists(st.tuples(st.floats(-6, 6), st.booleans()), max_size=40))

@@ -186,10 +186,13 @@ def _first_line(answer: Answer) -> str:
     return f"{_place_text(answer.places[0])} ({confidence}, {_known_text(answer)})"
 
 
+_UNSURE: Final = 0.05
+
+
 def _known_text(answer: Answer) -> str:
-    """The probability that the things shown are in the map, as text."""
-    spread = answer.known_spread
-    return f"known {answer.known:.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+    """The probability that the things shown are in the map, and how unsure it is if it is."""
+    spread = answer.known_spread or 0.0
+    return f"known {answer.known:.2f}" + (f" ± {spread:.2f}" if spread >= _UNSURE else "")
 
 
 def _place_text(place: RankedPlace) -> str:
