@@ -53,6 +53,7 @@ class MapToEdit:
         self.settings = settings_of(self.corrections)
         self.note = note
         self._view: MapView | None = None
+        self._map_of: Callable[[], MapView] = lambda: self.fold(corrections, self.settings)
 
     @property
     def known_at(self) -> Offset:
@@ -75,8 +76,16 @@ class MapToEdit:
     def view(self) -> MapView:
         """The map; folded at the first use."""
         if self._view is None:
-            self._view = self.fold(self.corrections, self.settings)
+            self._view = self.another_view()
         return self._view
+
+    def another_view(self) -> MapView:
+        """The map once more, for the caller to change."""
+        return self._map_of()
+
+    def use_maps(self, map_of: Callable[[], MapView]) -> None:
+        """Take the map from ``map_of`` instead of folding it; each call gives another one."""
+        self._map_of = map_of
 
     def set_view(self, view: MapView) -> None:
         """Use ``view`` as the map instead of folding it."""

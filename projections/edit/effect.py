@@ -20,7 +20,7 @@ from projections.fold.corrections import (
     compile_corrections,
     map_fingerprint,
 )
-from projections.fold.deltas import PlaceOrdinal
+from projections.fold.deltas import PlaceNamed, PlaceOrdinal
 from projections.fold.settings import Settings, assignment_texts, settings_by_name
 from projections.history.diff import Difference, difference_of, rows_of
 from projections.map.phrases import command_document, iso_time
@@ -80,9 +80,22 @@ class Change:
         """The map under the other commands."""
         if self._after is None:
             current = self.current
-            same = self._same_fold(current.corrections, self.corrections)
-            self._after = current.view if same else current.fold(self.corrections, self.settings)
+            if self._same_fold(current.corrections, self.corrections):
+                self._after = current.view
+            elif self._names_only:
+                self._after = self._renamed()
+            else:
+                self._after = current.fold(self.corrections, self.settings)
         return self._after
+
+    def _renamed(self) -> MapView:
+        view = self.current.another_view()
+        before, after = (_names(self.current, c) for c in (view.corrections, self.corrections))
+        for place in sorted(_differing(before, after)):
+            name, command = after.get(place, (None, None))
+            view.apply(PlaceNamed(self.current.end, place, name, command))
+        view.corrections = self.corrections
+        return view
 
     @property
     def known_after(self) -> MapView | None:
@@ -94,12 +107,19 @@ class Change:
         folds = [map_fingerprint(self.settings, each) for each in (first, second)]
         return same_settings and folds[0] == folds[1]
 
+    @property
+    def _names_only(self) -> bool:
+        before, after = self.current.corrections, self.corrections
+        return self._same_fold(before.without_names(), after.without_names())
+
     def effect(self) -> Effect:
         """The counts of changes."""
-        before = self.current.corrections
-        if self._same_fold(before.without_names(), self.corrections.without_names()):
-            names = [_names(self.current, c) for c in (before, self.corrections)]
-            return Effect(len(_differing(*names)), 0, 0)
+        if self._names_only:
+            before, after = (
+                {place: name for place, (name, _) in _names(self.current, corrections).items()}
+                for corrections in (self.current.corrections, self.corrections)
+            )
+            return Effect(len(_differing(before, after)), 0, 0)
         return effect_of(self.current.view, self.after)
 
     def difference(self) -> Difference:
@@ -120,9 +140,9 @@ def effect_of(before: MapView, after: MapView) -> Effect:
         )
 
 
-def _names(current: MapToEdit, corrections: Corrections) -> dict[PlaceOrdinal, str]:
-    """Places by ordinal, and their names; the later name counts."""
-    placed = ((current.place_of(named.anchor), named.name) for named in corrections.names)
+def _names(current: MapToEdit, corrections: Corrections) -> dict[PlaceOrdinal, tuple[str, Offset]]:
+    """Places by ordinal, their names and the commands that gave them; the later name counts."""
+    placed = ((current.place_of(n.anchor), (n.name, n.offset)) for n in corrections.names)
     return {place: name for place, name in placed if place is not None}
 
 

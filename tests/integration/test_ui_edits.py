@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eventsrc.log import LogWriter
-from tests.support.commands import Commands
+from tests.support.commands import Commands, cpu_seconds
 from tests.support.logs import bridge, walk, write_log
 from tests.support.thorough import every_other
 from tests.support.ui_page import UiServer, digest, showing
@@ -56,9 +56,17 @@ def test_a_dry_run_a_command_and_its_undo(mapfold: Commands, log: Path, server: 
     assert known == before
 
 
-def test_a_name_needs_no_reason(server: UiServer) -> None:
-    named = server.edit("name-place", "run-a_p0", "hall", dry_run=False).json
-    assert named["recorded"] is True
+def test_a_name_needs_no_reason_and_is_previewed_without_a_fold(
+    mapfold: Commands, log: Path, server: UiServer
+) -> None:
+    for name in ("hall", "corridor", "hall"):
+        used_s = cpu_seconds(server.program.pid)
+        preview = server.edit("name-place", "run-a_p0", name).json
+        assert cpu_seconds(server.program.pid) - used_s < 0.3
+        assert preview["effect"] == {"places": 1, "objects": 0, "keyframes": 0}
+        named = server.edit("name-place", "run-a_p0", name, dry_run=False).json
+        assert named["recorded"] is True
+        assert preview["difference"]["digests"][1] == digest(mapfold, log)
 
 
 def test_every_kind_says_what_the_command_says(

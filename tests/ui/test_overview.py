@@ -14,6 +14,7 @@ from tests.support.commands import Commands
 from tests.support.logs import write_log
 from tests.support.models import add_crop
 from tests.support.ui_page import UiServer, showing
+from tests.ui.browser import pixels
 from tests.ui.conftest import Visit
 from tests.ui.test_moments import go
 from tests.unit.test_moved_things import ROOM, run
@@ -119,7 +120,7 @@ def test_what_changed_since_the_run_before_is_listed(moved: UiServer, visit: Vis
 
 
 def test_runs_are_compared_and_what_changed_is_walked_through(
-    moved: UiServer, visit: Visit
+    moved: UiServer, visit: Visit, pictures: Path
 ) -> None:
     page = visit(moved)
     page.get_by_role("tab", name="Compare").click()
@@ -134,6 +135,18 @@ def test_runs_are_compared_and_what_changed_is_walked_through(
     expect(shown.nth(2)).to_have_attribute("aria-current", "true")
     page.keyboard.press("ArrowUp")
     expect(shown.nth(1)).to_have_attribute("aria-current", "true")
+    page.get_by_label("before and after side by side").check()
+    before = page.get_by_role("img", name=f"Map after {moved.api('changes')['since']} events")
+    after = page.get_by_role("img", name=f"Map after {moved.api('log')['through']} events")
+    boxes = before.bounding_box(), after.bounding_box()
+    assert boxes[0] is not None
+    assert boxes[1] is not None
+    assert boxes[0]["x"] + boxes[0]["width"] <= boxes[1]["x"]
+    expect(page).to_have_url(re.compile("beside=1"))
+    page.reload()
+    expect(before).to_be_visible()
+    assert pixels(page, "other") != pixels(page, "main")
+    page.screenshot(path=pictures / "beside.png")
     start.select_option(label="a")
     expect(shown).to_have_count(0)
 

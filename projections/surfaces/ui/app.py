@@ -272,6 +272,14 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             def work(end: Offset, go_on: GoOn) -> dict[str, Any]:
                 return editor.answer(end, asked, go_on)
 
+            if asked.dry_run and asked.kind == "name-place":  # nothing is folded anew
+
+                def rename(shown: LogMap, _: float) -> bytes:
+                    document = editor.answer(shown.through, asked, lambda: None, shown.timeline.at)
+                    return encoded(document)
+
+                found = await _answer(service, request, rename)
+                return Response(found, media_type="application/json")
             if asked.dry_run:
                 return await apart(request, lambda end, go_on: encoded(work(end, go_on)))
             future = service.ask_apart(work)  # recorded also when the page leaves meanwhile

@@ -5,6 +5,7 @@ arguments of a kind are those of ``mapfold edit LOG KIND``, in that order. A com
 log itself, or to the recorder that holds it; ``--connect`` of ``mapfold ui`` says where that is.
 """
 
+import functools
 import json
 import uuid
 from collections.abc import Callable
@@ -32,6 +33,7 @@ from projections.edit.record import (
 from projections.fold.map_errors import QuestionError
 from projections.fold.settings import Settings
 from projections.history.diff_rendering import difference_text
+from projections.map.view import MapView
 from projections.surfaces.text_encoders import with_text_encoder
 
 from .comparisons import MOST_LINES
@@ -160,13 +162,19 @@ class Editor:
         self._opened, self._log_id = opened, log_id
         self._open_session, self._issued_by = open_session, issued_by
 
-    def answer(self, through: int, asked: Edit, go_on: Callable[[], None]) -> dict[str, Any]:
+    def answer(
+        self,
+        through: int,
+        asked: Edit,
+        go_on: Callable[[], None],
+        maps_of: Callable[[Offset], MapView] | None = None,
+    ) -> dict[str, Any]:
         """The effect of a command, of a dry run or recorded. ``go_on`` ends a dry run by
-        raising."""
+        raising. ``maps_of`` gives the map after so many events, where it is folded already."""
         if asked.kind not in KINDS:
             raise QuestionError(f"no edit {asked.kind[:40]!r}; there are {', '.join(KINDS)}")
         maps: list[MapToEdit] = []
-        make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments), maps)
+        make_ = self._checked(KINDS[asked.kind].command(asked.kind, asked.arguments), maps, maps_of)
         if asked.kind not in NEEDS_NO_REASON and not asked.reason.strip() and not asked.dry_run:
             raise MisuseError("the reason is missing: say why, for later readers of the log")
         stamp = Stamp(asked.command_id or uuid.uuid4().hex, self._issued_by, asked.reason)
@@ -174,7 +182,10 @@ class Editor:
         log, settings = self._opened.log, self._opened.settings
         try:
             if asked.dry_run:
-                with PrefixReader(log, go_on=go_on) as reader:
+                reader = PrefixReader(log, go_on=go_on)
+                if maps_of is not None:
+                    reader.limit = Offset(through)
+                with reader:
                     made = make_command(reader, make_, stamp, settings, notes.append)
                     return self._document(through, asked, made, notes)
             made = record_command(log, make_, stamp, settings, self._open_session, notes.append)
@@ -187,7 +198,12 @@ class Editor:
             cache_effect(made.current, made.command, effect)
         return self._document(through, asked, made, notes)
 
-    def _checked(self, make_: MakeCommand, maps: list[MapToEdit]) -> MakeCommand:
+    def _checked(
+        self,
+        make_: MakeCommand,
+        maps: list[MapToEdit],
+        maps_of: Callable[[Offset], MapView] | None,
+    ) -> MakeCommand:
         """``make_``, refusing a log other than the one that the page shows; adds to ``maps`` those
         that it is made from."""
 
@@ -196,6 +212,8 @@ class Editor:
                 raise LogError(
                     f"there is another log at {self._opened.log} now; start mapfold ui again"
                 )
+            if maps_of is not None:
+                current.use_maps(functools.partial(maps_of, current.end))
             maps.append(current)
             return make_(current, stamp)
 

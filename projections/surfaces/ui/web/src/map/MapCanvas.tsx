@@ -114,7 +114,7 @@ export function MapCanvas({ side }: { side: Side }) {
     const stops = [keepDrawn(canvas, side), keepZoomed(canvas), followPointer(canvas, side)];
     return () => stops.forEach((stop) => stop());
   }, [side]);
-  const text = summary(side === "main" ? store.restedMap.value : store.otherMap.value, store.history.value);
+  const text = summary(side === "main" ? store.restedMap.value : store.other.value.map, store.history.value);
   return <canvas ref={ref} class="map" role="img" aria-label={text} data-side={side} />;
 }
 
@@ -171,7 +171,7 @@ function keepDrawn(canvas: HTMLCanvasElement, side: Side): () => void {
     if (side === "main" && store.drawnBounds.value !== null && !moved) queueMicrotask(() => moved || fitView());
   });
   const stop = effect(() => {
-    for (const each of inputs(side)) void each.value;
+    for (const each of inputs()) void each.value;
     schedule();
   });
   return () => {
@@ -193,10 +193,10 @@ function controlsOver(canvas: HTMLCanvasElement): Box[] {
 }
 
 /** The signals that a drawing depends on; the map itself is computed once a frame, in it. */
-function inputs(side: Side) {
+function inputs() {
   return [
     store.at, store.view, store.layers, store.selection, store.hovered, store.found, store.dark, store.log,
-    side === "main" ? store.history : store.otherHistory,
+    store.history, store.otherHistory, store.otherFacts,
     store.panel, store.compareMode, store.compareWith, shownBridge, shownLost, shownWay, store.floor, store.mapFacts, walls, dragged,
   ];
 }

@@ -28,7 +28,7 @@ export function currentScene(side: Side, width: number, height: number): Scene |
     height,
     layers: store.layers.value,
     walls: walls.value,
-    types: main ? store.rooms.value : new Map(),
+    types: main ? store.rooms.value : store.compareMode.value === "moments" ? new Map(store.otherFacts.value?.rooms.map((each) => [each.place_id, each])) : new Map(),
     selection: store.selection.value,
     hovered: store.hovered.value,
     found: new Set(store.found.value.map((thing) => litObject(shown, thing))),

@@ -3,7 +3,7 @@
 import { signal } from "@preact/signals";
 import { useEffect } from "preact/hooks";
 import { address } from "../api/client";
-import type { MapChange, MapChanges } from "../api/types";
+import type { MapChange, MapChanges, MapFacts } from "../api/types";
 import { bringIntoView } from "../map/MapCanvas";
 import type { History } from "../history/types";
 import { counted, label, placeTitle } from "../model/names";
@@ -109,6 +109,10 @@ export function CompareMoments() {
   const ready = history !== null && other !== null && other <= history.through && at <= history.through && other <= at;
   const asked = useAnswer<MapChanges>(ready ? address("/api/changes", { since: other, until: at, known_at: history.knownAt }) : null, history?.state);
   const maps = useAnswer<DiffAnswer>(ready ? address("/api/diff", { from: other, to: at, known_at: history.knownAt }) : null, history?.state);
+  const then = useAnswer<MapFacts>(ready && store.beside.value ? address("/api/overview", { at: other, known_at: history.knownAt }) : null, history?.state).value;
+  useEffect(() => {
+    store.otherFacts.value = then;
+  }, [then]);
   const changes = ready ? (asked.value?.changes ?? null) : null;
   useEffect(() => {
     sureChanges.value = changes;
@@ -135,6 +139,10 @@ export function CompareMoments() {
       {other !== null && other > at && <p class="dim">The end is before the start; choose a later run or day.</p>}
       {ready && (
         <>
+          <label class="check">
+            <input type="checkbox" checked={store.beside.value} onChange={() => (store.beside.value = !store.beside.value)} />
+            before and after side by side
+          </label>
           {asked.error !== null ? <p class="note">{asked.error.message}</p> : <SureChanges asked={asked} history={history} />}
           <PlaceCounts />
           <Answer asked={maps}>

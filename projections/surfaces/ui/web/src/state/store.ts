@@ -86,6 +86,10 @@ export const compareWith = signal<number | null>(null);
 export const otherEps = signal<number | null>(null);
 export const otherMinSamples = signal<number | null>(null);
 export const otherHistory = signal<History | null>(null);
+/** Whether the map at the other moment is drawn beside that of this one. */
+export const beside = signal(false);
+/** What the server sent about the map at the other moment. */
+export const otherFacts = signal<MapFacts | null>(null);
 export const foundAt = signal<{ offset: number; becomes: boolean }[]>([]);
 
 /** Which objects the table lists, and in which order. */
@@ -125,9 +129,11 @@ export const map = computed<MapState | null>(() =>
 export const restedMap = computed<MapState | null>(() =>
   history.value === null ? null : mapAt(history.value, Math.min(restedAt.value, history.value.through)),
 );
-export const otherMap = computed<MapState | null>(() =>
-  otherHistory.value === null ? null : mapAt(otherHistory.value, at.value),
-);
+/** What the second map shows: this history at the other moment, or that of other settings at this one. */
+export const other = computed<{ history: History | null; map: MapState | null }>(() => {
+  if (compareMode.value === "moments") return { history: history.value, map: comparedMap.value };
+  return { history: otherHistory.value, map: otherHistory.value === null ? null : mapAt(otherHistory.value, at.value) };
+});
 /** The floor that a person chose; null goes with the robot. */
 export const floor = signal<number | null>(null);
 /** The floor to show; null where there is only one. */
@@ -146,7 +152,7 @@ function seen(from: History | null, state: MapState | null): Shown | null {
 }
 /** What the maps show: the part on the floor. */
 export const shown = computed(() => seen(history.value, map.value));
-export const otherShown = computed(() => seen(otherHistory.value, otherMap.value));
+export const otherShown = computed(() => seen(other.value.history, other.value.map));
 
 export const moments = computed<Moments | null>(() => (history.value === null ? null : momentsOf(history.value)));
 export const stamps = computed<Stamps | null>(() => (history.value === null ? null : new Stamps(history.value)));
@@ -184,23 +190,25 @@ export const drawnBounds = computed<Bounds | null>(() => {
 const grid = computed<Grid | null>(() => (bounds.value === null ? null : gridOf(bounds.value)));
 
 const NO_FLOORS: ReadonlyMap<number, Float32Array[]> = new Map();
-/** The free floor of places as the server last sent it, and the places that stood then. */
-const sentFloors = computed(() => {
-  const [facts, of] = [mapFacts.value, history.value];
+/** The free floor of places as the server sent it, and the places that stood then. */
+const sentFloors = (sent: typeof mapFacts) => computed(() => {
+  const [facts, of] = [sent.value, history.value];
   if (facts === null || of === null) return null;
   const floors = new Map(facts.rooms.flatMap(({ place_id, region }) => (region === null ? [] : [[findPlace(of, place_id), ringsOf(region, of.origin)]])));
   if (floors.size === 0) return null;
   return { floors, places: mapAt(of, Math.min(facts.at, of.through)).places.join() };
 });
+const [floorsHere, floorsThere] = [sentFloors(mapFacts), sentFloors(otherFacts)];
 /** While W moves, the last ones stay as long as the same places stand. */
-const floorsNow = computed(() => (sentFloors.value?.places === map.value?.places.join() ? (sentFloors.value?.floors ?? NO_FLOORS) : NO_FLOORS));
+const floorsIn = (sent: typeof floorsHere.value, now: MapState | null) => (sent !== null && sent.places === now?.places.join() ? sent.floors : NO_FLOORS);
+const floorsNow = computed(() => floorsIn(floorsHere.value, map.value));
 
 function regionsIn(part: Shown | null, floors: typeof NO_FLOORS): Regions | null {
   return part === null || grid.value === null ? null : regionsOf(part.history, part.map, grid.value, floors);
 }
 export const regions = computed(() => regionsIn(shown.value, floorsNow.value));
 /** Of a map under other settings the rule of places knows no walls. */
-export const otherRegions = computed(() => regionsIn(otherShown.value, NO_FLOORS));
+export const otherRegions = computed(() => regionsIn(otherShown.value, compareMode.value === "moments" ? floorsIn(floorsThere.value, comparedMap.value) : NO_FLOORS));
 
 /** The map at the other moment of a comparison, while its panel is open and that moment is not later. */
 export const comparedMap = computed<MapState | null>(() =>
@@ -210,5 +218,5 @@ export const comparedMap = computed<MapState | null>(() =>
 );
 /** Whether two maps are shown side by side. */
 export const twoMaps = computed(
-  () => panel.value === "compare" && compareMode.value === "settings" && otherHistory.value !== null,
+  () => panel.value === "compare" && (compareMode.value === "settings" ? otherHistory.value !== null : beside.value && comparedMap.value !== null),
 );

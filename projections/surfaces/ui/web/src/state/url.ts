@@ -22,6 +22,7 @@ export function readAddress(hash: string) {
     selection: KINDS.includes(kind) && id.length > 0 ? ({ kind, id: id.join(":") } as store.Thing) : null,
     panel: panel === "none" ? null : store.PANELS.find((each) => each === panel),
     compareWith: number("with"),
+    beside: found.has("beside"),
     settings: found.get("compare") === "settings",
     asked: { what: found.get("what") ?? "", room: found.get("in") ?? "", every: found.has("once") },
     sorted: sortedBy(found.get("sort")),
@@ -67,6 +68,7 @@ export function applyAddress(hash: string) {
     store.selection.value = found.selection;
     if (found.panel !== undefined) store.panel.value = found.panel;
     store.compareWith.value = found.compareWith;
+    store.beside.value = found.beside;
     store.otherEps.value = found.eps;
     store.otherMinSamples.value = found.minSamples;
     store.compareMode.value = found.settings || found.eps !== null || found.minSamples !== null ? "settings" : "moments";
@@ -97,6 +99,7 @@ export function writtenAddress(still = false): string {
   if (store.panel.value === "compare") {
     if (store.compareMode.value === "moments") {
       if (store.compareWith.value !== null) found.set("with", String(store.compareWith.value));
+      if (store.beside.value) found.set("beside", "1");
     } else {
       found.set("compare", "settings");
       if (store.otherEps.value !== null) found.set("eps_m", String(store.otherEps.value));

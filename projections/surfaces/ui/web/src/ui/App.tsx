@@ -24,12 +24,12 @@ export function App() {
       <main class={two ? "stage two" : "stage"}>
         <div class="pane">
           <MapCanvas side="main" />
-          {two && <p class="pane-title">{settingsOf("main")}</p>}
+          {two && <p class="pane-title">{paneTitle("main")}</p>}
         </div>
         {two && (
-          <div class="pane">
+          <div class={store.compareMode.value === "moments" ? "pane before" : "pane"}>
             <MapCanvas side="other" />
-            <p class="pane-title">{settingsOf("other")}</p>
+            <p class="pane-title">{paneTitle("other")}</p>
           </div>
         )}
         <NoMap />
@@ -60,10 +60,10 @@ export function App() {
   );
 }
 
-function settingsOf(side: "main" | "other"): string {
-  const history = side === "main" ? store.history.value : store.otherHistory.value;
-  const map = side === "main" ? store.map.value : store.otherMap.value;
+function paneTitle(side: "main" | "other"): string {
+  const { history, map } = side === "main" ? { history: store.history.value, map: store.map.value } : store.other.value;
   if (history === null || map === null) return "";
+  if (store.compareMode.value === "moments") return `${side === "main" ? "after" : "before"}: ${counted(map.at, "event")}, ${counted(map.places.length, "place")}`;
   const { eps_m, min_samples } = history.settings;
   const settings = side === "main" ? store.log.value?.places_text : `ε ${eps_m} m, min_samples ${min_samples}`;
   return `${side === "main" ? "as recorded" : "what if"}: ${counted(map.places.length, "place")}, ${settings}`;

@@ -30,8 +30,7 @@ export function Tooltip() {
 }
 
 function thingLines({ thing, number, side }: NonNullable<typeof tip.value>): string[] {
-  const history = side === "main" ? store.history.value : store.otherHistory.value;
-  const map = side === "main" ? store.map.value : store.otherMap.value;
+  const { history, map } = side === "main" ? { history: store.history.value, map: store.map.value } : store.other.value;
   if (history === null || map === null) return [];
   const place = (each: number) => (each < 0 ? "in no place" : `in ${isolated(label(placeTitle(history, map, each), 40))}`);
   switch (thing.kind) {
