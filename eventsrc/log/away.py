@@ -79,7 +79,7 @@ def restore_log(
     here = [each for each in wanted if each.following > start] or wanted[-1:]
     if log.is_dir():
         delete_stand_ins(log)  # a restore was killed
-    if _has_away(log, archive):
+    if _has_all(log, archive, wanted):
         fetched = _bring_back(log, archive, here)
         end = sealed_end(log)
         events = wanted[-1].following if end is None else end.following
@@ -101,14 +101,13 @@ def restore_log(
     )
 
 
-def _has_away(log: Path, archive: Archive) -> bool:
-    """Whether a log is whole, but for segments that are away in this archive."""
+def _has_all(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> bool:
+    """Whether a log that is archived there has all these segments, here or away."""
     place = archive_place(log) if log.is_dir() else None
     if place is None or place.url != archive.store.url:
         return False
-    segments, end = names.list_growing(log), sealed_end(log)
-    is_whole = end is not None and end.base in {each.base for each in segments if each.sealed}
-    return is_whole and any(each.away for each in segments)
+    there, end = {each.base for each in names.list_growing(log)}, sealed_end(log)
+    return end is not None and end.log_id == archive.log_id and there >= {e.base for e in wanted}
 
 
 def _bring_back(log: Path, archive: Archive, wanted: list[ManifestEntry]) -> list[ManifestEntry]:

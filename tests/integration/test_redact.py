@@ -7,7 +7,6 @@ import os
 import random
 import shutil
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -42,6 +41,7 @@ from projections.postgres.connection import Targets, connect
 from projections.surfaces.cli.redact_command import redact
 from tests.support.byte_search import holds
 from tests.support.commands import Commands
+from tests.support.dying import die_at
 from tests.support.envelopes import detection, embedding, envelope, payload
 from tests.support.fixtures_log import KEY, read_log
 from tests.support.thorough import rounds
@@ -336,27 +336,12 @@ def _redact_killed(log: Path, calls: int) -> bool:
     pid = os.fork()
     if pid == 0:
         try:
-            _die_at(calls)
+            die_at(calls)
             redact(log, class_=["person"], reason="x")
         finally:
             os._exit(0)
     _, status = os.waitpid(pid, 0)
     return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
-
-
-def _die_at(calls: int) -> None:
-    left = calls
-    changing = {f"os.{name}" for name in ("rename", "remove", "mkdir", "symlink", "rmdir")}
-
-    def watch(event: str, args: tuple[Any, ...]) -> None:
-        nonlocal left
-        flags = args[2] if event == "open" and isinstance(args[2], int) else 0
-        if event in changing or flags & (os.O_WRONLY | os.O_RDWR):
-            left -= 1
-            if left < 0:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    sys.addaudithook(watch)
 
 
 def test_databases_give_the_bytes_up(run: Commands, tmp_path: Path, one_database: Targets) -> None:
