@@ -30,7 +30,7 @@ from eventsrc.base.text import advised
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
 
 from . import format as names
-from .archive_place import note_archive_place, place_locked
+from .archive_place import note_archive_place, place_locked, refuse_away
 from .durable_files import write_all
 from .lock import is_held
 from .reader import LogReader
@@ -249,6 +249,7 @@ def archive_log(log: Path, store: ObjectStore, *, note: Callable[[str], None]) -
 
 def _archive_sealed(log: Path, store: ObjectStore) -> Archived:
     segments = names.list_growing(log)
+    refuse_away(log, segments[-1:])
     sealed = [each for each in segments if each.sealed]
     if not sealed:
         raise NothingSealed(f"{log} has no sealed segment yet: there is nothing to archive")
@@ -306,15 +307,8 @@ class _Archiver:
             with place_locked(self._log):
                 note_archive_place(self._log, self._store.url)
         events = max((each.following for each in self._entries.values()), default=0)
-        return Archived(
-            self._archive.log_id,
-            self._added,
-            self._bytes,
-            self._replaced,
-            len(self._entries),
-            events,
-            not_sealed,
-        )
+        done = self._added, self._bytes, self._replaced
+        return Archived(self._archive.log_id, *done, len(self._entries), events, not_sealed)
 
     def _skip_to(self, base: Offset) -> None:
         """Pass segments that only the archive has."""

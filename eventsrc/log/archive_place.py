@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from eventsrc.base.errors import LogDamaged, LogError
-from eventsrc.base.text import advised
+from eventsrc.base.text import advised, command_line
 
 from .durable_files import (
     delete_durably,
@@ -56,6 +56,11 @@ def refuse_away(log: Path, segments: Sequence[SegmentPath]) -> None:
     if away:
         place = archive_place(log)
         url = "URL" if place is None else place.url
+        if segments[-1].away:  # of a log that was thinned out here the last segment stays
+            raise LogError(
+                f"{url} is an archive, which is only read here; to write, bring the log back:"
+                f" `{command_line('log', 'restore', url, 'LOG')}`, and name LOG instead"
+            )
         raise LogError(
             f"{away[0].path}: this segment is in the archive only;"
             f" `{advised('log', 'restore', url, log)}` brings it back"

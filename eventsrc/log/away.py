@@ -33,6 +33,7 @@ from .archive_place import (
     delete_stand_ins,
     note_archive_place,
     place_locked,
+    refuse_away,
     stand_in,
 )
 from .archived_history import restore_kept
@@ -228,7 +229,7 @@ def retain_log(
     ``keep_bytes`` here; the last sealed segment stays, and what is not archived yet. Each goes only
     after the archived one, read just now, was equal. Raises LogError, ArchiveError; what is left is
     whole then."""
-    segments_of(log)
+    refuse_away(log, segments_of(log)[-1:])
     delete_stand_ins(log)
     place = archive_place(log)
     if place is None:

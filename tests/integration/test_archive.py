@@ -336,8 +336,18 @@ def test_an_archive_is_read_by_its_url(log: Path, url: str, tmp_path: Path) -> N
     mapfold("log", "archive", log, url)
     assert mapfold("log", "info", url, "--json").json["events"] == RECORDED + 15
     (tmp_path / "x.jsonl").write_bytes(payload(envelope(1)))
-    for words in (("log", "recover", url), ("import", url, "x.jsonl")):
-        assert "in the archive only" in mapfold(*words, code=1).err
+    for words in (
+        ("edit", url, "name-place", "p0", "hall"),
+        ("import", url, "x.jsonl"),
+        ("log", "recover", url),
+        ("log", "archive", url, folder_url(tmp_path / "other")),
+        ("log", "retain", url, "--keep", "1d"),
+        ("log", "redact", url, "--run", "run-a", "--reason", "a test"),
+    ):
+        told = mapfold(*words, code=1).err
+        assert f"{url} is an archive, which is only read here" in told
+        assert f"`mapfold log restore '{url}' LOG`" in told  # quoted, as its name has a space
+    assert "restore into a folder" in mapfold("log", "restore", url, url, code=2).err
     assert "no archive" in mapfold("state", folder_url(tmp_path), code=1).err
 
 

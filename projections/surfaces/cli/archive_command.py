@@ -169,6 +169,10 @@ def restore(
     """
     if at is not None and (from_, to) != ("0", "end"):
         raise MisuseError("--at stands for --from 0 --to W: give one of them")
+    from projections.postgres.embedded import mapfold_home  # here: `log archive` needs none
+
+    if log.parent == mapfold_home() / "archives":
+        raise MisuseError("LOG is a URL, too: restore into a folder")
     archive = Archive(ObjectStore(url))
     if (from_, at or to) == ("0", "end"):
         done = restore_log(archive, log)

@@ -100,6 +100,9 @@ def _complete_commands(app: typer.Typer) -> None:
             _refuse_empty_paths(command.callback)
     for group in app.registered_groups:
         if group.typer_instance is not None:
+            of_all = group.typer_instance.registered_callback
+            if of_all is not None and of_all.callback is not None:
+                _refuse_empty_paths(of_all.callback)
             group.short_help = group.typer_instance.info.help
             _complete_commands(group.typer_instance)
 
