@@ -6,15 +6,16 @@ occupancy map, both with a free line of sight. Where no robot drove, unknown gro
 
 Of the poses that saw it the best one has most others that saw it around it, for one detection may
 be of a thing beside it, and is some `_BEST_M` away. It counts against a pose how few those are (up
-to 1, `_flaws`), how many others around it looked at the Object without seeing it (up to `_MISSED`),
-each metre that it is nearer or farther (`_A_METRE`) or, up to one, off the ground of the last run
-(`_OFF_LAST`), that a later run saw the Object too (`_EARLIER`), that another Object stands there
-and that a wall is in the line of sight, for estimates err (`_BLOCKED` each). Of the others the best
-one is as far away as the Object is seen from usually. Of equal ones the earliest.
+to 1, `_flaws`), each metre that it is nearer or farther (`_A_METRE`) or, up to one, off the ground
+of the last run (`_OFF_LAST`), that a later run saw the Object too (`_EARLIER`), that another Object
+stands there and that a wall is in the line of sight, for estimates err (`_BLOCKED` each). Of the
+others the best one is as far away as the Object is seen from usually. Of equal ones the earliest.
+Counting against a pose that others around it looked at the Object and did not see it puts as many
+things of the developing half of generated buildings in view as without, 2,165 of 2,265.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -29,17 +30,15 @@ from projections.map.records import KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
 
 from .driven_ground import DrivenGround, Floor, Spot, um_of
-from .object_changes import keyframes_looking
 
 CLEARANCE_M: Final = 0.3
 Floats = NDArray[np.float64]
 
 _BEST_M: Final = 2.5
 _A_METRE: Final = 0.2
-_EARLIER: Final = 0.6
+_EARLIER: Final = 0.3
 _OFF_LAST: Final = 0.5
 _BLOCKED: Final = 1.0
-_MISSED: Final = 1.0
 _AROUND_M: Final = 0.7
 _MANY: Final = 2.0
 _STANDS_M: Final = 0.4
@@ -130,7 +129,7 @@ class GoalGround:
         distances = sorted(math.dist(_spot(keyframe), found.spot) for keyframe in seen)
         usual = distances[len(distances) // 2] if distances else _RINGS[0]
         for ground, candidates in (
-            ("seen", self._seen(view, found, seen)),
+            ("seen", self._seen(found, seen)),
             ("driven", self._driven()),
             ("free", self._around(found)),
         ):
@@ -163,12 +162,10 @@ class GoalGround:
             f" {clearance_m:g} m from walls; give a smaller --clearance"
         )
 
-    def _seen(
-        self, view: MapView, found: ObjectRecord, seen: Sequence[KeyframeRecord]
-    ) -> Iterator[_Candidate]:
+    def _seen(self, found: ObjectRecord, seen: Sequence[KeyframeRecord]) -> Iterator[_Candidate]:
         """Poses that saw an Object where it stands now."""
         last = max((keyframe.run for keyframe in seen), default=None)
-        flaws = self._flaws(view, found, seen)
+        flaws = self._flaws(seen)
         for keyframe in sorted(seen, key=lambda k: k.ordinal):
             spot = _spot(keyframe)
             blocked = int(self._is_taken(keyframe.floor, spot, found))
@@ -176,32 +173,20 @@ class GoalGround:
             worse = flaws[self._node(keyframe)] + _BLOCKED * blocked
             yield spot, keyframe.floor, keyframe, worse + _EARLIER * (keyframe.run != last)
 
-    def _flaws(
-        self, view: MapView, found: ObjectRecord, seen: Sequence[KeyframeRecord]
-    ) -> dict[int, float]:
-        """By node of poses that saw an Object: how few of them are around it, how many there saw
-        it of those that should, and how far the last run was."""
-        saw, hits = self._places(seen), {keyframe.ordinal for keyframe in seen}
-        looks = [] if found.estimate is None else list(keyframes_looking(view, found, view))
-        looked = self._places(looks)
-        is_hit = np.array([keyframe.ordinal in hits for keyframe in looks], np.bool_)
+    def _flaws(self, seen: Sequence[KeyframeRecord]) -> dict[int, float]:
+        """By node of poses that saw an Object: how few of them are around it, and how far the last
+        run was."""
+        saw = np.array([(*_spot(each), self._floors[each.floor]) for each in seen])
         flaws = dict[int, float]()
         for node in {self._node(keyframe) for keyframe in seen}:
             place = *self._ground.spots[node], self._floors[self._ground.keyframe(node).floor]
-            around = _weights(looked, place)
-            share = (float(around[is_hit].sum()) + 1.0) / (float(around.sum()) + 2.0)
-            few = math.exp(-float(_weights(saw, place).sum()) / _MANY)
-            off = float(_apart(self._last, place).min(initial=1.0))
-            flaws[node] = few + _MISSED * (1.0 - share) + _OFF_LAST * off
+            around = np.exp(_apart(saw, place) ** 2 / (-2 * _AROUND_M**2)).sum()
+            off = _apart(self._last, place).min(initial=1.0)
+            flaws[node] = math.exp(-float(around) / _MANY) + _OFF_LAST * float(off)
         return flaws
 
     def _node(self, keyframe: KeyframeRecord) -> int:
         return self._ground.nodes_of([keyframe.ordinal])[0]
-
-    def _places(self, keyframes: Iterable[KeyframeRecord]) -> Floats:
-        """x, y and the number of the floor of each keyframe."""
-        places = [(*_spot(each), self._floors[each.floor]) for each in keyframes]
-        return np.array(places, np.float64).reshape(-1, 3)
 
     def _is_taken(self, floor: Floor, spot: Spot, found: ObjectRecord) -> bool:
         """Whether another Object than ``found`` stands at a spot of a floor."""
@@ -261,12 +246,6 @@ def _spot(keyframe: KeyframeRecord) -> Spot:
 def _stand(spot: Spot) -> tuple[int, int]:
     """The square of a spot, `_STANDS_M` wide."""
     return math.floor(spot[0] / _STANDS_M), math.floor(spot[1] / _STANDS_M)
-
-
-def _weights(places: Floats, place: tuple[float, float, int]) -> Floats:
-    """How much each place is around one, 1 for itself."""
-    around: Floats = np.exp(_apart(places, place) ** 2 / (-2 * _AROUND_M**2))
-    return around
 
 
 def _apart(places: Floats, place: tuple[float, float, int]) -> Floats:

@@ -1,7 +1,6 @@
 """Which of the poses that saw a thing is its goal."""
 
 import math
-from collections.abc import Container
 
 import numpy as np
 
@@ -32,11 +31,10 @@ OFTEN = [(3.0 + 0.1 * step, 0.0) for step in range(4)]
 def goal_of(
     *runs: list[tuple[float, float]],
     other: tuple[float, float] | None = None,
-    missed: Container[tuple[float, float]] = (),
     walls: OccupancyMap | None = None,
 ) -> GoalPose:
-    """The goal of a thing at the origin that was seen from the spots of some runs but those
-    ``missed``, which face it too; another thing may stand somewhere."""
+    """The goal of a thing at the origin that was seen from the spots of some runs; another thing
+    may stand somewhere."""
     view = MapView(Settings(), keep_embeddings=False)
     if walls is not None:
         view.maps[None] = MapGiven(Offset(0), walls)
@@ -56,24 +54,23 @@ def goal_of(
                     *(KeyframeId(number), float(number), pose, view.survivors),
                 )
             )
-            if (x, y) not in missed:
-                observation = ObservationOrdinal(len(view.observations))
-                view.observations.append(
-                    ObservationRecord(
-                        ordinal=observation,
-                        keyframe=KeyframeOrdinal(number),
-                        det_id=DetId(f"d{number}"),
-                        class_name="oven",
-                        confidence=1.0,
-                        bbox=(0.0, 0.0, 9.0, 9.0),
-                        embedding_model=None,
-                        embedding=None,
-                        embedding_crc=None,
-                        foreign_space=False,
-                        object=thing.ordinal,
-                    )
+            observation = ObservationOrdinal(len(view.observations))
+            view.observations.append(
+                ObservationRecord(
+                    ordinal=observation,
+                    keyframe=KeyframeOrdinal(number),
+                    det_id=DetId(f"d{number}"),
+                    class_name="oven",
+                    confidence=1.0,
+                    bbox=(0.0, 0.0, 9.0, 9.0),
+                    embedding_model=None,
+                    embedding=None,
+                    embedding_crc=None,
+                    foreign_space=False,
+                    object=thing.ordinal,
                 )
-                thing.observations.append(observation)
+            )
+            thing.observations.append(observation)
     thing.estimate = EstimatedPosition(0, 0, 1, 0, 1, 2)
     view.objects[thing.ordinal] = thing
     if other is not None:
@@ -102,13 +99,6 @@ def test_a_goal_is_not_where_another_thing_stands() -> None:
     beside = [(-x - 0.3, y) for x, y in OFTEN]
     assert goal_of([*OFTEN, *beside]).x > 0.0
     assert goal_of([*OFTEN, *beside], other=(3.1, 0.0)).x < 0.0
-
-
-def test_a_goal_is_not_where_others_beside_it_missed_the_thing() -> None:
-    beside = [(-x, y) for x, y in OFTEN]
-    missed = [(x - 0.05, 0.05) for x, _ in OFTEN]
-    assert goal_of([*OFTEN, *beside, *missed]).x > 0.0
-    assert goal_of([*OFTEN, *beside, *missed], missed=missed).x < 0.0
 
 
 def test_a_goal_on_ground_that_no_robot_drove_keeps_away_from_unknown_ground() -> None:
