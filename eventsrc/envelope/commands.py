@@ -179,7 +179,7 @@ Yaw: TypeAlias = Annotated[float, Field(ge=-MAX_YAW_RAD, le=MAX_YAW_RAD)]
 
 
 class CorrectedPose(_Model):
-    """A keyframe's corrected pose: metres and radians in the map frame."""
+    """A keyframe's corrected pose: metres and radians in the map frame of its run."""
 
     keyframe_id: Annotated[KeyframeId, INT64]
     x: Position

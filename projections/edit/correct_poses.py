@@ -17,6 +17,8 @@ from eventsrc.envelope import commands
 from eventsrc.envelope.commands import MAX_COMMAND_BYTES
 from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId, RunId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
+from projections.fold.corrections import FrameJoin
+from projections.fold.pose_corrections import Pose, moved_by
 from projections.map.frames import frames_of
 
 from .conflicts import check_run_in_map
@@ -129,8 +131,9 @@ def by_trajectory(
     ignore_missing: bool = False,
     note: Callable[[str], None] = lambda _: None,
 ) -> commands.CorrectPoses:
-    """The poses of a file for the keyframes of a run. ``note`` is called with a message if
-    the file may be cut off, keyframes or poses are left out, or poses are interpolated."""
+    """The poses of a file, in the run's own frame, for its keyframes. ``note`` is called with a
+    message if the file may be cut off, keyframes or poses are left out, or poses are interpolated.
+    """
     keyframes = _keyframes(current, run_id, span)
     laid = lay(trajectory, keyframes, slack_s)
     in_run = {k.keyframe_id for k in current.run(run_id)}
@@ -154,9 +157,18 @@ def by_trajectory(
 def by_transform(
     current: MapToEdit, stamp: Stamp, run_id: str, span: Span, dx: float, dy: float, dyaw: float
 ) -> commands.CorrectPoses:
-    """One rigid transform of the keyframes of a run."""
+    """One rigid transform of the keyframes of a run. The command has it in the run's own frame,
+    which joins of frames move after it."""
     transform = _transform(dx, dy, dyaw)
     _keyframes(current, run_id, span)
+    if joins := _joins_of(current, run_id, span):
+        here: Pose = (0.0, 0.0, 0.0)
+        for join in joins:
+            here = moved_by(join.transform, here)
+        there = moved_by(transform, here)
+        x, y, angle = there[0] - here[0], there[1] - here[1], here[2]
+        cos, sin = math.cos(angle), math.sin(angle)
+        transform = _transform(cos * x + sin * y, cos * y - sin * x, dyaw)
     return build(
         commands.CorrectPoses,
         stamp,
@@ -165,6 +177,22 @@ def by_transform(
         first=span.first,
         last=span.last,
     )
+
+
+def _joins_of(current: MapToEdit, run_id: str, span: Span) -> list[FrameJoin]:
+    """The joins that move the keyframes of a run after their correction. Raises MisuseError if
+    these are not the same for all."""
+    frames = {
+        k.frame for k in current.run(run_id) if k.pose is not None and span.has(k.keyframe_id)
+    }
+    joins = [current.corrections.frame_joins(frame) for frame in sorted(frames, key=str)]
+    if any(each != joins[0] for each in joins):
+        named = ", ".join(visible(frame or "the map's own") for frame in sorted(frames, key=str))
+        raise MisuseError(
+            f"{visible(run_id)} has keyframes in several frames, {named}; correct those of one with"
+            " --from and --to"
+        )
+    return joins[0] if joins else []
 
 
 def join_frames(

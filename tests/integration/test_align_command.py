@@ -3,8 +3,10 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from projections.localize.align.matching import moved
 from tests.property.test_align import HERE, in_frame, jumped
 from tests.support.commands import Commands
 from tests.support.logs import simulated, walk, write_log
@@ -113,6 +115,12 @@ def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
     assert "--jumps takes neither --to nor --picture" in said.err
 
 
+def poses_of_b(mapfold: Commands, log: Path) -> np.ndarray:
+    seen = mapfold("state", log, "--json").json["keyframes"]
+    run = [k for k in seen if k["run_id"] == "run-b" and k["map_x"] is not None]
+    return np.array([(k["map_x"], k["map_y"]) for k in run])
+
+
 def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
     here = walk(12) + [each | {"frame": "b"} for each in walk(12, run_id="run-b")]
     log = write_log(mapfold.folder / "log", here)
@@ -128,7 +136,7 @@ def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
     said = mapfold("edit", log, "join-frames", "c", "--reason", "x", code=2)
     assert "frame c: no keyframe names it, or the map's own; held apart are b" in said.err
     joining = ["edit", log, "join-frames", "b", "--dx", "0.5", "--reason", "one house"]
-    mapfold(*joining)
+    mapfold(*joining, "--command-id", "c1")
     assert "join-frames b into the map's own: dx=0.5 dy=0 dyaw=0" in mapfold("edits", log).out
     (joined,) = mapfold("merges", log, "--frames", "--json").json
     assert joined == apart | {"held_apart": False, "into": None, "command": 24} | {
@@ -141,6 +149,14 @@ def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
         joined
     ]
     assert "frame b: joined already" in mapfold(*joining, code=2).err
+    before = poses_of_b(mapfold, log)
+    mapfold("edit", log, "undo", "c1", "--reason", "x")
+    mapfold(*joining[:-2], "--dy", "-3", "--dyaw", "2.0", "--reason", "y")
+    placed = poses_of_b(mapfold, log)
+    move = ["--dx", "1", "--dy", "2", "--dyaw", "0.3"]
+    mapfold("edit", log, "correct-poses", "run-b", *move, "--reason", "z")
+    assert np.abs(moved(placed, (1.0, 2.0, 0.3)) - poses_of_b(mapfold, log)).max() < 1e-5
+    assert np.abs(before - placed).max() > 0.5
     said = mapfold("merges", log, "--frames", "--objects", code=2)
     assert "are tables of their own; give one alone" in said.err
 
