@@ -98,8 +98,8 @@ def proxy_of(server: str) -> Iterator[Proxy]:
                     self.send_header(name, value)
             self.send_header("Content-Length", str(answer.length))
             self.end_headers()
+            proxy.sent += len(answer.body)  # before the client has it and asks how much it was
             self.wfile.write(answer.body)
-            proxy.sent += len(answer.body)
             if self.command != "HEAD" and len(answer.body) != answer.length:
                 self.close_connection = True
 
