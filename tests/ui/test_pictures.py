@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.support.ui_page import UiServer
-from tests.ui.browser import whole
+from tests.ui.browser import answered, whole
 from tests.ui.conftest import SCHEMES, SIZES, Visit
 
 STATES = {
@@ -56,4 +56,4 @@ def _settled(page: Page, state: str) -> None:
         page.get_by_text("How the two maps differ").wait_for()
     if state == "whatif":
         page.locator("table").wait_for()
-    page.wait_for_timeout(250)
+    answered(page)

@@ -20,13 +20,13 @@ export const mapY = (view: View, y: number) => (view.y - y) / view.k;
 /** The share of a canvas that a map fills in the direction in which it is larger. */
 const FILLED = 0.95;
 
-/** The view in which the bounds fill a canvas below `top` pixels, beside what covers `left` and `right` of it where there is room. */
+/** The view in which the bounds fill a canvas below `top` pixels, beside what covers `left` and `right` of it as far as there is room. */
 export function fitted(bounds: Bounds, width: number, height: number, left = 0, top = 0, right = 0): View {
   const [w, h] = [Math.max(bounds.x1 - bounds.x0, 1.5), Math.max(bounds.y1 - bounds.y0, 1.5)];
   const k = Math.max(1e-3, FILLED * Math.min(width / w, (height - top) / h));
-  const room = FILLED * width - k * w;
-  const from = left <= room ? left : 0;
-  const to = from + right <= room ? width - right : width;
+  const room = Math.max(0, FILLED * width - k * w);
+  const from = Math.min(left, room);
+  const to = width - Math.min(right, room - from);
   return {
     k,
     x: (from + to) / 2 - (k * (bounds.x0 + bounds.x1)) / 2,
