@@ -3,9 +3,9 @@
     kept/NAME.packed    the file NAME of the cache folder, in spans that are packed one by one, end
                         to end; then a `_Index`, packed too; then its length in 8 bytes and `_END`
 
-A span begins where `Span` says and ends where the next does. It is compressed by zstd as it is, or
-with the first bytes of all its numbers first, then the second ones …: what is smaller. Columns of
-numbers take a quarter.
+A span begins where `FileSpan` says and ends where the next does. It is compressed by zstd as it is,
+or with the first bytes of all its numbers first, then the second ones …: what is smaller. That
+takes a quarter for columns of numbers.
 
 Of a log that is read by its URL the files stand for those in the archive: as long, and empty.
 ``NAME.away`` beside each says what spans of which object it is made of. Every reader of these files
@@ -35,7 +35,7 @@ from eventsrc.envelope.model import FIRST_OFFSET, Offset
 from . import format as names
 from .archive import KEPT, Archive
 from .archive_place import archive_place, stand_in
-from .log_identity import STANDS_FOR, Span, cache_folder, make_cache_folder, write_cache_file
+from .log_identity import STANDS_FOR, FileSpan, cache_folder, make_cache_folder, write_cache_file
 from .sealed_end import sealed_end
 
 _NAME: Final = re.compile(r"[0-9a-f]{16}-(?:\d{20}-)?(\d{20})(?:\.\d+)?\.\w+")
@@ -95,7 +95,7 @@ class _Stand(msgspec.Struct, frozen=True):
     index: _Index
 
 
-def archive_kept(log: Path, store: ObjectStore, files: Mapping[str, Sequence[Span]]) -> int:
+def archive_kept(log: Path, store: ObjectStore, files: Mapping[str, Sequence[FileSpan]]) -> int:
     """Put these files of the kept history of a log, each in spans that begin at byte 0, and delete
     those in the archive that are not among them; returns the number of bytes put."""
     there = Archive(store).kept_files()
@@ -114,13 +114,13 @@ def archive_kept(log: Path, store: ObjectStore, files: Mapping[str, Sequence[Spa
     return put
 
 
-def _pack(source: Path, spans: Sequence[Span], target: Path) -> None:
+def _pack(source: Path, spans: Sequence[FileSpan], target: Path) -> None:
     compressor = zstandard.ZstdCompressor(write_checksum=True)
     lengths, widths = list[int](), list[int]()
     with source.open("rb") as file, target.open("wb") as packed:
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             size = len(data)
-            for (start, width), (end, _) in pairwise([*spans, Span(size)]):
+            for (start, width), (end, _) in pairwise([*spans, FileSpan(size)]):
                 raw = data[start:end]
                 found = compressor.compress(raw)
                 if width > 1 and len(by_byte := compressor.compress(_by_byte(raw, width))) < len(

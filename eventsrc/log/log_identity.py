@@ -179,7 +179,7 @@ STANDS_FOR: Final = ".away"
 """Ends the name of the file that says of which archived object another one is made."""
 
 
-class Span(NamedTuple):
+class FileSpan(NamedTuple):
     """The byte at which a span of a cached file begins, which is archived by itself, and the bytes
     of one of its numbers."""
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from eventsrc.base.machine import crc32
 from eventsrc.envelope.model import Offset
-from eventsrc.log.log_identity import STANDS_FOR, Span
+from eventsrc.log.log_identity import STANDS_FOR, FileSpan
 from projections.fold import State
 
 from .columns import TABLES, Array, Stripe, ends_of
@@ -121,10 +121,10 @@ class PartFile:
         """Drop the file's pages from this process's memory; access reads them again."""
         _release(self._map, 0, len(self._map))
 
-    def spans(self) -> list[Span]:
+    def spans(self) -> list[FileSpan]:
         """The spans of the file: one for each array, and for the manifest."""
         at = [(each.at, np.dtype(each.dtype).itemsize) for each in self._locations]
-        return [Span(0), *(Span(*each) for each in sorted(at)), Span(self._manifest_at)]
+        return [FileSpan(0), *(FileSpan(*each) for each in sorted(at)), FileSpan(self._manifest_at)]
 
     def _manifest(self) -> dict[str, Any]:
         try:
@@ -225,9 +225,9 @@ def _fetch(path: Path, start: int, end: int | None) -> bool:
     return fetch_kept(path, start, end)
 
 
-def spans_of(path: Path) -> list[Span]:
+def spans_of(path: Path) -> list[FileSpan]:
     """The spans in which a file is archived. Raises OSError, DamagedPart."""
-    return PartFile(path).spans() if path.suffix == ".npz" else [Span(0)]
+    return PartFile(path).spans() if path.suffix == ".npz" else [FileSpan(0)]
 
 
 def _release(data: mmap.mmap, start: int, end: int) -> None:

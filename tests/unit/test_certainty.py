@@ -15,7 +15,7 @@ from projections.localize.relocalize import MapConstants, Match, QuestionCrop, r
 from projections.localize.relocalize.candidates import MapCandidates
 from projections.localize.relocalize.certainty import (
     Looks,
-    Session,
+    QuestionSession,
     known_features,
     known_probability,
     looks_of,
@@ -109,7 +109,7 @@ def test_unknown_follows_from_known() -> None:
 
 def _after(logits: list[float], logit: float) -> tuple[float, float]:
     """`known` and its spread, of a question after others."""
-    session = Session()
+    session = QuestionSession()
     for each in logits:
         session.add(Looks(each, ANY_DAY))
     return session.known(Looks(logit, ANY_DAY))

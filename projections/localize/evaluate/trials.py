@@ -20,7 +20,7 @@ from projections.fold.map_errors import QuestionError
 from projections.fold.settings import CameraConstants
 from projections.localize import relocalize
 from projections.localize.relocalize import Answer, ExactIndex, MapCandidates, Match, Method, rank
-from projections.localize.relocalize.certainty import Session
+from projections.localize.relocalize.certainty import QuestionSession
 from projections.map.view import MapView
 
 from .parallel import call_all
@@ -287,7 +287,7 @@ def known_of_sessions(trials: Iterable[Trial]) -> list[tuple[float, bool]]:
     for asked in by_run.values():
         for number, trial in enumerate(asked):
             if number % SESSION == 0:
-                session = Session()
+                session = QuestionSession()
             looks = trial.answer.looks
             if number % SESSION >= BEFORE:
                 known = trial.answer.known if looks is None else session.known(looks)[0]

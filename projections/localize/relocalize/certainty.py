@@ -18,7 +18,7 @@ candidates show that, so `thinness` costs a question nothing.
 
 How much likeness another day costs, a map of one run cannot know. Its `SessionPrior` is a mean and
 a spread of that, as an addition to the logit; of several runs `mapfold calibrate` reads it. What
-the questions of one session say of it is in `Session`.
+the questions of one session say of it is in `QuestionSession`.
 
 In the fit of `confidence`, an answer to crops of things that the map lacks counts as wrong. Where
 only classes are known, there is no likeness by which to decide whether the things are those of the
@@ -147,7 +147,7 @@ _COUNT: Final = 0.3
 """How much of an independent question each is: successive ones show the same things."""
 
 
-class Session:
+class QuestionSession:
     """What the questions of one session say of what its day costs.
 
     Their logits are a mixture: known ones are normally distributed about 2.4 less the cost of the

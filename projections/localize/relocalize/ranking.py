@@ -22,7 +22,7 @@ from projections.fold.deltas import PlaceOrdinal
 from projections.fold.settings import CameraConstants
 
 from .candidates import MapCandidates, Match
-from .certainty import UNKNOWN_BELOW, Looks, Session, known_probability, looks_of, thinness
+from .certainty import UNKNOWN_BELOW, Looks, QuestionSession, known_probability, looks_of, thinness
 from .constants import MODEL, RankingModel
 from .layout import Hypotheses, Layout
 from .likelihood import Scene
@@ -124,7 +124,7 @@ class Answer:
     def known_spread(self) -> float | None:
         """The standard deviation of ``known``, as nobody knows what likeness the day of a question
         costs; None without embeddings."""
-        return None if self.looks is None else Session().known(self.looks)[1]
+        return None if self.looks is None else QuestionSession().known(self.looks)[1]
 
     @property
     def unknown(self) -> bool:

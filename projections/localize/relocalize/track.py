@@ -12,7 +12,7 @@ found again after a few questions, and a single wrong answer moves little.
 
 Things that the map does not have (``known`` below 0.5) make it less likely that the robot is where
 the particles are, by known / (1 - known), at least an eighth. `known` is that of the session: what
-its day costs is learnt from its questions (`certainty.Session`).
+its day costs is learnt from its questions (`certainty.QuestionSession`).
 
 Questions from places near each other share their errors, and a look-alike deceives several in a
 row: a likelihood is taken to a power that is the smaller, the less the robot has moved since the
@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Floats
-from .certainty import Looks, Session
+from .certainty import Looks, QuestionSession
 from .layout import STEP_M, Hypotheses
 from .question import Movement, Question
 from .ranking import PoseHypothesis
@@ -119,7 +119,7 @@ class Track:
         self._questions = 0
         self._floors: list[str | None] = []
         self._moved = math.inf
-        self._session = Session()
+        self._session = QuestionSession()
         self.particles: Floats = np.zeros((0, 3))
         self.lost = 1.0
 
