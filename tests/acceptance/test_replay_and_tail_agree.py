@@ -58,6 +58,7 @@ def test_tail_from_nothing_equals_replay_and_both_may_run_twice(
     assert everything(replayed) == first
 
 
+@pytest.mark.slow
 def test_graph_and_vectors_may_live_in_two_databases(mapfold: Commands, awkward_log: Path) -> None:
     both = new_database(mapfold, "both")
     graph, vectors = new_database(mapfold, "graph_only"), new_database(mapfold, "vectors_only")

@@ -65,6 +65,7 @@ def at_stage(stage: str, act: Callable[[], None]) -> Callable[[RebuildProgress],
 
 
 @pytest.mark.parametrize("kind", ["two_databases", "one_database"][: rounds(2, 1)])
+@pytest.mark.slow
 def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRequest) -> None:
     targets: Targets = request.getfixturevalue(kind)
     result = prefork.run(
@@ -80,6 +81,7 @@ def test_killed_at_any_statement(log: Path, kind: str, request: pytest.FixtureRe
 
 
 @pytest.mark.parametrize("stage", mostly_slow(["writing", "folding", "swapping"]))
+@pytest.mark.slow
 def test_a_terminated_session_ends_the_rebuild_with_a_message(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
@@ -122,6 +124,7 @@ def test_the_message_names_which_of_two_databases_failed(
         rebuild(log, two_databases, SETTINGS, progress=at_stage(stage, end_sessions))
 
 
+@pytest.mark.slow
 def test_rows_that_the_server_refuses_while_the_fold_goes_on(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ def test_a_tail_killed_between_any_two_statements_while_places_are_named(
     assert found["steps"] > 20
 
 
+@pytest.mark.slow
 def test_the_server_killed_at_any_statement_of_a_refold(
     log: Path, tmp_path: Path, one_database: Targets
 ) -> None:

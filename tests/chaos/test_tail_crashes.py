@@ -54,6 +54,7 @@ def own_server() -> Iterator[EmbeddedServer]:
         yield server
 
 
+@pytest.mark.slow
 def test_postgres_is_killed_again_and_again(tmp_path: Path, own_server: EmbeddedServer) -> None:
     log = write_log(tmp_path / "log", walk(60) + list(bridge()))
     targets = Targets(own_server.url, own_server.url, own_server)

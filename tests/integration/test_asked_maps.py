@@ -87,6 +87,7 @@ def test_the_databases_answer_as_the_log(tmp_path: Path, one_database: Targets) 
     assert any(each["moved_from"] for each in answers(live)[4]["answers"])
 
 
+@pytest.mark.slow
 def test_the_databases_have_the_walls_and_python_gives_the_same(
     mapfold: Commands, one_database: Targets, house: Map
 ) -> None:

@@ -42,6 +42,7 @@ def _settings(log: Path) -> Settings:
         return read_corrections(reader).settings or Settings()
 
 
+@pytest.mark.slow
 def test_constants_are_printed_with_their_priors_and_what_they_rest_on(mapfold: Commands) -> None:
     said = mapfold("calibrate", "log")
     first, header, *rest = said.out.splitlines()
@@ -138,6 +139,7 @@ def test_the_map_says_how_it_would_do_and_a_second_write_records_nothing(
     assert len(mapfold("edits", "log", "--json").json) == 1
 
 
+@pytest.mark.slow
 def test_write_with_set_switches_the_rule_in_one_command(mapfold: Commands) -> None:
     said = mapfold("calibrate", "log", "--write", *BY_EVIDENCE, "--reason", "try it").out
     assert "folded with fusion=page" not in said

@@ -96,6 +96,7 @@ def test_a_sample_of_a_large_map_is_the_same_in_both(
     assert len({constants.different for constants in with_new}) > 1
 
 
+@pytest.mark.slow
 def test_constants_are_sent_once(
     tmp_path: Path, documents: list[dict[str, Any]], targets: Targets
 ) -> None:

@@ -183,6 +183,7 @@ def test_dropped_tables_are_reported_and_not_written_to(
 
 
 @pytest.mark.parametrize("sink", mostly_slow(DROPS))
+@pytest.mark.slow
 def test_a_rebuild_beside_a_check_makes_no_difference(
     log: Path, one_database: Targets, monkeypatch: pytest.MonkeyPatch, sink: SinkName
 ) -> None:

@@ -80,6 +80,7 @@ def test_a_process_that_makes_no_progress_is_given_up(tmp_path: Path) -> None:
     assert process.returncode is not None
 
 
+@pytest.mark.slow
 def test_waiting_goes_on_as_long_as_there_is_progress(tmp_path: Path) -> None:
     """What is observed changes all the time, so ten times the bound is no reason to give up."""
     seen = iter(range(10**9))

@@ -71,6 +71,7 @@ def made(stage: Stage) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return said.json, [json.loads(line) for line in out.read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_every_picture_is_accounted_for(stage: Stage, made: Any) -> None:
     numbers, envelopes = made
     assert numbers["pictures"] == stage.count == numbers["between"] + numbers["keyframes"]

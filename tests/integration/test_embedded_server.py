@@ -80,6 +80,7 @@ def answers(server: EmbeddedServer) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_starts_serves_and_stops_at_a_path_with_spaces_quotes_and_percent() -> None:
     with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as folder:
         with EmbeddedServer(Path(folder) / "my robot's 100% café") as server:
@@ -89,6 +90,7 @@ def test_starts_serves_and_stops_at_a_path_with_spaces_quotes_and_percent() -> N
         assert not answers(server)
 
 
+@pytest.mark.slow
 def test_two_commands_share_it_and_the_last_one_stops_it(home: Path) -> None:
     with EmbeddedServer(home) as server, holder(home) as (other, pipe):
         server.stop()
@@ -270,6 +272,7 @@ def test_damaged_data_names_db_reset_which_makes_it_usable(
         assert not EmbeddedServer(Path(folder)).running
 
 
+@pytest.mark.slow
 def test_reset_stops_a_kept_server_whose_lock_file_is_damaged(home: Path) -> None:
     server = EmbeddedServer(home).start(keep=True)
     server.stop()

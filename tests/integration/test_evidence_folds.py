@@ -99,6 +99,7 @@ def test_a_tail_that_goes_on_has_the_rows_of_a_rebuild(
         assert (report.differing, report.foreign) == (0, ())
 
 
+@pytest.mark.slow
 def test_a_check_names_an_estimate_that_was_changed(
     log: Path, one_database: Targets, pg: Any
 ) -> None:

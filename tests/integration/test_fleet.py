@@ -131,6 +131,7 @@ def test_what_is_up_to_date_is_skipped_and_what_fails_is_named(
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_the_map_of_another_log_is_replaced_only_when_told(pg_url: str, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log", walk(10))
     site = ReplayRequest(Site("büro", log), Targets(pg_url, pg_url))
@@ -331,6 +332,7 @@ def test_a_name_of_any_letters_is_asked_for_under_any_encoding(
     assert exists(pg_server.url_of("東京")) is False
 
 
+@pytest.mark.slow
 def test_a_site_whose_server_refuses_the_list_of_databases_is_not_asked(tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="mapfold-test-home-") as home:
         furnish(Path(home))

@@ -265,6 +265,7 @@ def playing(log: Path, settings: Settings = SETTINGS) -> Iterator[tuple[Client, 
         assert not thread.is_alive()
 
 
+@pytest.mark.slow
 def test_a_timeline_that_seeks_gets_the_map_of_each_moment(mapfold: Commands) -> None:
     merges = mapfold("merges", SAMPLE, "--json", *ROOMS).json
     with playing(SAMPLE) as (client, maps):

@@ -151,6 +151,7 @@ def test_a_lone_surrogate_in_a_key_is_escaped(tmp_path: Path) -> None:
     assert record.reason == r"key 't/\ud800' is no UTF-8"
 
 
+@pytest.mark.slow
 def test_thousands_of_keys_go_into_several_segments(tmp_path: Path) -> None:
     """MCAP counts channels in 16 bits, and a segment repeats all their names at its end."""
     most, keys = 4_096, [f"robot/{number}" for number in range(rounds(10_000, 5_000))]

@@ -166,6 +166,7 @@ def test_messages_that_are_none_of_their_type_are_kept_as_rejected(tmp_path: Pat
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_of_a_large_message_in_sqlite_an_excerpt_is_kept(
     drives: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -50,6 +50,7 @@ def test_folders_in_use_are_left(parent: Path, gone: int) -> None:
     assert remove_killed_runs(parent) == [held]
 
 
+@pytest.mark.slow
 def test_a_folder_with_a_server_in_use_is_left(parent: Path, gone: int) -> None:
     home = parent / f"mapfold-test-{gone}"
     with EmbeddedServer(furnish(home)) as server:

@@ -178,6 +178,7 @@ CHANGES: list[tuple[LiteralString, str]] = [
 ]
 
 
+@pytest.mark.slow
 def test_check_finds_a_changed_map_and_repairs_it(tmp_path: Path, one_database: Targets) -> None:
     log = _log(tmp_path / "log", ROOMS.encode())
     rebuild(log, one_database, Settings())

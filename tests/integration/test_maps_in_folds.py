@@ -199,6 +199,7 @@ def test_state_names_the_map_only_where_there_is_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", mostly_slow(["svg", "png", "pdf"]))
+@pytest.mark.slow
 def test_a_picture_shows_the_walls_and_stays_the_same(tmp_path: Path, suffix: str) -> None:
     run = Commands.in_folder(tmp_path)
     _write(tmp_path / "plain", *DRIVE)

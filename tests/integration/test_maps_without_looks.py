@@ -67,6 +67,7 @@ def _questions(**more: Any) -> list[dict[str, Any]]:
     return asked
 
 
+@pytest.mark.slow
 def test_a_tail_has_the_rows_of_a_rebuild_and_both_those_of_the_fold(
     tmp_path: Path,
     documents: list[dict[str, Any]],
@@ -212,6 +213,7 @@ class TestCommands:
         values = {each["name"]: (each["value"], each["prior"]) for each in said["constants"]}
         assert values["evidence.same_back"][0] == values["evidence.same_back"][1]
 
+    @pytest.mark.slow
     def test_a_drive_without_looks_is_evaluated_by_classes(
         self, mapfold: Commands, bare: Path, tmp_path: Path
     ) -> None:
@@ -258,6 +260,7 @@ BAD_VECTORS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize("which", mostly_slow(LEFT_OUT))
+@pytest.mark.slow
 def test_a_bad_vector_among_detections_without_is_kept_as_rejected(
     mapfold: Commands, which: Without
 ) -> None:

@@ -76,6 +76,7 @@ def test_over_stdio(log: Path) -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_over_http_only_those_ask_who_may(log: Path) -> None:
     from tests.support.agents import tool, with_token
     from tests.support.http_attacks import Served

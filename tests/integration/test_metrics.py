@@ -53,6 +53,7 @@ def test_a_busy_port_is_one_clear_line(tmp_path: Path) -> None:
         pytest.fail("two servers on one port")
 
 
+@pytest.mark.slow
 def test_open_connections_block_no_scrape_and_the_oldest_are_closed(tmp_path: Path) -> None:
     with ExitStack() as held, serving_metrics(("127.0.0.1", 0), lambda: REPORT, tmp_path) as port:
         silent = [held.enter_context(connect(port)) for _ in range(5 * MAX_CONNECTIONS)]

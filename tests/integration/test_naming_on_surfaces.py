@@ -62,6 +62,7 @@ def test_a_short_id_of_several_runs_lists_them(mapfold: Commands, log: Path) -> 
     assert "\n  run-a_p1 (bathroom, 4 keyframes at (9.15, 0.00))\n  run-b_p1 (" in said
 
 
+@pytest.mark.slow
 def test_every_printed_id_is_short_and_taken(mapfold: Commands, log: Path) -> None:
     document = mapfold("state", log, "--json").json
     whole = [each["place_id"] for each in document["places"]]

@@ -266,6 +266,7 @@ def test_the_processes_end_with_the_context(log: Path) -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_a_killed_parent_leaves_no_process(log: Path) -> None:
     program = (
         "import sys, time\n"

@@ -28,6 +28,7 @@ def robot(endpoint: str, tmp_path: Path) -> Iterator[EnvelopePublisher]:
         yield publisher
 
 
+@pytest.mark.slow
 def test_nonsense_on_the_ack_key_acknowledges_nothing(
     endpoint: str, connected: Sessions, tmp_path: Path
 ) -> None:

@@ -253,6 +253,7 @@ def test_a_reader_that_keeps_its_lock_stops_the_swap_with_a_message(
     ("first", "second"),
     mostly_slow([(COUNT_VECTORS, COUNT_PATHS), (COUNT_PATHS, COUNT_VECTORS)]),
 )
+@pytest.mark.slow
 def test_a_transaction_that_reads_both_is_never_ended_by_a_deadlock(
     tmp_path: Path, one_database: Targets, first: str, second: str
 ) -> None:

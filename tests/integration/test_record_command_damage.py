@@ -105,6 +105,7 @@ def test_a_failing_seal_is_reported_with_the_numbers(
     assert len(read_log(log)) == 1
 
 
+@pytest.mark.slow
 def test_a_segment_that_is_cut_short_is_reported_and_recording_goes_on(
     start: Start, endpoint: str, tmp_path: Path
 ) -> None:

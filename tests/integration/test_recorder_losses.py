@@ -75,6 +75,7 @@ def _losses(log: Path) -> list[Loss]:
     return [Loss.model_validate_json(e.payload) for e in read_log(log) if e.key == LOSS_KEY]
 
 
+@pytest.mark.slow
 def test_gaps_in_sequence_numbers_are_recorded_as_losses(
     connected: Sessions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -297,6 +297,7 @@ def test_a_forged_journal_moves_no_other_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_killed_at_random_moments_it_goes_on_or_was_never_begun(quick_path: Path) -> None:
     """By --resume, by the next recorder, or by the next redaction."""
     chance, events = random.Random(7), 24

@@ -64,6 +64,7 @@ def end_of(log: Path) -> int:
 @pytest.mark.parametrize("fusion", ["page", "evidence"])
 @settings(max_examples=rounds(60, 3), deadline=None)
 @given(seed=st.integers(0, 10**6), batch=st.integers(1, 70), until=st.floats(0.1, 1.0))
+@pytest.mark.slow
 def test_the_map_is_that_of_a_log_recorded_in_the_space(
     fusion: str, seed: int, batch: int, until: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

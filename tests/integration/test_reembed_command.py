@@ -45,6 +45,7 @@ def picture(level: int) -> bytes:
 
 @settings(max_examples=examples(200), deadline=None)
 @given(det_id=st.text(NAMES, min_size=1, max_size=40), size=st.integers(0, 9))
+@pytest.mark.slow
 def test_a_crop_is_a_compressed_image_of_ros(det_id: str, size: int) -> None:
     jpeg = b"\xff\xd8\xff" + bytes(size) + b"\xff\xd9"
     topic, crop = received_crop(f"a/tb/crops/{quote(det_id, safe='')}", jpeg)

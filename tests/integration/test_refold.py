@@ -158,6 +158,7 @@ def test_an_undone_command_gives_the_digest_of_before(log: Path, one_database: T
         assert map_digest(fold_log(reader, SETTINGS)[1]) == digest
 
 
+@pytest.mark.slow
 def test_a_live_tail_names_places_and_refolds(
     log: Path, targets: Targets, third_database: Targets
 ) -> None:

@@ -93,6 +93,7 @@ def test_a_reader_cannot_tail(log: Path, projected: Targets) -> None:
         tail(log, as_role(projected, "a_reader"), SETTINGS, once=True)
 
 
+@pytest.mark.slow
 def test_a_writer_tails_and_cannot_rebuild(log: Path, projected: Targets) -> None:
     writer = as_role(projected, "a_writer")
     write_log(log, list(bridge()) + walk(20, first=40))

@@ -250,6 +250,7 @@ def test_the_command_shows_the_map_and_its_walls(
         (3_000, "has 0 events that can be read now and had 20; run `mapfold log recover"),
     ],
 )
+@pytest.mark.slow
 def test_a_growing_log_that_is_cut_off_beneath_the_command_ends_it(
     tmp_path: Path, endpoint: str, start_code: Callable[..., Program], size: int, said: str
 ) -> None:

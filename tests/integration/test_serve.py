@@ -128,6 +128,7 @@ class TestKilledServer:
             assert answerer.relocalize(question(), {}) == before
         assert [line.endswith("trying again") for line in notes[:4]] == [True, False, True, False]
 
+    @pytest.mark.slow
     def test_questions_wait_for_another_server_at_first_and_fail_at_once_later(
         self, server: EmbeddedServer, queue: FairQueue, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -154,6 +155,7 @@ class TestKilledServer:
         assert notes[1:] == ["the database answers again"]
 
 
+@pytest.mark.slow
 def test_a_full_pool_is_not_reported_as_an_outage(
     walked_map: Targets, monkeypatch: pytest.MonkeyPatch
 ) -> None:

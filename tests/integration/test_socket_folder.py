@@ -237,6 +237,7 @@ def test_clients_do_not_talk_to_another_users_server(
     (server.data / SOCKET).unlink()
 
 
+@pytest.mark.slow
 def test_a_server_of_another_data_folder_is_refused(
     short_home: Path, folders: list[Path], pg_server: EmbeddedServer
 ) -> None:

@@ -135,6 +135,7 @@ def test_a_first_replay_is_not_missing(tmp_path: Path, one_database: Targets) ->
     assert seen == [{("rebuilding", "mapfold replay", None)}]
 
 
+@pytest.mark.slow
 def test_a_busy_sink_is_reported_with_its_writer_and_server_process(
     tmp_path: Path, one_database: Targets
 ) -> None:

@@ -5,6 +5,8 @@ import shutil
 import time
 from pathlib import Path
 
+import pytest
+
 from eventsrc.envelope.system_events import LOSS_KEY, REJECTED_KEY, RejectedPayload
 from tests.support.commands import Commands
 from tests.support.envelopes import payload
@@ -118,6 +120,7 @@ def test_settings_of_the_command_line(mapfold: Commands, tmp_path: Path) -> None
         assert "--base eps_m=0.9" in whatif["command"]
 
 
+@pytest.mark.slow
 def test_truth_scores_other_settings(mapfold: Commands, tmp_path: Path) -> None:
     log, run = tmp_path / "log", tmp_path / "run.jsonl"
     mapfold("simulate", "--out", run)

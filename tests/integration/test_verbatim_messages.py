@@ -302,6 +302,7 @@ def test_a_message_that_no_segment_takes_is_refused(
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_thousands_of_formats_and_large_schemas_stay_within_the_bounds(log_path: Path) -> None:
     """Schemas of 12 MB in all: a new segment begins before one has too many."""
     forms = [

@@ -182,6 +182,7 @@ def test_walls_count_the_same_wherever_the_question_goes(
     assert _check_answers(log, targets, asked) == 0.0, "a map without walls"
 
 
+@pytest.mark.slow
 def test_each_floor_has_its_walls_in_answers(
     tmp_path: Path, targets: Targets, services: Callable[[], _Services]
 ) -> None:
@@ -198,6 +199,7 @@ def test_each_floor_has_its_walls_in_answers(
     assert set(index.search(asked.crops).walls) == {"0", "1"}
 
 
+@pytest.mark.slow
 def test_a_tail_refuses_a_projection_whose_table_of_maps_was_dropped(
     tmp_path: Path, one_database: Targets
 ) -> None:

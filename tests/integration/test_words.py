@@ -127,6 +127,7 @@ def test_a_space_that_the_log_does_not_have_is_named(mapfold: Commands) -> None:
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_a_new_log_begins_with_what_the_command_would_record(said: Commands, model: Path) -> None:
     named = "--set", f"text_encoder={model.relative_to(said.folder)}"
     again = "import", "new", "one.jsonl", *named
@@ -145,6 +146,7 @@ def test_a_new_log_begins_with_what_the_command_would_record(said: Commands, mod
 
 
 @pytest.mark.seconds
+@pytest.mark.slow
 def test_said_once_it_holds_for_every_surface(said: Commands, one_database: Targets) -> None:
     word, log = backwards("potted plant"), said.folder / "log"
     by_log = said("find", "log", word, "--json").json
@@ -185,6 +187,7 @@ def test_words_that_are_a_class_use_the_class_and_what_it_looks_like(said: Comma
     assert said("find", "log", "kitchen", code=2).err.startswith("mapfold: 'kitchen' is a place")
 
 
+@pytest.mark.slow
 def test_a_file_elsewhere_must_be_the_same(said: Commands, model: Path, tmp_path: Path) -> None:
     word = backwards("couch")
     folder = model.parent.rename(tmp_path / "elsewhere")
