@@ -81,7 +81,9 @@ Size = Annotated[
     ),
 ]
 Height = Annotated[model.Position | None, _unless_foreign(_is_number)]
-Frame = Annotated[model.Text | None, _unless_foreign(lambda given: isinstance(given, str))]
+Frame = Annotated[
+    model.Text | None, _unless_foreign(lambda given: isinstance(given, str) and given != "")
+]
 
 
 class DetectionModel(_Model, title="Detection"):

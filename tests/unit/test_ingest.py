@@ -64,6 +64,13 @@ def test_an_unknown_field_named_like_one_of_ours_changes_nothing() -> None:
     assert isinstance(read.envelope, Envelope)
 
 
+def test_an_empty_frame_names_none() -> None:
+    """As an unset frame_id of ROS; logs had it before frames were read."""
+    assert accepted(envelope(frame="")).envelope.frame is None
+    assert accepted(envelope(frame=7)).envelope.frame is None
+    assert accepted(envelope(frame="odom")).envelope.frame == "odom"
+
+
 def test_an_envelope_without_a_pose_is_accepted() -> None:
     assert accepted(envelope(x=None)).envelope.map_x is None
     assert accepted(envelope(map_x=None, map_y=None, map_yaw=None)).envelope.map_x is None
