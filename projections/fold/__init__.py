@@ -9,7 +9,7 @@ from array import array
 from collections.abc import MutableSequence
 from typing import Any, Final, Literal, TypeAlias
 
-FOLD_VERSION: Final = 15
+FOLD_VERSION: Final = 16
 """To be raised with every change of the reducers that changes the map of some log: what was kept of
 the maps of another version, and databases with them, are made again."""
 
