@@ -12,14 +12,18 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from eventsrc.base.errors import MisuseError
-from eventsrc.base.text import counted, visible
+from eventsrc.base.text import advised, counted, visible
 from eventsrc.envelope import commands
 from eventsrc.envelope.commands import MAX_COMMAND_BYTES
-from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId, RunId
+from eventsrc.envelope.ingest import Accepted
+from eventsrc.envelope.model import MAX_POSITION_M, KeyframeId, Offset, RunId
 from eventsrc.envelope.trajectory import Trajectory, TrajectoryPose
+from eventsrc.log import LogReader
 from projections.fold.corrections import FrameJoin
 from projections.fold.pose_corrections import Pose, moved_by
 from projections.map.frames import frames_of
+from projections.map.parsing import parse_events
+from projections.map.view import MapView
 
 from .conflicts import check_run_in_map
 from .current import MapToEdit
@@ -195,6 +199,29 @@ def _joins_of(current: MapToEdit, run_id: str, span: Span) -> list[FrameJoin]:
     return joins[0] if joins else []
 
 
+def _own_frame(reader: LogReader, view: MapView) -> str | None:
+    """The name of the map's own frame, which is that of its first pose; None if it has none."""
+    first = next((each for each in view.keyframes if each.pose is not None), None)
+    if first is None:
+        return None
+    if joins := view.corrections.frame_joins(first.frame):
+        return joins[-1].into
+    (event,) = parse_events(list(reader.read(first.offset, Offset(first.offset + 1))))
+    return event.parsed.envelope.frame if isinstance(event.parsed, Accepted) else None
+
+
+def frames_of_runs(reader: LogReader, view: MapView) -> dict[RunId, set[str | None]]:
+    """The frames that the poses of each run are in after all joins: None is the map's own, the
+    others are held apart."""
+    own, found = _own_frame(reader, view), dict[RunId, set[str | None]]()
+    for keyframe in view.keyframes:
+        if keyframe.pose is not None:
+            joins = view.corrections.frame_joins(keyframe.frame)
+            frame = joins[-1].into if joins else keyframe.frame
+            found.setdefault(keyframe.run_id, set()).add(None if frame == own else frame)
+    return found
+
+
 def join_frames(
     current: MapToEdit,
     stamp: Stamp,
@@ -206,11 +233,13 @@ def join_frames(
 ) -> commands.JoinFrames:
     """One rigid transform of all keyframes in the map frame ``frame`` into the frame ``into``, None
     for the map's own. Raises MisuseError for a frame that is not held apart."""
-    there = frames_of(current.view)
+    there, own = frames_of(current.view), _own_frame(current.reader, current.view)
     apart = [each.frame for each in there if each.joined is None]
     names = f"held apart are {', '.join(map(visible, apart))}" if apart else "none is held apart"
+    # By its name, so that it stays that one where the first run in it is left out.
+    into = own if into is None else into
     for given in (frame, into):
-        if given is not None and given not in apart:
+        if given is not None and given not in apart and (given is frame or given != own):
             joined = any(each.frame == given for each in there)
             raise MisuseError(
                 f"frame {visible(given)}: {'joined already' if joined else 'no keyframe names it'},"
@@ -231,13 +260,28 @@ def by_alignment(
     dyaw: float,
 ) -> commands.CorrectPoses | commands.JoinFrames:
     """The move of a run into the frame of the run ``target``, or of another log: where it brings a
-    frame that is held apart to another one, of all that is in that frame."""
-    there = frames_of(current.view)
-    frame_of = {run: each.frame for each in there if each.joined is None for run in each.runs}
-    one, into = frame_of.get(RunId(run_id)), frame_of.get(RunId(target or ""))
-    is_run = any(run.run_id == target for run in current.view.runs)
-    if one is None or one == into or not is_run or span != Span(None, None):
+    frame that is held apart to another one, of all that is in that frame. Raises MisuseError for a
+    run in several frames, and for one of the map's own that would be moved to one held apart."""
+    there = frames_of_runs(current.reader, current.view)
+    if target not in there or span != Span(None, None):
         return by_transform(current, stamp, run_id, span, dx, dy, dyaw)
+    for run in (RunId(run_id), RunId(target)):
+        if len(frames := there.get(run, set())) > 1:
+            named = ", ".join(sorted(visible(each or "the map's own") for each in frames))
+            raise MisuseError(
+                f"{visible(run)} has keyframes in several frames, {named}: which is aligned cannot"
+                f" be told; `{advised('edit', current.reader.path, 'join-frames', 'FRAME')}` joins"
+                " one"
+            )
+    (one,), (into,) = there.get(RunId(run_id), {None}), there[RunId(target)]
+    if one == into:
+        return by_transform(current, stamp, run_id, span, dx, dy, dyaw)
+    if one is None:
+        raise MisuseError(
+            f"{visible(run_id)} is in the map's own frame, {visible(target)} in"
+            f" {visible(str(into))}, which is held apart: give them the other way round, --run"
+            f" {visible(target)} --to {visible(run_id)}"
+        )
     return join_frames(current, stamp, one, into, dx, dy, dyaw)
 
 

@@ -100,11 +100,9 @@ class Floors:
         # The floor of each group of things joined by command, by kind and number of the group.
         self._homes: dict[tuple[str, int], int] = {}
 
-    def enter(self, envelope: Envelope, stated: str | None) -> tuple[str | None, int]:
-        """The floor of an envelope with a pose, and its number; ``stated`` is the frame that it
-        named before any join."""
-        is_joined = envelope.frame is None and stated is not None  # to the map's, whatever that is
-        if not self._has_frame and not is_joined:
+    def enter(self, envelope: Envelope) -> tuple[str | None, int]:
+        """The floor of an envelope with a pose, and its number."""
+        if not self._has_frame:
             self.frame, self._has_frame = envelope.frame, True
         apart = None if envelope.frame == self.frame else envelope.frame
         floor = apart, floor_name(envelope, self._height_um)

@@ -160,7 +160,7 @@ class SemanticMap:
             deltas.append(RunSeen(offset, run, envelope.run_id, envelope.timestamp))
         keyframe = folded_ids.add_keyframe(run, envelope.keyframe_id, offset, digest)
         pose = pose_of(envelope)
-        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope, frame)
+        floor, ground = (None, 0) if pose is None else self.floors.enter(envelope)
         if is_corrected and self._anchors:
             anchor = Keyframe(envelope.run_id, envelope.keyframe_id)
             self._add_anchor(keyframe, anchor, None if pose is None else ground)

@@ -6,6 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from eventsrc.base.errors import MisuseError
+from eventsrc.envelope.commands import CorrectPoses, JoinFrames, RigidTransform
+from eventsrc.log import LogReader
+from projections.edit.correct_poses import Span, by_alignment
+from projections.edit.current import MapToEdit
+from projections.edit.make import Stamp
+from projections.fold.settings import Settings
 from projections.localize.align.matching import moved
 from tests.property.test_align import HERE, in_frame, jumped
 from tests.support.commands import Commands
@@ -159,6 +166,48 @@ def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
     assert np.abs(before - placed).max() > 0.5
     said = mapfold("merges", log, "--frames", "--objects", code=2)
     assert "are tables of their own; give one alone" in said.err
+
+
+def test_a_run_is_moved_with_the_frame_that_it_is_in_after_all_joins(mapfold: Commands) -> None:
+    """And never into one held apart alone, nor by one of several frames."""
+    runs = {"run-a": "a", "run-b": "b", "run-c": "c", "run-d": "d"}
+    here = [each | {"frame": f} for run, f in runs.items() for each in walk(6, run_id=run)]
+    log = write_log(mapfold.folder / "log", here + walk(6, run_id="run-d", first=6))
+    mapfold("edit", log, "join-frames", "c", "--into", "b", "--dx", "1", "--reason", "x")
+    with LogReader(log) as reader:
+        current = MapToEdit(reader, lambda _: Settings())
+
+        def moved_run(run: str, to: str | None) -> CorrectPoses | JoinFrames:
+            by = by_alignment(current, Stamp("id", "ann", ""), run, to, Span(None, None), 1, 2, 0.3)
+            assert by.transform == RigidTransform.of(1, 2, 0.3)
+            return by
+
+        to_map, same = moved_run("run-c", "run-a"), moved_run("run-b", "run-c")
+        assert isinstance(to_map, JoinFrames)
+        assert (to_map.frame, to_map.into) == ("b", "a")
+        assert isinstance(same, CorrectPoses)
+        assert isinstance(moved_run("run-b", "another log"), CorrectPoses)
+        with pytest.raises(MisuseError, match="the other way round, --run run-c --to run-a"):
+            moved_run("run-a", "run-c")
+        with pytest.raises(MisuseError, match="run-d has keyframes in several frames, d, the map"):
+            moved_run("run-d", "run-c")
+    mapfold("edit", log, "join-frames", "d", "--into", "a", "--reason", "x")
+    assert "join-frames d into a: dx=0 dy=0 dyaw=0" in mapfold("edits", log).out
+    said = mapfold("edit", log, "join-frames", "a", "--reason", "x", code=2)
+    assert "frame a: no keyframe names it, or the map's own; held apart are b" in said.err
+
+
+@pytest.mark.slow
+def test_frames_of_two_names_that_are_one_are_joined(mapfold: Commands) -> None:
+    """As of robots that are localised in one map and put their names before that of its frame."""
+    away = lines("b", HERE).replace('"run_id"', '"frame": "b", "run_id"')
+    log = log_of(mapfold, "log", lines("a", HERE), away)
+    said = mapfold("align", log, "--write")
+    assert "already in one frame, within " in said.out
+    assert ", under two names, which --write joins" in said.out
+    (frame,) = mapfold("merges", log, "--frames", "--json").json
+    assert not frame["held_apart"]
+    assert "under two names" not in mapfold("align", log).out
 
 
 @pytest.mark.slow

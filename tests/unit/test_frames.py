@@ -158,13 +158,21 @@ def test_a_fold_that_was_kept_goes_on_with_its_frames() -> None:
         assert state_bytes(again) == state_bytes(whole)
 
 
-def test_what_is_joined_to_the_map_does_not_name_its_frame() -> None:
-    """Where the first run is left out, later ones in its frame are in the map still."""
-    documents = drive("r", "a") + drive("s", "b") + drive("t", "a")
+def test_nothing_else_becomes_the_frame_that_one_was_joined_to() -> None:
+    """Where the first run is left out, later ones in its frame are in the map still, and others are
+    held apart still."""
+    documents = drive("r", "a") + drive("s", "b") + drive("c", "c") + drive("t", "a")
     forget = ForgetRun(command_id="f", issued_by="ann", run_id=RunId("r"))
-    found = fold(documents, joining("b", None, 0.0, 0.0), forget)
-    assert [each["place_id"] for each in map_of(found.view)["places"]] == ["s_p0"]
-    assert [each.frame for each in frames_of(found.view)] == ["b"]
+    found = fold(documents, joining("b", "a", 0.0, 0.0), forget)
+    assert [each["place_id"] for each in map_of(found.view)["places"]] == ["s_p0", "c_p0"]
+    assert [(each.frame, each.joined is None) for each in frames_of(found.view)] == [
+        ("b", False),
+        ("c", True),
+    ]
+    unnamed = drive("r", None) + drive("c", "c") + drive("s", "b") + drive("t", None)
+    for runs in (unnamed, unnamed[16:] + unnamed[8:16]):
+        found = fold(runs, joining("b", None, 0.0, 0.0))
+        assert [each.frame for each in frames_of(found.view) if each.joined is None] == ["c"]
 
 
 def test_a_join_that_moves_a_pose_out_of_the_map_is_named() -> None:

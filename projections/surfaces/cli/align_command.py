@@ -12,10 +12,9 @@ from eventsrc.base.progress import reported
 from eventsrc.base.text import counted, visible
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
-from projections.edit.correct_poses import Span, by_alignment
+from projections.edit.correct_poses import Span, by_alignment, frames_of_runs
 from projections.edit.make import Stamp
 from projections.edit.record import Made, record_command, recorded_document
-from projections.map.frames import frames_of
 from projections.map.parsing import read_corrections
 from projections.map.view import MapView
 from projections.store.history_recorder import map_after
@@ -35,6 +34,7 @@ _NAMED = 5
 _SEVERAL = 3
 """Runs of a log that are all aligned, where none is named."""
 _EVERYWHERE = Span(None, None)
+_TWO_NAMES = ", under two names, which --write joins"
 _NO_JUMP = "no step in a run of 20 keyframes or more is larger than usual: no frame jumped"
 
 
@@ -77,6 +77,7 @@ class _Frames(CachedLog):
 
         with self.opened() as opened:
             frame, moved, target, runs = self._maps(opened)
+            there = self._of_runs(opened)
         first, second = things_of_map(frame), things_of_map(moved)
         if first is None or second is None:
             bare = visible(target) if first is None else ", ".join(map(visible, runs))
@@ -90,8 +91,11 @@ class _Frames(CachedLog):
             from projections.adapters.drawing.merge_picture import draw_alignment
 
             draw_alignment(frame, moved, found, picture, title)
-        is_to_move = found is not None and not found.is_one_frame
-        text = f"{title}: {decision_text(found)}{_pair_lines(found)}"
+        is_apart = any(there.get(run) != there.get(RunId(target), there.get(run)) for run in runs)
+        is_to_move = found is not None and (is_apart or not found.is_one_frame)
+        text = f"{title}: {decision_text(found)}"
+        text += _TWO_NAMES if is_apart and found is not None and found.is_one_frame else ""
+        text += _pair_lines(found)
         about = {"runs": runs, "to": target}
         reason = f"aligned to {target}"
         return _proposed(runs, _EVERYWHERE, found, is_to_move, text, reason, about)
@@ -122,16 +126,22 @@ class _Frames(CachedLog):
             runs = [run.run_id for run in self._view(opened).runs]
             if len(runs) < _SEVERAL:
                 return None
-            maps = maps_of_runs(reader, end, corrections, settings, runs)
+            maps, there = (
+                maps_of_runs(reader, end, corrections, settings, runs),
+                self._of_runs(opened),
+            )
         made = {run: things_of_map(each) for run, each in maps.items()}
         placed, against = align_runs({run: each for run, each in made.items() if each is not None})
+        apart = {each.run for each in placed if there.get(each.run) != there.get(each.frame)}
         proposals = [
             _Proposal(
                 [each.run],
                 _EVERYWHERE,
                 each.verdict,
-                None if each.is_one_frame or each.verdict == "unknown" else each.transform,
-                str(each),
+                each.transform
+                if each.verdict != "unknown" and (each.run in apart or not each.is_one_frame)
+                else None,
+                f"{each}{_TWO_NAMES}" if each.run in apart and each.is_one_frame else str(each),
                 f"aligned to {each.frame} by {counted(each.pairs, 'pair')} of runs",
                 each.document(),
             )
@@ -153,11 +163,13 @@ class _Frames(CachedLog):
         ]
         return proposals, against
 
-    def held_apart(self) -> dict[RunId, str]:
-        """The frame of each run in one that is held apart."""
+    def of_runs(self) -> dict[RunId, set[str | None]]:
+        """The frames that each run is in; see `frames_of_runs`."""
         with self.opened() as opened:
-            there = frames_of(self._view(opened))
-        return {run: each.frame for each in there if each.joined is None for run in each.runs}
+            return self._of_runs(opened)
+
+    def _of_runs(self, opened: OpenLog) -> dict[RunId, set[str | None]]:
+        return frames_of_runs(opened[0], self._view(opened))
 
     def _view(self, opened: OpenLog) -> MapView:
         reader, end, _, corrections, settings = opened
@@ -272,14 +284,14 @@ def align(
     if write:
         usable = [each for each in left if each.verdict in wanted]
         left = [each for each in left if each.verdict not in wanted]
-        held, joined = frames.held_apart(), set[str | None]()
+        there, joined = frames.of_runs(), set[str | None]()
         for proposal, run in ((each, run) for each in usable for run in each.runs):
-            if held.get(run) in joined:
+            if there.get(run, set()) & joined:
                 say(f"{visible(run)}: moved with its frame, which is joined already")
                 continue
             made = _record(frames, zenoh, run, proposal, who)
             if made.command.kind == "join-frames":
-                joined.add(held[run])
+                joined.add(made.command.frame)
             recorded.append(recorded_document(made))
             if not json_:
                 display(recorded_text(made))
