@@ -125,7 +125,8 @@ class GoalGround:
     ) -> GoalPose:
         """The goal of an Object. Raises MisuseError for none."""
         since = found.relocations[-1].offset if found.relocations else 0
-        seen = [k for k in view.sightings(found) if k.pose is not None and k.offset >= since]
+        ever = [k for k in view.sightings(found) if k.pose is not None]
+        seen, floors = [k for k in ever if k.offset >= since], {k.floor for k in ever}
         distances = sorted(math.dist(_spot(keyframe), found.spot) for keyframe in seen)
         usual = distances[len(distances) // 2] if distances else _RINGS[0]
         for ground, candidates in (
@@ -141,6 +142,8 @@ class GoalGround:
                 off = abs(distance - (_BEST_M if is_seen else usual))
                 rank = round(worse + off * _A_METRE, 3), number
                 if distance < _LEAST_M or (best is not None and rank >= best):
+                    continue
+                if floor not in floors:
                     continue
                 if not self._is_clear(floor, spot, clearance_m, is_driven=ground != "free"):
                     continue

@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+import pytest
 
+from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.model import DetId, KeyframeId, Offset, RunId
 from eventsrc.envelope.occupancy_map import UNKNOWN, OccupancyMap
 from projections.ask.goal_pose import GoalGround, GoalPose
@@ -23,6 +25,8 @@ from projections.map.records import (
     ObservationRecord,
 )
 from projections.map.view import MapView
+from tests.support.envelopes import detection, envelope
+from tests.support.folds import Folded
 
 OFTEN = [(3.0 + 0.1 * step, 0.0) for step in range(4)]
 """Spots beside each other, with the thing at the origin."""
@@ -108,3 +112,17 @@ def test_a_goal_on_ground_that_no_robot_drove_keeps_away_from_unknown_ground() -
     goal = goal_of([(0.3, 0.0)], walls=given)
     assert goal.ground == "free"
     assert goal.x + 0.3 <= 0.4
+
+
+def test_a_goal_is_on_a_floor_or_in_a_frame_from_which_the_thing_was_seen() -> None:
+    """Not where a robot drove on another one, which the same coordinates do not tell."""
+    cup = [detection("cup", [1.0, 0.0, 0.0], depth_m=0.3, bbox=(300, 180, 340, 220))]
+    ways = [envelope(number, number / 2, 0.0, run_id="r") for number in range(8)]
+    for apart in ({"floor": "upper"}, {"frame": "b"}):
+        beside = envelope(0, 1.5, 0.3, run_id="s", detections=cup, **apart)
+        view = (
+            Folded.start(Settings(places="rooms", fusion="evidence")).extend([*ways, beside]).view
+        )
+        (thing,) = view.objects.values()
+        with pytest.raises(MisuseError, match="no pose from which cup"):
+            GoalGround(view).goal(view, thing)
