@@ -251,11 +251,7 @@ def retain_log(
         entry = entries.get(segment.base)
         if entry is None:
             break  # not archived yet
-        if file_sha256(segment.path) != entry.sha256:
-            raise ArchiveError(
-                f"{segment.path} is not archived as it is here; run"
-                f" `{advised('log', 'archive', log, place.url)}`"
-            )
+        _check_same(log, archive, segment, entry)
         archive.check(entry)
         _let_go(log, archive, segment, entry)
         gone, gone_bytes = gone + 1, gone_bytes + length
@@ -271,10 +267,22 @@ def _last_logged_ns(segment: names.SegmentPath) -> int:
         file.close()
 
 
+def _check_same(
+    log: Path, archive: Archive, segment: names.SegmentPath, entry: ManifestEntry
+) -> None:
+    if file_sha256(segment.path) != entry.sha256:
+        raise ArchiveError(
+            f"{segment.path} is not archived as it is here; run"
+            f" `{advised('log', 'archive', log, archive.store.url)}`"
+        )
+
+
 def _let_go(log: Path, archive: Archive, segment: names.SegmentPath, entry: ManifestEntry) -> None:
-    """Replace a segment by a file that stands for it."""
+    """Replace a segment by a file that stands for it, unless it was redacted meanwhile: what was
+    erased would come back."""
     path = _away_path(log, entry)
     with place_locked(log):
+        _check_same(log, archive, segment, entry)
         note_archive_place(log, archive.store.url, {path.name: entry.object})
         file = SealedFile(segment.path, segment.base)
         try:

@@ -41,7 +41,7 @@ from eventsrc.envelope.system_events import REDACTED_KEY, REDACTION_KEY
 
 from . import format as names
 from . import mcap_records as _mcap
-from .archive_place import refuse_away
+from .archive_place import place_locked, refuse_away
 from .channels import key_channel, schema_of
 from .durable_files import replace_durably, sync_directory, sync_file, write_all
 from .event import Event, event_hash
@@ -139,11 +139,12 @@ class Pending:
 
     def replace_segments(self) -> None:
         """Put the new segments in the place of the old ones; durable when this returns."""
-        for name in self._segments:
-            staged = staging_folder(self._log) / name
-            if staged.is_file() and not staged.is_symlink():
-                staged.replace(self._log / name)
-        sync_directory(self._log)
+        with place_locked(self._log):
+            for name in self._segments:
+                staged = staging_folder(self._log) / name
+                if staged.is_file() and not staged.is_symlink():
+                    staged.replace(self._log / name)
+            sync_directory(self._log)
 
     def missing(self, next_offset: Offset) -> list[bytes]:
         """The events still to be appended to a log that ends at ``next_offset``."""

@@ -27,7 +27,7 @@ from eventsrc.base.errors import (
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.envelope.model import Offset
 from eventsrc.log import LogReader, LogWriter, verify_log
-from eventsrc.log.archive import Archive, Archived, archive_log
+from eventsrc.log.archive import Archive, Archived, ManifestEntry, archive_log
 from eventsrc.log.archive_place import archive_place, note_archive_place, place_locked
 from eventsrc.log.away import archived_log, restore_log, retain_log
 from eventsrc.log.redact import Redactor
@@ -421,6 +421,23 @@ def test_nothing_goes_that_the_archive_has_not(log: Path, url: str, tmp_path: Pa
     (tmp_path / "an archive").rename(tmp_path / "unplugged")
     with pytest.raises(NoSuchObject, match="no such folder"):
         retain_log(log, keep_bytes=0)
+
+
+def test_a_segment_redacted_while_its_archived_one_is_read_stays(
+    log: Path, url: str, tmp_path: Path
+) -> None:
+    """What was erased would come back from the archive."""
+    archived(log, url)
+    real = Archive.check
+
+    def redacts(archive: Archive, entry: ManifestEntry) -> None:
+        real(archive, entry)
+        Commands.in_folder(tmp_path)("log", "redact", log, "--run", "run-a", "--reason", "a test")
+
+    with patch.object(Archive, "check", redacts), pytest.raises(ArchiveError, match="as it is her"):
+        retain_log(log, keep_bytes=0)
+    assert list(log.glob("*.away")) == []
+    assert verify_log(log).findings == ()
 
 
 def test_a_part_of_a_log_is_restored(log: Path, url: str, tmp_path: Path) -> None:
