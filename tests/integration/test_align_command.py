@@ -45,7 +45,8 @@ def test_a_run_is_brought_into_the_frame_of_the_first(mapfold: Commands) -> None
     apart = mapfold("state", log, "--json").json["counts"]
     said = mapfold("align", log, "--picture", "both.png")
     assert said.out.startswith("sim-7-b into the frame of sim-7-a: moved by (")
-    assert "nothing is written; --write records" in said.err
+    assert "nothing is recorded; --write records" in said.err
+    assert "both maps are in both.png" in said.err
     assert (mapfold.folder / "both.png").read_bytes().startswith(b"\x89PNG")
     told = mapfold("align", log, "--run", "sim-7-b", "--to", "sim-7-a", "--write", "--json").json
     assert (told["verdict"], told["runs"], told["to"]) == ("sure", ["sim-7-b"], "sim-7-a")
@@ -77,7 +78,7 @@ def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> Non
     said = mapfold("align", log, "--write", code=3)
     assert "sim-3-a into the frame of sim-7-a: moved by (" in said.out
     assert "but not surely" in said.out
-    assert "nothing is written; --write --yes records" in said.err
+    assert "nothing is recorded; --write --yes records" in said.err
     assert "correct-poses" not in mapfold("edits", log).out
     mapfold("align", log, "--write", "--yes")
     assert mapfold("edits", log).out.count("correct-poses") == 1
@@ -112,7 +113,7 @@ def test_the_tail_behind_a_jump_is_brought_back(mapfold: Commands) -> None:
     said = mapfold("align", log, "--jumps", code=3)
     assert said.out.startswith("sim-7-a: a step of ")
     assert "from there to the end moved by (" in said.out
-    assert "nothing is written; --write records" in said.err
+    assert "nothing is recorded; --write records" in said.err
     told = mapfold("align", log, "--jumps", "--run", "sim-7-a", "--write", "--json").json
     (step,) = told["steps"]
     assert (step["jumped"], step["run"], step["last"]) == (True, "sim-7-a", None)
@@ -245,7 +246,9 @@ def test_runs_that_are_not_there_are_named_with_those_that_are(mapfold: Commands
 def test_a_log_of_one_run_has_none_to_move(mapfold: Commands) -> None:
     log = log_of(mapfold, "log", lines("a", HERE))
     said = mapfold("align", log, code=2)
-    assert "--run is missing: which run is to be moved? it has no other runs" in said.err
+    assert (
+        "has one run, sim-7-a: import another one into it, or name another log by --to" in said.err
+    )
 
 
 @pytest.mark.slow

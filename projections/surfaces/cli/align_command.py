@@ -91,6 +91,7 @@ class _Frames(CachedLog):
             from projections.adapters.drawing.merge_picture import draw_alignment
 
             draw_alignment(frame, moved, found, picture, title)
+            say(f"both maps are in {picture}")
         is_apart = any(there.get(run) != there.get(RunId(target), there.get(run)) for run in runs)
         is_to_move = found is not None and (is_apart or not found.is_one_frame)
         text = f"{title}: {decision_text(found)}"
@@ -211,9 +212,13 @@ class _Frames(CachedLog):
                 raise MisuseError(f"--run and --to are both {visible(target)}; give two runs")
             return self._known(runs, self.run)
         others = [run for run in runs if run != target]
-        if len(others) != 1:
-            asked = _runs(others) if others else "it has no other runs"
-            raise MisuseError(f"--run is missing: which run is to be moved? {asked}")
+        if not others:
+            raise MisuseError(
+                f"{self.log} has one run, {visible(target)}: import another one into it, or name"
+                " another log by --to"
+            )
+        if len(others) > 1:
+            raise MisuseError(f"--run is missing: which run is to be moved? {_runs(others)}")
         return others[0]
 
     def _known(self, runs: list[RunId], run: str) -> RunId:
@@ -304,7 +309,7 @@ def align(
     elif left:
         also = " --yes" if all(each.verdict == "likely" for each in left) else ""
         what = "what is not sure is not" if recorded else "nothing is"
-        say(f"{what} written; --write{also} records the correction of its poses")
+        say(f"{what} recorded; --write{also} records the correction of its poses")
     is_unknown = any(each.verdict == "unknown" for each in proposals)
     finish(findings=is_unknown or (bool(left) and (write or jumps)))
 

@@ -117,6 +117,7 @@ def _report_fold(done: int, total: int) -> None:
 def _follow(log: LogArgument, store: ObjectStore, *, fold: bool) -> None:
     """Archive each segment once it is sealed. A store that does not answer is asked again, ever
     more rarely: what is not archived stays in the log."""
+    say(f"following {log} until Ctrl-C: each segment is archived when it is sealed")
     folded, pause_s = FIRST_OFFSET, _POLL_S
     with stop_on_signals() as stop:
         while True:
