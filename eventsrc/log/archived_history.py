@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 import zstandard
 
-from eventsrc.base.errors import NoSuchObject
+from eventsrc.base.errors import ArchiveError, NoSuchObject
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.base.progress import report_progress
 from eventsrc.envelope.model import FIRST_OFFSET, Offset
@@ -44,7 +44,11 @@ _END: Final = b"mapfold1"
 _LENGTH_BYTES: Final = 8
 _TAIL_BYTES: Final = 8 * 1024
 """What is read of the end of an object first; the index of a short history takes less."""
-_MOST_INDEX_BYTES: Final = 64 * 1024 * 1024
+_ALLOWED_BYTES: Final = 64 * 1024 * 1024
+_MOST_RATIO: Final = 1000
+"""An index unpacks to at most `_ALLOWED_BYTES`, and a file to at most these or `_MOST_RATIO` times
+its object: what says more would take terabytes here. Those measured unpack to five times."""
+_MOST_NUMBER_BYTES: Final = 8
 _AT_ONCE: Final = 32 * 1024
 """Bytes that a request fetches of the spans behind the one that is asked for, if these are short:
 what is read with it mostly lies behind it."""
@@ -70,6 +74,9 @@ class _Index(msgspec.Struct, frozen=True):
             raise ValueError("its spans are not end to end")
         if min(*self.lengths, *self.number_bytes) < 1:
             raise ValueError("it has a span of no bytes")
+        most = max(_ALLOWED_BYTES, _MOST_RATIO * sum(self.lengths))
+        if self.size > most or max(self.number_bytes) > _MOST_NUMBER_BYTES:
+            raise ValueError("it is of more than such an object holds")
 
     def end(self, number: int) -> int:
         """Where a span ends in the file."""
@@ -81,7 +88,8 @@ def _unpack_into(index: _Index, data: bytes, spans: range, file: BinaryIO) -> No
     at = 0
     for number in spans:
         start, length = index.starts[number], index.lengths[number]
-        raw = _unpacked(data[at : at + length], index.end(number) - start)
+        size = index.end(number) - start
+        raw = _unpacked(data[at : at + length], size, size)
         file.seek(start)
         file.write(_by_number(raw, index.number_bytes[number]))
         at += length
@@ -149,9 +157,9 @@ def _by_number(raw: bytes, width: int) -> bytes:
     return np.frombuffer(raw[:whole], np.uint8).reshape(width, -1).T.tobytes() + raw[whole:]
 
 
-def _unpacked(data: bytes, size: int) -> bytes:
+def _unpacked(data: bytes, least: int, most: int) -> bytes:
     try:
-        if zstandard.frame_content_size(data) == size:  # else it may say that it takes terabytes
+        if least <= zstandard.frame_content_size(data) <= most:  # else it may say terabytes
             return zstandard.ZstdDecompressor().decompress(data)
     except zstandard.ZstdError:
         pass
@@ -160,20 +168,34 @@ def _unpacked(data: bytes, size: int) -> bytes:
 
 def _read_index(store: ObjectStore, name: str, size: int) -> _Index:
     """The index of a packed object of ``size`` bytes. Raises ArchiveError, _Damaged."""
-    tail = store.part(name, max(0, size - _TAIL_BYTES), size)
+    if size < len(_END) + _LENGTH_BYTES:
+        raise _Damaged
+    tail = _part(store, name, max(0, size - _TAIL_BYTES), size)
     length = int.from_bytes(tail[-len(_END) - _LENGTH_BYTES : -len(_END)], "little")
     start = size - len(_END) - _LENGTH_BYTES - length
     if not tail.endswith(_END) or start < 0:
         raise _Damaged
     if start < size - len(tail):
-        tail = store.part(name, start, size)
+        tail = _part(store, name, start, size)
     data = tail[len(tail) - (size - start) :][:length]
-    with contextlib.suppress(msgspec.MsgspecError, zstandard.ZstdError):
-        found = zstandard.ZstdDecompressor().decompress(data, _MOST_INDEX_BYTES)
-        index = msgspec.json.decode(found, type=_Index)
+    with contextlib.suppress(msgspec.MsgspecError):
+        index = msgspec.json.decode(_unpacked(data, 0, _ALLOWED_BYTES), type=_Index)
         if sum(index.lengths) == start:
             return index
     raise _Damaged
+
+
+def _part(store: ObjectStore, name: str, start: int, end: int) -> bytes:
+    """Bytes ``start`` to before ``end`` of an object. Raises ArchiveError, _Damaged if it has been
+    cut off since it was listed."""
+    try:
+        return store.part(name, start, end)
+    except NoSuchObject:
+        raise
+    except ArchiveError:
+        if store.sizes(KEPT).get(name, 0) < end:
+            raise _Damaged from None
+        raise
 
 
 def restore_kept(log: Path, archive: Archive, end: Offset) -> None:
@@ -244,7 +266,7 @@ def fetch_kept(path: Path, start: int, end: int | None = None) -> bool:
     while last < len(index.starts) and at[last + 1] - at[first] <= _AT_ONCE:
         last += 1
     with contextlib.suppress(NoSuchObject, _Damaged):
-        data = ObjectStore(stand.url).part(stand.object, at[first], at[last])
+        data = _part(ObjectStore(stand.url), stand.object, at[first], at[last])
         with path.open("r+b") as file:
             _unpack_into(index, data, range(first, last), file)
     return True

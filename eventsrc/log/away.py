@@ -340,18 +340,19 @@ def _fetch_segments(
 
 
 def fetch_segment(archive: Archive, entry: ManifestEntry, path: Path) -> None:
-    """Write an archived segment durably to ``path``, all of it or nothing. Raises ArchiveError."""
-    temporary = names.segment_path(path.parent, Offset(entry.base), names.SEALING)
+    """Write an archived segment durably to ``path``, all of it or nothing; one that came there
+    meanwhile stays. Raises ArchiveError."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{names.SEALING}")
     unlink_quietly(temporary)
     fd = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
     try:
         archive.write_checked(entry, fd)
         sync_file(fd)
-        replace_durably(temporary, path)
-    except BaseException:
-        unlink_quietly(temporary)
-        raise
+        with place_locked(path.parent):
+            if not path.exists():
+                replace_durably(temporary, path)
     finally:
+        unlink_quietly(temporary)
         os.close(fd)
 
 

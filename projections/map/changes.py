@@ -58,7 +58,7 @@ class FollowedRegions:
     def __init__(self) -> None:
         self.regions: dict[d.PlaceOrdinal, Region] = {}
         """As of the last call of `changed`."""
-        self._are_due = True
+        self._are_due = self._is_first = True
         self._changed: set[d.PlaceOrdinal] = set()
 
     def end_batch(self, *, may_differ: bool) -> None:
@@ -68,9 +68,12 @@ class FollowedRegions:
 
     def changed(self, view: MapView) -> set[d.PlaceOrdinal]:
         """The places whose region is another than after the last batch for which this was called;
-        at first all that have one."""
+        at first all on a map: what was written of them before may have other regions, or some."""
         if self._are_due:
             before, self.regions, self._are_due = self.regions, place_regions(view), False
+            if self._is_first and view.settings.places == "rooms" and view.maps_in_force():
+                self._changed.update(view.places)
+            self._is_first = False
             for place in before.keys() | self.regions.keys():
                 if before.get(place) != self.regions.get(place) and place in view.places:
                     self._changed.add(place)

@@ -33,6 +33,7 @@ from eventsrc.log.away import archived_log, restore_log, retain_log
 from eventsrc.log.redact import Redactor
 from eventsrc.log.verify import verify_archive
 from projections.fold.semantic_map import SemanticMap
+from projections.surfaces.cli import redact_command
 from tests.integration.test_kept_maps import nothing_is_folded
 from tests.integration.test_progress import reports_of
 from tests.property.test_timeline_cache import kept_early
@@ -547,6 +548,26 @@ def test_a_restore_killed_before_its_last_step_leaves_no_stand_in(
         Commands.in_folder(tmp_path)("log", "redact", log, "--run", "run-a", "--reason", "a test")
     assert list(log.glob("*.away")) == []
     assert verify_log(log).findings == ()
+
+
+def test_what_is_redacted_while_it_is_restored_stays_so(log: Path, url: str) -> None:
+    """By two who restore it at once; their half-made files are not one."""
+    archived(log, url)
+    retain_log(log, keep_bytes=0)
+    real, left = Archive.write_checked, [Archive(ObjectStore(url))]
+
+    def after_another(*given: Any) -> None:
+        if left:
+            restore_log(left.pop(), log)
+            redact_command.redact(log, run=["run-a"], reason="a test")
+        real(*given)
+
+    other = pytest.raises(LogError, match="differs from the archived one")
+    with patch.object(Archive, "write_checked", after_another), other:
+        restore_log(Archive(ObjectStore(url)), log)
+    assert verify_log(log).findings == ()
+    assert not [each for each in read_log(log) if each.key == KEY]
+    assert not list(log.glob("*.sealing"))
 
 
 def test_a_false_place_of_an_index_is_found(log: Path, url: str, tmp_path: Path) -> None:

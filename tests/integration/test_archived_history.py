@@ -1,6 +1,7 @@
 """The kept history of an archived log: read by ranges, of which few are needed, and folded again
 where it is damaged or gone."""
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,12 +9,13 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+import zstandard
 
 from eventsrc.base.errors import ArchiveError
 from eventsrc.base.object_store import ObjectStore
 from eventsrc.log import LogReader, LogWriter, cache_folder
 from eventsrc.log.archive import Archive
-from eventsrc.log.archived_history import archive_kept
+from eventsrc.log.archived_history import archive_kept, stand_for_kept
 from eventsrc.log.away import archived_log, restore_log
 from projections.fold.semantic_map import SemanticMap
 from projections.fold.settings import Settings
@@ -121,6 +123,47 @@ def test_a_damaged_history_is_folded_again(at: int | None, url: str, tmp_path: P
     assert any("is folded again" in each for each in said) == (at is None)
     restore_log(Archive(ObjectStore(url)), tmp_path / "back")  # without it
     assert answer(tmp_path / "back") == found
+
+
+def _sized(size: int, width: int) -> bytes:
+    """An object of one span that says so of the file and its numbers."""
+    index = {"size": size, "starts": [0], "lengths": [1], "number_bytes": [width]}
+    return b"x" + _ended(zstandard.compress(json.dumps(index).encode()))
+
+
+def _ended(index: bytes) -> bytes:
+    return index + len(index).to_bytes(8, "little") + b"mapfold1"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        _sized(10**17, 1),
+        _sized(2**70, 1),
+        _sized(9, 2**70),
+        _ended(b"\x28\xb5\x2f\xfd\xe0" + (2**50).to_bytes(8, "little") + b"\x01\x00\x00"),
+    ],
+    ids=["empty", "file", "long", "number", "index"],
+)
+def test_what_says_that_it_takes_terabytes_is_left_out(
+    content: bytes, url: str, tmp_path: Path
+) -> None:
+    for path in packed(tmp_path):
+        path.write_bytes(content)
+    log = archived_log(url, tmp_path / "home")
+    stand_for_kept(log)
+    assert not list(cache_folder(log).iterdir())
+    restore_log(Archive(ObjectStore(url)), tmp_path / "back")
+    assert not list(cache_folder(tmp_path / "back").glob("*.npz"))
+
+
+def test_what_is_cut_off_after_it_was_listed_is_folded_again(url: str, tmp_path: Path) -> None:
+    stand_for_kept(archived_log(url, tmp_path / "home"))
+    for path in packed(tmp_path):
+        path.write_bytes(path.read_bytes()[:100])
+    log = archived_log(url, tmp_path / "home")
+    assert map_digest(map_of(log, str)) == answer(tmp_path / "log")
 
 
 def test_a_history_that_the_archiver_replaced_is_taken_anew(url: str, tmp_path: Path) -> None:

@@ -57,6 +57,18 @@ def test_tail_rebuild_and_check_agree(tmp_path: Path, one_database: Targets, pla
     assert [r.differing for r in check(log, one_database, settings)] == [0, 0]
 
 
+def test_a_region_that_a_later_map_takes_away_goes_from_the_rows(
+    tmp_path: Path, one_database: Targets
+) -> None:
+    """Also where a tail was started in between, which has not written the region itself."""
+    log, settings = _log(tmp_path / "log", ROOMS.encode()), Settings(places="rooms")
+    tail(log, one_database, settings, once=True)
+    with LogWriter(log) as writer:
+        writer.append(MAP_KEY, drawn_map("### #.# ###", 1.0, (-90.0, 0.0, 0.0)).encode())
+    tail(log, one_database, settings, once=True)
+    assert [r.differing for r in check(log, one_database, settings)] == [0, 0]
+
+
 @pytest.mark.parametrize("size", [1, 3])
 def test_regions_in_rows_follow_keyframes_of_other_places(tmp_path: Path, size: int) -> None:
     """A pose takes floor from places that its event does not name."""
