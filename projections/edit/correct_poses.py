@@ -147,6 +147,10 @@ def by_trajectory(
     if not laid.poses:
         raise MisuseError(_nothing_laid(trajectory, keyframes, slack_s))
     _note_left(note, run_id, trajectory, laid, slack_s)
+    joined = current.corrections.frames.keys() & {k.frame for k in current.run(run_id)}
+    if joined:
+        names = ", ".join(visible(str(frame)) for frame in sorted(joined))
+        note(f"{trajectory.name}: read as poses in frame {names}, which join-frames moves then")
     command = build(commands.CorrectPoses, stamp, run_id=run_id, poses=laid.poses)
     size = len(commands.encode_command(command))
     if size > MAX_COMMAND_BYTES:

@@ -165,6 +165,9 @@ def test_frames_are_listed_and_joined_by_a_command(mapfold: Commands) -> None:
     mapfold("edit", log, "correct-poses", "run-b", *move, "--reason", "z")
     assert np.abs(moved(placed, (1.0, 2.0, 0.3)) - poses_of_b(mapfold, log)).max() < 1e-5
     assert np.abs(before - placed).max() > 0.5
+    (mapfold.folder / "poses.csv").write_text("keyframe_id,x,y,yaw\n0,1,2,0\n")
+    said = mapfold("edit", log, "correct-poses", "run-b", "poses.csv", "--reason", "z")
+    assert "poses.csv: read as poses in frame b, which join-frames moves then" in said.err
     said = mapfold("merges", log, "--frames", "--objects", code=2)
     assert "are tables of their own; give one alone" in said.err
 
