@@ -72,6 +72,15 @@ def test_a_log_is_brought_into_the_frame_of_another(mapfold: Commands) -> None:
 
 
 @pytest.mark.slow
+def test_a_log_is_compared_by_what_is_in_the_frame_of_its_map(mapfold: Commands) -> None:
+    """A run that it holds apart would be a second place that looks alike."""
+    apart = lines("b", (3.0, -4.0, 1.0)).replace('"run_id"', '"frame": "b", "run_id"')
+    frame = log_of(mapfold, "frame", lines("a", HERE), apart)
+    log = log_of(mapfold, "log", lines("b", FRAME))
+    assert "moved by (" in mapfold("align", log, "--to", frame).out
+
+
+@pytest.mark.slow
 def test_what_is_not_sure_is_not_written_without_a_yes(mapfold: Commands) -> None:
     """Two houses whose furniture happens to agree in part; and one with a part of a drive."""
     log = log_of(mapfold, "log", lines("a", HERE), lines("a", HERE, seed=3))

@@ -16,7 +16,7 @@ from eventsrc.base.text import counted, table, visible
 from eventsrc.envelope.model import RunId
 from eventsrc.log import LogReader
 from projections.localize.align.alignment import Alignment, align
-from projections.localize.align.framed_things import FramedThings, map_of_runs, things_of_map
+from projections.localize.align.framed_things import FramedThings, own_map, things_of_map
 from projections.localize.align.several import Contradiction, PlacedRun, RunPair, placed_runs
 from projections.map.parsing import read_corrections
 
@@ -35,12 +35,12 @@ class SiteThings(NamedTuple):
 
 
 def things_of_site(site: Site, progress: Progress) -> SiteThings:
-    """The things of one site's map, folded by evidence, its runs in the frames that they have."""
+    """The things of one site's map, folded by evidence: of the runs in its own frame."""
     try:
         with LogReader(site.log) as reader:
             known = read_corrections(reader, reader.next_offset)
             settings = ChosenSettings().of(known)
-            view = map_of_runs(reader, reader.next_offset, known, settings, ())
+            view = own_map(reader, reader.next_offset, known, settings)
             progress(int(reader.next_offset))
     except (MapfoldError, OSError) as error:
         return SiteThings(None, error_text(error, site))

@@ -23,6 +23,7 @@ from projections.fold.sights import camera_of
 from projections.localize.relocalize.camera import Cameras, box_rows, camera_values, sights
 from projections.localize.relocalize.candidates import ExactIndex
 from projections.map.fold import fold_log, fold_parsed, new_map, read_ahead
+from projections.map.frames import frames_of
 from projections.map.parsing import parsed_stretches
 from projections.map.records import EstimatedPosition, KeyframeRecord, ObjectRecord
 from projections.map.view import MapView
@@ -96,6 +97,16 @@ def map_of_runs(
             forgotten_ranges=ranges,
         ),
     )[1]
+
+
+def own_map(
+    reader: LogReader, end: Offset, corrections: Corrections, settings: Settings
+) -> MapView:
+    """The map by evidence of the runs that are in its own frame: one held apart would be a second
+    place that looks alike."""
+    view = map_of_runs(reader, end, corrections, settings, ())
+    apart = {run for each in frames_of(view) if each.joined is None for run in each.runs}
+    return map_of_runs(reader, end, corrections, settings, apart) if apart else view
 
 
 def maps_of_runs(

@@ -181,7 +181,7 @@ class _Frames(CachedLog):
     def _maps(self, opened: OpenLog) -> tuple[MapView, MapView, str, list[RunId]]:
         """The map of the frame, the map to move, what the frame is called, the runs to move.
         Raises MisuseError for a run that the log does not have."""
-        from projections.localize.align.framed_things import map_of_runs
+        from projections.localize.align.framed_things import map_of_runs, own_map
 
         reader, end, _, corrections, settings = opened
         runs = [run.run_id for run in self._view(opened).runs]
@@ -197,7 +197,7 @@ class _Frames(CachedLog):
             with LogReader(Path(target)) as other:
                 known = read_corrections(other, other.next_offset)
                 own = settings_from(None, None, known)
-                frame = map_of_runs(other, other.next_offset, known, own, ())
+                frame = own_map(other, other.next_offset, known, own)
         else:
             raise MisuseError(
                 f"--to {visible(target)}: neither a run of {self.log} nor a log; {_runs(runs)}"
