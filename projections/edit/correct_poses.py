@@ -8,7 +8,7 @@ extrapolated: a keyframe before the first or after the last pose takes that one 
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from eventsrc.base.errors import MisuseError
@@ -23,6 +23,7 @@ from projections.fold.corrections import FrameJoin
 from projections.fold.pose_corrections import Pose, moved_by
 from projections.map.frames import frames_of
 from projections.map.parsing import parse_events
+from projections.map.records import KeyframeRecord
 from projections.map.view import MapView
 
 from .conflicts import check_run_in_map
@@ -214,15 +215,22 @@ def _own_frame(reader: LogReader, view: MapView) -> str | None:
     return event.parsed.envelope.frame if isinstance(event.parsed, Accepted) else None
 
 
-def frames_of_runs(reader: LogReader, view: MapView) -> dict[RunId, set[str | None]]:
-    """The frames that the poses of each run are in after all joins: None is the map's own, the
-    others are held apart."""
-    own, found = _own_frame(reader, view), dict[RunId, set[str | None]]()
+def _frames(reader: LogReader, view: MapView) -> Iterator[tuple[KeyframeRecord, str | None]]:
+    """Each keyframe with a pose, and the frame that it is in after all joins."""
+    own = _own_frame(reader, view)
     for keyframe in view.keyframes:
         if keyframe.pose is not None:
             joins = view.corrections.frame_joins(keyframe.frame)
             frame = joins[-1].into if joins else keyframe.frame
-            found.setdefault(keyframe.run_id, set()).add(None if frame == own else frame)
+            yield keyframe, None if frame == own else frame
+
+
+def frames_of_runs(reader: LogReader, view: MapView) -> dict[RunId, set[str | None]]:
+    """The frames that the poses of each run are in after all joins: None is the map's own, the
+    others are held apart."""
+    found = dict[RunId, set[str | None]]()
+    for keyframe, frame in _frames(reader, view):
+        found.setdefault(keyframe.run_id, set()).add(frame)
     return found
 
 
@@ -264,8 +272,19 @@ def by_alignment(
     dyaw: float,
 ) -> commands.CorrectPoses | commands.JoinFrames:
     """The move of a run into the frame of the run ``target``, or of another log: where it brings a
-    frame that is held apart to another one, of all that is in that frame. Raises MisuseError for a
-    run in several frames, and for one of the map's own that would be moved to one held apart."""
+    frame that is held apart to another one, of all that is in that frame. So too for a ``span`` of
+    a run that is in a frame which the rest of it is not. Raises MisuseError for a run in several
+    frames, and for one of the map's own that would be moved to one held apart."""
+    if span != Span(None, None):
+        of_run = [
+            (span.has(each.keyframe_id), frame)
+            for each, frame in _frames(current.reader, current.view)
+            if each.run_id == run_id
+        ]
+        inside, rest = ({f for is_in, f in of_run if is_in is side} for side in (True, False))
+        only = next(iter(inside)) if len(inside) == 1 else None
+        if only is not None and rest == {None}:
+            return join_frames(current, stamp, only, None, dx, dy, dyaw)
     there = frames_of_runs(current.reader, current.view)
     if target not in there or span != Span(None, None):
         return by_transform(current, stamp, run_id, span, dx, dy, dyaw)

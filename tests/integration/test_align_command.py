@@ -8,6 +8,7 @@ import pytest
 
 from eventsrc.base.errors import MisuseError
 from eventsrc.envelope.commands import CorrectPoses, JoinFrames, RigidTransform
+from eventsrc.envelope.model import KeyframeId
 from eventsrc.log import LogReader
 from projections.edit.correct_poses import Span, by_alignment
 from projections.edit.current import MapToEdit
@@ -20,6 +21,7 @@ from tests.support.logs import simulated, walk, write_log
 from tests.support.thorough import stride
 
 FRAME = (12.0, -7.0, 2.1)
+WHOLE = Span(None, None)
 CAMERA = {"hfov_deg": 69.4, "width_px": 640, "height_px": 400}
 
 
@@ -190,8 +192,8 @@ def test_a_run_is_moved_with_the_frame_that_it_is_in_after_all_joins(mapfold: Co
     with LogReader(log) as reader:
         current = MapToEdit(reader, lambda _: Settings())
 
-        def moved_run(run: str, to: str | None) -> CorrectPoses | JoinFrames:
-            by = by_alignment(current, Stamp("id", "ann", ""), run, to, Span(None, None), 1, 2, 0.3)
+        def moved_run(run: str, to: str | None, span: Span = WHOLE) -> CorrectPoses | JoinFrames:
+            by = by_alignment(current, Stamp("id", "ann", ""), run, to, span, 1, 2, 0.3)
             assert by.transform == RigidTransform.of(1, 2, 0.3)
             return by
 
@@ -204,6 +206,11 @@ def test_a_run_is_moved_with_the_frame_that_it_is_in_after_all_joins(mapfold: Co
             moved_run("run-a", "run-c")
         with pytest.raises(MisuseError, match="run-d has keyframes in several frames, d, the map"):
             moved_run("run-d", "run-c")
+        jumped = moved_run("run-d", None, Span(None, KeyframeId(5)))  # a frame, not a jump in one
+        assert isinstance(jumped, JoinFrames)
+        assert (jumped.frame, jumped.into) == ("d", "a")
+        assert isinstance(moved_run("run-d", None, Span(KeyframeId(6), None)), CorrectPoses)
+        assert isinstance(moved_run("run-b", None, Span(None, KeyframeId(3))), CorrectPoses)
     mapfold("edit", log, "join-frames", "d", "--into", "a", "--reason", "x")
     assert "join-frames d into a: dx=0 dy=0 dyaw=0" in mapfold("edits", log).out
     said = mapfold("edit", log, "join-frames", "a", "--reason", "x", code=2)
