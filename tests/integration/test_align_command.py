@@ -14,10 +14,12 @@ from projections.edit.correct_poses import Span, by_alignment
 from projections.edit.current import MapToEdit
 from projections.edit.make import Stamp
 from projections.fold.settings import Settings
+from projections.localize.align.framed_things import own_map
 from projections.localize.align.matching import moved
+from projections.map.parsing import read_corrections
 from tests.property.test_align import HERE, in_frame, jumped
 from tests.support.commands import Commands
-from tests.support.logs import simulated, walk, write_log
+from tests.support.logs import append_command, join_frames, simulated, walk, write_log
 from tests.support.thorough import stride
 
 FRAME = (12.0, -7.0, 2.1)
@@ -215,6 +217,21 @@ def test_a_run_is_moved_with_the_frame_that_it_is_in_after_all_joins(mapfold: Co
     assert "join-frames d into a: dx=0 dy=0 dyaw=0" in mapfold("edits", log).out
     said = mapfold("edit", log, "join-frames", "a", "--reason", "x", code=2)
     assert "frame a: no keyframe names it, or the map's own; held apart are b" in said.err
+
+
+def test_a_run_in_two_frames_is_compared_by_its_keyframes_in_that_of_the_map(
+    tmp_path: Path,
+) -> None:
+    """Nor by those in a frame that is joined to one held apart."""
+    seen = walk(12, run_id="run-a")
+    log = write_log(
+        tmp_path / "log", [each | {"frame": "abc"[k % 3]} for k, each in enumerate(seen)]
+    )
+    append_command(log, join_frames("c", "b"))
+    with LogReader(log) as reader:
+        known = read_corrections(reader)
+        view = own_map(reader, reader.next_offset, known, Settings())
+    assert [each.keyframe_id for each in view.keyframes] == [0, 3, 6, 9]
 
 
 @pytest.mark.slow

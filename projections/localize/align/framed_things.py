@@ -102,11 +102,17 @@ def map_of_runs(
 def own_map(
     reader: LogReader, end: Offset, corrections: Corrections, settings: Settings
 ) -> MapView:
-    """The map by evidence of the runs that are in its own frame: one held apart would be a second
-    place that looks alike."""
+    """The map by evidence of the keyframes that are in its own frame: one held apart would be a
+    second place that looks alike. A run may have keyframes in both."""
     view = map_of_runs(reader, end, corrections, settings, ())
-    apart = {run for each in frames_of(view) if each.joined is None for run in each.runs}
-    return map_of_runs(reader, end, corrections, settings, apart) if apart else view
+    apart = {each.frame for each in frames_of(view) if each.joined is None}
+    ranges = dict[RunId, list[tuple[KeyframeId, KeyframeId]]]()
+    for each in view.keyframes:
+        joins = corrections.frame_joins(each.frame)
+        if (joins[-1].into if joins else each.frame) in apart:
+            ranges.setdefault(each.run_id, []).append((each.keyframe_id, each.keyframe_id))
+    without = {run: tuple(each) for run, each in ranges.items()}
+    return map_of_runs(reader, end, corrections, settings, (), without) if without else view
 
 
 def maps_of_runs(
