@@ -231,7 +231,8 @@ def test_a_run_in_two_frames_is_compared_by_its_keyframes_in_that_of_the_map(
     with LogReader(log) as reader:
         known = read_corrections(reader)
         view = own_map(reader, reader.next_offset, known, Settings())
-    assert [each.keyframe_id for each in view.keyframes] == [0, 3, 6, 9]
+    posed = [each.keyframe_id for each in view.keyframes if each.pose is not None]
+    assert posed == [0, 3, 6, 9]
 
 
 @pytest.mark.slow
