@@ -90,8 +90,8 @@ def note_archive_place(log: Path, url: str, away: Mapping[str, str] | None = Non
 
 
 def delete_stand_ins(log: Path) -> None:
-    """Delete what stands for segments that are here again: it may hold some of their events.
-    Raises OSError."""
+    """Delete what stands for segments that are here again, as it may hold some of their events,
+    and what a killed process has left of a note. Raises OSError."""
     if _needless(log):
         with place_locked(log):
             for path in _needless(log):
@@ -101,7 +101,8 @@ def delete_stand_ins(log: Path) -> None:
 def _needless(log: Path) -> list[Path]:
     files = segment_files(log)
     here = {each.base for each in files if each.path.name.endswith(SEALED)}
-    return [each.path for each in files if each.away and each.base in here]
+    notes = log.glob(f"{ARCHIVE}.*{SEALING}")  # with the lock nobody is writing one
+    return [*(each.path for each in files if each.away and each.base in here), *notes]
 
 
 def stand_in(path: Path, size: int, parts: Mapping[int, bytes]) -> None:

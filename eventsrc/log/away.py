@@ -89,6 +89,8 @@ def restore_log(
     _check_target(log, archive, wanted)
     make_directory_durably(log)
     with WriterLock(log, system_clock):
+        for path in names.leftovers(log):  # of a restore that was killed
+            unlink_quietly(path)
         _check_target(log, archive, wanted)
         last = wanted[-1]
         end = SealedEnd(archive.log_id, Offset(last.base), Offset(last.following))

@@ -43,7 +43,7 @@ def loaded(folder: Path, *words: str) -> list[str]:
             ("merges sample", (*ALWAYS, *WRITERS), 152),
             ("state sample", (*ALWAYS, *WRITERS), 140),
             ("log info sample", ALWAYS, 130),
-            ("path sample 0,0 1,0", (*ROS, *IMPORTERS, *ADAPTERS, *NETWORK, *WRITERS), 122),
+            ("path sample 0,0 1,0", (*ROS, *IMPORTERS, *ADAPTERS, *NETWORK, *WRITERS), 124),
         ]
     ),
 )
