@@ -304,6 +304,7 @@ class Ordeal:
         """Leave one recorder in peace until it has everything, then count."""
         last = self._record()
         try:
+            last.wait_for("recording")  # else Ctrl-C ends it as it starts, with 130
             acknowledged = self._robot.finish()
             if self._editor is not None:
                 self._editor.finish()
