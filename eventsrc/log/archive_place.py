@@ -101,7 +101,7 @@ def delete_stand_ins(log: Path) -> None:
 def _needless(log: Path) -> list[Path]:
     files = segment_files(log)
     here = {each.base for each in files if each.path.name.endswith(SEALED)}
-    notes = log.glob(f"{ARCHIVE}.*{SEALING}")  # with the lock nobody is writing one
+    notes = log.glob(f"{ARCHIVE}.*{SEALING}")  # only the holder of the lock makes one
     return [*(each.path for each in files if each.away and each.base in here), *notes]
 
 

@@ -122,8 +122,8 @@ class Answer:
 
     @property
     def known_spread(self) -> float | None:
-        """The standard deviation of ``known``, as nobody knows what likeness the day of a question
-        costs; None without embeddings."""
+        """The standard deviation of ``known``, from the uncertain loss of likeness on another day
+        (`SessionPrior`); None without embeddings."""
         return None if self.looks is None else QuestionSession().known(self.looks)[1]
 
     @property

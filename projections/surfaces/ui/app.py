@@ -272,7 +272,7 @@ def create_app(service: UiService, watch: LiveWatch, editor: Editor | None = Non
             def work(end: Offset, go_on: GoOn) -> dict[str, Any]:
                 return editor.answer(end, asked, go_on)
 
-            if asked.dry_run and asked.kind == "name-place":  # nothing is folded anew
+            if asked.dry_run and asked.kind == "name-place":  # a name needs no other fold
 
                 def rename(shown: LogMap, _: float) -> bytes:
                     document = editor.answer(shown.through, asked, lambda: None, shown.timeline.at)

@@ -82,7 +82,7 @@ def _opened(chromium: Browser, server: UiServer) -> tuple[Page, float, float]:
     session = page.context.new_cdp_session(page)
     session.send("Performance.enable")
     used = _seconds(session, "ProcessTime") + cpu_seconds(server.program.pid) - began
-    answered(page)  # so that the server works for nobody when the next page is opened
+    answered(page)  # the server has answered this page before the next one is opened
     return page, used, clock_s
 
 

@@ -344,8 +344,7 @@ def kill_side_by_side(
         for lane in range(lanes):
             own = folder / f"lane-{lane}"
             own.mkdir()
-            rng = random.Random(f"{seed}/{lane}")
-            ordeal = Ordeal(endpoint, own, rate, rng, f"r{lane}")
+            ordeal = Ordeal(endpoint, own, rate, random.Random(f"{seed}/{lane}"), f"r{lane}")
             ordeals.append(stack.enter_context(closing(ordeal)))
         with ThreadPoolExecutor(lanes) as threads:
             for part in threads.map(Ordeal.kill, ordeals, shares):
